@@ -40,7 +40,9 @@ def make_folder(path: Path) -> Path:
         If it cannot be made or written to.
     """
     if path.exists() and not path.is_dir():
-        raise InputError(f"output folder {str(path)!r} is a file, expected the name of a folder")
+        raise InputError(
+            f"output folder {str(path)!r} is a file", "the name of a folder", key="output", value=str(path)
+        )
     try:
         path.mkdir(parents=True, exist_ok=True)
         probe = path / ".mauvecl-probe"
@@ -48,7 +50,10 @@ def make_folder(path: Path) -> Path:
         probe.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(
-            f"output folder {str(path)!r} cannot be written ({error.strerror}), expected a writable one"
+            f"output folder {str(path)!r} cannot be written ({error.strerror})",
+            "a writable one",
+            key="output",
+            value=str(path),
         ) from error
     return path
 

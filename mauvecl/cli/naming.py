@@ -92,7 +92,9 @@ def name_flag(error: InputError) -> str:
     if not any(_gives(word, flags) for word in sys.argv[1:]):
         return text
     # The key as it is written, which may have blanks, after the place that holds it.
-    return re.sub(rf"^(?:[^:=]*: )?{re.escape(key).replace('_', '[_ ]')} = ", lambda _: f"{flags[0]} ", text)
+    section, _, own = re.escape(key).replace("_", "[_ ]").rpartition(r"\.")
+    shown = rf"(?:{section}\.)?{own}" if section else own
+    return re.sub(rf"^(?:[^:=]*: )?{shown} = ", lambda _: f"{flags[0]} ", text)
 
 
 def _gives(word: str, flags: list[str]) -> bool:

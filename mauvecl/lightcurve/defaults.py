@@ -6,7 +6,6 @@ import math
 from typing import Literal
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
 
 #: Shapes of flares: `flares.shapes.SHAPES`.
 SHAPE_NAMES = ("davenport2014", "tovarmendoza2022", "fiducial")
@@ -28,13 +27,13 @@ DAYS: dict[Per, float] = {"day": 1.0, "month": 365.25 / 12, "year": 365.25}
 def check_shape(name: str) -> None:
     """Raise InputError if no flare shape has this name."""
     if name not in SHAPE_NAMES:
-        raise InputError(f"flare shape {shortened(name)} is unknown, expected one of {', '.join(SHAPE_NAMES)}")
+        raise InputError.of("shape", name, f"one of {', '.join(SHAPE_NAMES)}")
 
 
 def per_day(false_alarms: float, per: Per) -> float:
     """Convert a number of false alarms per unit of time to false alarms per star-day."""
     if per not in DAYS:
-        raise InputError(f"false alarms per {per!r}, expected per {', '.join(DAYS)}", key="per", value=per)
+        raise InputError.of("per", per, f"per {', '.join(DAYS)}")
     if not (math.isfinite(false_alarms) and false_alarms > 0):
-        raise InputError(f"false alarms = {false_alarms:g} per {per}, expected a number above 0")
+        raise InputError.of("false_alarms", false_alarms, "a number above 0")
     return false_alarms / DAYS[per]

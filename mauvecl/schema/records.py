@@ -119,8 +119,15 @@ def _own_error(model: type[BaseModel], path: list[str], key: str, first: Any) ->
         inner = InputError(fault, expected or None, key=key if path else None, value=first.get("input"))
     # What read the value knows more of it than where it stands.
     found = inner if own else inner.within(key)
-    found.key = inner.key or (key if path else None)
+    found.key = _full_key(model, path, inner.key)
     return found
+
+
+def _full_key(model: type[BaseModel], path: list[str], inner: str | None) -> str | None:
+    """Return the path of a nested record and the field that its own error names; any other key as it is."""
+    if inner is None or path[-1:] == [inner]:
+        return ".".join(path) or None
+    return ".".join([*path, inner]) if inner in _fields(model, path) else inner
 
 
 def _fields(model: type[BaseModel], path: list[str]) -> Any:

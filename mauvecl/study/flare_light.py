@@ -87,16 +87,29 @@ class FlareLight(Section):
     def _one_model(self) -> Self:
         given = [key for key in BLACKBODY_KEYS if getattr(self, key) is not None]
         if self.file is not None and given:
-            raise ValueError(f"a flare's spectrum has file and {given[0]}, expected one of them")
+            raise InputError(f"a flare's spectrum has file and {given[0]}", "one of them", key="file", value=self.file)
         own = [key for key in FILE_KEYS if getattr(self, key) is not None]
         if self.file is None and own:
-            raise ValueError(f"a flare's spectrum has {own[0]} without a file, expected both or neither")
+            raise InputError(
+                f"a flare's spectrum has {own[0]} without a file",
+                "both or neither",
+                key=own[0],
+                value=getattr(self, own[0]),
+            )
         if (self.second_temperature_k is None) != (self.second_area is None):
-            raise ValueError(
-                "a flare's spectrum has only one of second_temperature_k and second_area, expected both or neither"
+            raise InputError(
+                "a flare's spectrum has only one of second_temperature_k and second_area",
+                "both or neither",
+                key="second_area",
+                value=self.second_area,
             )
         if self.balmer_jump is not None and self.second_area is not None:
-            raise ValueError("a flare's spectrum has balmer_jump and second_area, expected one of them")
+            raise InputError(
+                "a flare's spectrum has balmer_jump and second_area",
+                "one of them",
+                key="balmer_jump",
+                value=self.balmer_jump,
+            )
         if self.file is None and self != FlareLight.model_construct():
             self.at_temperature(10_000.0)
         return self
@@ -134,7 +147,10 @@ class FlareLight(Section):
         (key,) = path
         if key == "line_scale" and not (self.lines or self.line_fluxes):
             raise InputError(
-                f"line_scale = {value} has no effect on a flare without lines, expected lines in flare.spectrum.lines"
+                f"line_scale = {value} has no effect on a flare without lines",
+                "lines in flare.spectrum.lines",
+                key="line_scale",
+                value=value,
             )
         return type(self)(**(self.model_dump() | {key: value}))
 

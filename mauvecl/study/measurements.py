@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from mauvecl.schema.errors import InputError
 from mauvecl.schema.section import Section
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ class MeasureQuestion(Section):
                 EmissionLine.named(name)
         for low, high in self.bands_nm:
             if not 0 < low < high:
-                raise ValueError(f"measure.bands_nm holds {low:g} to {high:g} nm, expected ascending wavelengths")
+                raise InputError.of("measure.bands_nm", (low, high), "ascending wavelengths", unit="nm")
         return self
 
 

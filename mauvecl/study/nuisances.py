@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field, create_model, model_validator
 
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, Amplitude, default_processes
+from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 from mauvecl.study.sections import Section
 
@@ -30,8 +31,10 @@ def _spread(given: Any) -> Any:
     except (TypeError, ValueError):
         value = float("nan")
     if not 0 < value < float("inf"):
-        raise ValueError(
-            f"the standard deviation of an unknown is {shortened(str(given))}, expected a number above 0, or 'free'"
+        raise InputError(
+            f"the standard deviation of an unknown is {shortened(str(given))}",
+            "a number above 0, or 'free'",
+            value=given,
         )
     return value
 
@@ -49,7 +52,12 @@ class OwnNuisance(Section):
     @model_validator(mode="after")
     def _one_spectrum(self) -> Self:
         if (self.file is None) == (self.points is None):
-            raise ValueError("a nuisance spectrum has neither or both of file and points, expected one of them")
+            raise InputError(
+                "a nuisance spectrum has neither or both of file and points",
+                "one of them",
+                key="points",
+                value=self.points,
+            )
         return self
 
     def spectrum(self, name: str, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:

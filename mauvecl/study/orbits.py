@@ -55,7 +55,7 @@ class LimitsText(Section):
         try:
             return float(given)
         except (TypeError, ValueError):
-            raise ValueError(f"orbit.limits.{info.field_name} = {shown(given)}, expected a number, or none") from None
+            raise InputError.of(f"orbit.limits.{info.field_name}", given, "a number, or none") from None
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
@@ -129,7 +129,12 @@ class PlanTarget(Section):
         for names in (("mass_msun", "age_myr"), ("alpha", "rate_per_day", "at_erg")):
             given = [name for name in names if getattr(self, name) is not None]
             if given and len(given) < len(names):
-                raise ValueError(f"{self.name} has {' and '.join(given)}, expected all of {', '.join(names)} or none")
+                raise InputError(
+                    f"{self.name} has {' and '.join(given)}",
+                    f"all of {', '.join(names)} or none",
+                    key=given[0],
+                    value=getattr(self, given[0]),
+                )
         ways = [
             name
             for name, key in (("rates", "rates"), ("mass and age", "mass_msun"), ("alpha", "alpha"),
@@ -137,7 +142,9 @@ class PlanTarget(Section):
             if getattr(self, key) is not None
         ]  # fmt: skip
         if len(ways) > 1:
-            raise ValueError(f"{self.name} has flare rates by {' and by '.join(ways)}, expected one of them")
+            raise InputError(
+                f"{self.name} has flare rates by {' and by '.join(ways)}", "one of them", key="rates", value=ways
+            )
         return self
 
     def target(self, simbad: bool) -> Target:
@@ -170,8 +177,10 @@ class PlanTarget(Section):
             alpha = EXPONENTS.get(kind)
             known = "" if alpha is None else f" except for an exponent of {alpha} (Althukair & Tsiklauri 2023)"
             raise InputError(
-                f"flare rates of {self.name}, of the type {shortened(spectral_type)}, are unknown{known}, expected "
-                "alpha with rate_per_day and at_erg, rates, mass_msun and age_myr, or rates_file"
+                f"flare rates of {self.name}, of the type {shortened(spectral_type)}, are unknown{known}",
+                "alpha with rate_per_day and at_erg, rates, mass_msun and age_myr, or rates_file",
+                key="rates",
+                value=spectral_type,
             )
         return preset(kind)
 
@@ -200,7 +209,7 @@ class PlanQuestion(Section):
         names = [target.name for target in self.targets]
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
-            raise ValueError(f"the plan has the target {twice!r} twice, expected different ones")
+            raise InputError(f"the plan has the target {twice!r} twice", "different ones", key="targets", value=twice)
         return self
 
     def law(self) -> DurationLaw:
@@ -219,11 +228,13 @@ def targets_of(study: Study) -> list[Target]:
         t.target(o.simbad) for t in study.plan.targets
     ]
     if not targets:
-        raise InputError("no targets, expected names or coordinates, such as `orbit.targets='eps Eri'`")
+        raise InputError(
+            "no targets", "names or coordinates, such as `orbit.targets='eps Eri'`", key="orbit.targets", value=()
+        )
     names = [one.name for one in targets]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise InputError(f"the target {twice!r} is named twice, expected different ones")
+        raise InputError(f"the target {twice!r} is named twice", "different ones", key="orbit.targets", value=twice)
     return targets
 
 
@@ -240,13 +251,13 @@ def read_targets(path: Path) -> list[dict[str, Any]]:
     if "V" in columns:
         columns["magnitude"] = columns.pop("V")
     if "name" not in columns:
-        raise InputError(f"{named} has the columns {shown(', '.join(columns), 200)}, expected one called name")
+        raise InputError(f"{named} has the columns {shown(', '.join(columns), 200)}", "one called name", key="name")
     keys = {*PlanTarget.model_fields, "ra", "dec"}
     other = next((name for name in columns if name not in keys), None)
     if other is not None:
-        raise InputError(f"{named} has the column {shortened(other)}, expected some of {', '.join(sorted(keys))}")
+        raise InputError(f"{named} has the column {shortened(other)}", f"some of {', '.join(sorted(keys))}", key=other)
     if not 1 <= len(table) <= MAX_TARGETS:
-        raise InputError(f"{named} holds {len(table)} targets, expected 1 to {MAX_TARGETS}")
+        raise InputError(f"{named} holds {len(table)} targets", f"1 to {MAX_TARGETS}", key="name", value=len(table))
     targets = []
     for number, row in enumerate(table, 1):
         one: dict[str, Any] = {}
@@ -256,13 +267,18 @@ def read_targets(path: Path) -> list[dict[str, Any]]:
                 one[key] = value.item() if hasattr(value, "item") else value
         if ("ra" in one) != ("dec" in one) or ("ra" in one and "coordinates" in one):
             raise InputError(
-                f"{named}: row {number} has only one of ra and dec, or coordinates as well, expected both or neither"
+                f"{named}: row {number} has only one of ra and dec, or coordinates as well",
+                "both or neither",
+                key="coordinates",
+                value=number,
             )
         odd = next((key for key in ("ra", "dec") if key in one and not _is_number(one[key])), None)
         if odd is not None:
             raise InputError(
-                f"{named}: row {number} has {odd} = {shortened(str(one[odd]))}, expected degrees; sexagesimal "
-                "values belong in a column coordinates"
+                f"{named}: row {number} has {odd} = {shortened(str(one[odd]))}",
+                "degrees; sexagesimal values belong in a column coordinates",
+                key=odd,
+                value=one[odd],
             )
         if "ra" in one:
             one["coordinates"] = f"{one.pop('ra')} {one.pop('dec')}"

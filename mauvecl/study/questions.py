@@ -33,8 +33,11 @@ class CampaignQuestion(Section):
     def _requires_frames(self) -> Self:
         given = next((name for name in ("step", "fap", "alarms") if getattr(self, name) is not None), None)
         if given is not None and self.frames is None:
-            raise ValueError(
-                f"campaign.{given} is given without campaign.frames, expected the number of frames that are searched"
+            raise InputError(
+                f"campaign.{given} is given without campaign.frames",
+                "the number of frames that are searched",
+                key=given,
+                value=getattr(self, given),
             )
         return self
 
@@ -56,7 +59,7 @@ class BulkQuestion(Section):
     @model_validator(mode="after")
     def _ascending(self) -> Self:
         if not isinstance(self.frames, str) and list(self.frames) != sorted(set(self.frames)):
-            raise ValueError(f"bulk.frames = {list(self.frames)} is not ascending, expected ascending numbers")
+            raise InputError.of("bulk.frames", list(self.frames), "ascending numbers")
         return self
 
     def chosen(self, n_frames: int) -> tuple[int, ...] | None:
@@ -66,7 +69,7 @@ class BulkQuestion(Section):
         if isinstance(self.frames, str):
             return tuple(range(n_frames))
         if self.frames[-1] >= n_frames:
-            raise InputError(f"bulk.frames names frame {self.frames[-1]}, expected 0 to {n_frames - 1}")
+            raise InputError.of("bulk.frames", self.frames[-1], f"0 to {n_frames - 1}")
         return self.frames
 
 
@@ -91,19 +94,27 @@ class Axis(Section):
     def _one_way(self) -> Self:
         spaced = (self.start, self.stop, self.steps)
         if (self.values is None) == (None in spaced) or (self.values is not None and spaced != (None, None, None)):
-            raise ValueError(
-                f"the axis {self.quantity!r} has neither or both of values and start, stop, steps, expected one of them"
+            raise InputError(
+                f"the axis {self.quantity!r} has neither or both of values and start, stop, steps",
+                "one of them",
+                key="values",
+                value=self.values,
             )
         if self.values is not None and len(self.values) == 0:
-            raise ValueError(f"the axis {self.quantity!r} has no values, expected some")
+            raise InputError(f"the axis {self.quantity!r} has no values", "some", key="values", value=self.values)
         quantity = QUANTITIES[self.quantity]
         for value in self.points():
             if quantity.is_name != isinstance(value, str):
                 expected = "names of the library" if quantity.is_name else "numbers"
-                raise ValueError(f"the axis {self.quantity!r} has the value {value!r}, expected {expected}")
+                raise InputError(
+                    f"the axis {self.quantity!r} has the value {value!r}", expected, key="values", value=value
+                )
             if not isinstance(value, str) and value not in quantity.range:
-                raise ValueError(
-                    f"the axis {self.quantity!r} reaches {value:g}, expected {quantity.range.words(quantity.unit)}"
+                raise InputError(
+                    f"the axis {self.quantity!r} reaches {value:g}",
+                    quantity.range.words(quantity.unit),
+                    key="values",
+                    value=value,
                 )
         return self
 
@@ -115,9 +126,11 @@ class Axis(Section):
         assert self.stop is not None
         assert self.steps is not None
         if self.log and min(self.start, self.stop) <= 0:
-            raise ValueError(
-                f"the logarithmic axis {self.quantity!r} runs from {self.start:g} to {self.stop:g}, expected values "
-                "above 0"
+            raise InputError(
+                f"the logarithmic axis {self.quantity!r} runs from {self.start:g} to {self.stop:g}",
+                "values above 0",
+                key="start",
+                value=(self.start, self.stop),
             )
         share = [i / (self.steps - 1) for i in range(self.steps)]
         if self.log:
@@ -135,7 +148,9 @@ class MapQuestion(Section):
     @model_validator(mode="after")
     def _different_axes(self) -> Self:
         if self.x.quantity == self.y.quantity:
-            raise ValueError(f"both axes of the map are {self.x.quantity!r}, expected two quantities")
+            raise InputError(
+                f"both axes of the map are {self.x.quantity!r}", "two quantities", key="y", value=self.y.quantity
+            )
         return self
 
 
@@ -150,13 +165,15 @@ class Sweep(Section):
         names = [axis.quantity for axis in self.axes]
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
-            raise ValueError(f"the sweep has the quantity {twice!r} twice, expected different ones")
+            raise InputError(f"the sweep has the quantity {twice!r} twice", "different ones", key="axes", value=twice)
         lengths = {axis.quantity: len(axis.points()) for axis in self.axes}
         if self.how == "list" and len(set(lengths.values())) > 1:
             counts = ", ".join(f"{n} of {name}" for name, n in lengths.items())
-            raise ValueError(f"the sweep is a list of {counts}, expected equal numbers of values")
+            raise InputError(f"the sweep is a list of {counts}", "equal numbers of values", key="axes", value=counts)
         if self.size > MAX_CELLS:
-            raise ValueError(f"the sweep has {self.size} combinations, expected at most {MAX_CELLS}")
+            raise InputError(
+                f"the sweep has {self.size} combinations", f"at most {MAX_CELLS}", key="axes", value=self.size
+            )
         return self
 
     @property

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from mauvecl.lightcurve.defaults import HALF_WIDTHS_S, RANK, WINDOW_S, Per, check_shape, per_day
+from mauvecl.schema.errors import InputError
 from mauvecl.study.nuisances import Spread
 from mauvecl.study.sections import Section
 
@@ -46,9 +47,11 @@ class SearchChoice(Section):
     def _possible(self) -> Self:
         check_shape(self.shape)
         if list(self.half_widths_s) != sorted(set(self.half_widths_s)):
-            raise ValueError(f"search.half_widths_s = {list(self.half_widths_s)}, expected ascending times")
+            raise InputError.of("search.half_widths_s", list(self.half_widths_s), "ascending times")
         if self.slope and not self.offset:
-            raise ValueError("search.slope is true without search.offset, expected both or the offset alone")
+            raise InputError(
+                "search.slope is true without search.offset", "both or the offset alone", key="slope", value=True
+            )
         return self
 
     @property
@@ -102,11 +105,19 @@ class InjectionQuestion(Section):
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         if self.low is not None and self.high is not None and not self.low < self.high:
-            raise ValueError(f"injections.low = {self.low:g} and high = {self.high:g}, expected low below high")
+            raise InputError(
+                f"injections.low = {self.low:g} and high = {self.high:g}",
+                "low below high",
+                key="low",
+                value=(self.low, self.high),
+            )
         if self.half_width_low_s > self.half_width_high_s:
-            raise ValueError(
+            raise InputError(
                 f"injections.half_width_low_s = {self.half_width_low_s:g} is above half_width_high_s = "
-                f"{self.half_width_high_s:g}, expected it below"
+                f"{self.half_width_high_s:g}",
+                "it below",
+                key="half_width_low_s",
+                value=self.half_width_low_s,
             )
         return self
 

@@ -12,6 +12,7 @@ from mauvecl.host.sky import DEFAULT_SKY
 from mauvecl.host.stars.band_names import ALIASES
 from mauvecl.noise.priors import Normal, Uniform
 from mauvecl.noise.unknowns import INSTRUMENT_VALUES, PROCESSES
+from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Quantity, Range
 from mauvecl.schema.parsing import words
 from mauvecl.schema.physical import (
@@ -106,10 +107,17 @@ class Star(Section):
     @model_validator(mode="after")
     def _one_spectrum(self) -> Self:
         if (self.library is None) == (self.file is None):
-            raise ValueError("a star has neither or both of library and file, expected one of them")
+            raise InputError(
+                "a star has neither or both of library and file", "one of them", key="library", value=self.library
+            )
         given = [key for key in FILE_KEYS if getattr(self, key) is not None]
         if self.file is None and given:
-            raise ValueError(f"a star of the library has {' and '.join(given)}, expected a star from a file")
+            raise InputError(
+                f"a star of the library has {' and '.join(given)}",
+                "a star from a file",
+                key=given[0],
+                value=getattr(self, given[0]),
+            )
         return self
 
     def with_value(self, path: Sequence[str], value: Any) -> Self:
@@ -256,9 +264,14 @@ class SkyLight(Section):
     @model_validator(mode="after")
     def _one_sky(self) -> Self:
         if (self.target is None) != (self.time is None):
-            raise ValueError("the sky has only one of target and time, expected both or neither")
+            raise InputError("the sky has only one of target and time", "both or neither", key="time", value=self.time)
         if (self.surface_brightness is not None) + (self.target is not None) + self.none > 1:
-            raise ValueError("the sky is given twice, expected one of surface_brightness, target with time, and none")
+            raise InputError(
+                "the sky is given twice",
+                "one of surface_brightness, target with time, and none",
+                key="surface_brightness",
+                value=self.surface_brightness,
+            )
         return self
 
     def with_value(self, path: Sequence[str], value: Any) -> Self:
@@ -286,9 +299,11 @@ class PriorText(Section):
     @model_validator(mode="after")
     def _one_shape(self) -> Self:
         if (self.uniform is None) == (self.normal is None) or (self.normal is None) != (self.between is None):
-            raise ValueError(
-                "a prior is neither { uniform = [low, high] } nor { normal = [mean, sd], between = [low, high] }, "
-                "expected one of them"
+            raise InputError(
+                "a prior is neither { uniform = [low, high] } nor { normal = [mean, sd], between = [low, high] }",
+                "one of them",
+                key="uniform",
+                value=self.uniform,
             )
         self.prior()
         return self
@@ -431,10 +446,12 @@ class Unknowns(create_model("_InstrumentValues", __base__=Section, **_unknown_ke
     @model_validator(mode="after")
     def _possible(self) -> Self:
         if self.draws == 1:
-            raise ValueError("unknowns.draws = 1, expected 0 or at least 2")
+            raise InputError.of("unknowns.draws", self.draws, "0 or at least 2")
         other = next((name for name in self.known if name not in INSTRUMENT_VALUES), None)
         if other is not None:
-            raise ValueError(f"unknowns.known names {other!r}, expected some of {', '.join(INSTRUMENT_VALUES)}")
+            raise InputError(
+                f"unknowns.known names {other!r}", f"some of {', '.join(INSTRUMENT_VALUES)}", key="known", value=other
+            )
         self.priors()
         return self
 

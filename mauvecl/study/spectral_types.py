@@ -17,7 +17,12 @@ def subtype(spectral_type: str) -> float:
     """Convert a spectral type to a number, ten per class: K5 is 55, M0 is 60, and a class without subtype is x5."""
     matched = _TYPE.match(spectral_type)
     if not matched:
-        raise InputError(f"spectral type {shortened(spectral_type)} is unknown, expected one from O to M, such as M3V")
+        raise InputError(
+            f"spectral type {shortened(spectral_type)} is unknown",
+            "one from O to M, such as M3V",
+            key="spectral_type",
+            value=spectral_type,
+        )
     return 10.0 * CLASSES.index(matched[1]) + (5.0 if matched[2] is None else float(matched[2]))
 
 

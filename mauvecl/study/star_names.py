@@ -34,9 +34,10 @@ def check_spectrum(name: str) -> None:
     from mauvecl.study.spectral_types import nearest_spectrum
 
     raise InputError(
-        f"star {name!r} has no spectrum of its own in the library, expected that of the nearest type and its V: "
-        f"`star={nearest_spectrum(row['spectral_type'])!r}` with `magnitude={float(row['V']):g}` ({row['name']} is of "
-        f"type {row['spectral_type']}, {float(row['distance']):g} pc away; {row['source']})",
+        f"star {name!r} has no spectrum of its own in the library",
+        f"that of the nearest type and its V: `star={nearest_spectrum(row['spectral_type'])!r}` with "
+        f"`magnitude={float(row['V']):g}` ({row['name']} is of type {row['spectral_type']}, "
+        f"{float(row['distance']):g} pc away; {row['source']})",
         key="star",
         value=name,
     )

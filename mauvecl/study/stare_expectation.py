@@ -35,7 +35,9 @@ def refuse_priors(study: Study) -> None:
     if processes.modulations:
         name, _ = processes.modulations[0]
         raise InputError(
-            f"processes.{name} applies to single exposures only, expected jitters, offsets, drifts or cycles in [stare]"
+            f"processes.{name} applies to single exposures only",
+            "jitters, offsets, drifts or cycles in [stare]",
+            key=f"processes.{name}",
         )
 
 
@@ -77,12 +79,19 @@ def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare
     q, o = study.stare, study.orbit
     if q.gaps or q.orbit_gap_s or q.thermal is not None:
         raise InputError(
-            "stare.along_orbit is true and gaps or a thermal curve are given, expected neither, since both follow from "
-            "the orbit"
+            "stare.along_orbit is true and gaps or a thermal curve are given",
+            "neither, since both follow from the orbit",
+            key="stare.along_orbit",
+            value=True,
         )
     targets = targets_of(study)
     if len(targets) != 1:
-        raise InputError(f"stare.along_orbit is true with {len(targets)} targets, expected one in orbit.targets")
+        raise InputError(
+            f"stare.along_orbit is true with {len(targets)} targets",
+            "one in orbit.targets",
+            key="stare.along_orbit",
+            value=True,
+        )
     return Stare.along(
         o.orbit(), targets[0], o.start, q.duration_s, frame_s=frame_s, limits=o.limits.limits(), **changes
     )
@@ -205,7 +214,10 @@ def _event(study: Study, text: EventText) -> Event:
     kelvin = flare.temperature_k if text.temperature_k is None else text.temperature_k
     if text.cooling is not None and flare.spectrum.file is not None:
         raise InputError(
-            "events.cooling is given with a flare spectrum from a file, expected a flare that has a temperature"
+            "events.cooling is given with a flare spectrum from a file",
+            "a flare that has a temperature",
+            key="events.cooling",
+            value=text.cooling,
         )
     temperature = kelvin if text.cooling is None else Cooling(kelvin, text.cooling.end_k, text.cooling.fold_s)
     amplitude = flare.amplitudes[0] if text.amplitude is None else text.amplitude
@@ -226,7 +238,9 @@ def _of_energy(study: Study, star: Star, source: Source, text: EventText, event:
     one = energy_of(study, star, source, event, text.energy, temperatures_k)
     if one is None:
         raise InputError(
-            f"the amplitude of a flare of {text.energy_erg:g} erg on {source.name} is unknown, expected the star's "
-            "distance_pc, or radius_rsun and effective_temperature_k"
+            f"the amplitude of a flare of {text.energy_erg:g} erg on {source.name} is unknown",
+            "the star's distance_pc, or radius_rsun and effective_temperature_k",
+            key="events.energy_erg",
+            value=text.energy_erg,
         )
     return replace(event, amplitude=text.energy_erg / one)

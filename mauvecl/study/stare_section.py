@@ -34,9 +34,16 @@ class CurveText(Section):
     @model_validator(mode="after")
     def _one_way(self) -> Self:
         if (self.amplitude is not None) + (self.points is not None) + (self.file is not None) != 1:
-            raise ValueError("a curve has none or several of amplitude, points and file, expected one of them")
+            raise InputError(
+                "a curve has none or several of amplitude, points and file",
+                "one of them",
+                key="amplitude",
+                value=self.amplitude,
+            )
         if self.amplitude is None and (self.period_s is not None or self.phase):
-            raise ValueError("a curve without amplitude has period_s or phase, expected them with an amplitude only")
+            raise InputError(
+                "a curve without amplitude has period_s or phase", "them with an amplitude only", key="amplitude"
+            )
         if self.file is None:
             self.curve("curve", ORBIT_S)
         return self
@@ -84,12 +91,15 @@ class StareQuestion(Section):
     def _possible(self) -> Self:
         check_shape(self.shape)
         if self.orbit_gap_s >= self.orbit_s:
-            raise ValueError(
-                f"stare.orbit_gap_s = {self.orbit_gap_s:g} of an orbit of {self.orbit_s:g} s, expected a shorter gap"
+            raise InputError(
+                f"stare.orbit_gap_s = {self.orbit_gap_s:g} of an orbit of {self.orbit_s:g} s",
+                "a shorter gap",
+                key="orbit_gap_s",
+                value=self.orbit_gap_s,
             )
         for low, high in self.bands_nm:
             if not 0 < low < high:
-                raise ValueError(f"stare.bands_nm holds {low:g} to {high:g} nm, expected ascending wavelengths")
+                raise InputError.of("stare.bands_nm", (low, high), "ascending wavelengths", unit="nm")
         return self
 
     @property
@@ -136,9 +146,11 @@ class EventText(Section):
         sizes = ("amplitude", "peak", "equivalent_duration_s", "energy_erg")
         given = [name for name in sizes if getattr(self, name) is not None]
         if len(given) > 1:
-            raise ValueError(f"an event has {' and '.join(given)}, expected one of them")
+            raise InputError(
+                f"an event has {' and '.join(given)}", "one of them", key=given[0], value=getattr(self, given[0])
+            )
         if self.shape is not None and self.shape_file is not None:
-            raise ValueError("an event has both shape and shape_file, expected one of them")
+            raise InputError("an event has both shape and shape_file", "one of them", key="shape", value=self.shape)
         if self.shape is not None:
             check_shape(self.shape)
         return self
@@ -169,8 +181,10 @@ def check_sweep(study: Study) -> None:
     for axis in study.sweep.axes:
         if fixed.get(axis.quantity):
             raise InputError(
-                f"a sweep over {axis.quantity.replace('_', ' ')} changes no flare of this stare, expected a quantity "
-                "that [stare] and [[events]] do not fix"
+                f"a sweep over {axis.quantity.replace('_', ' ')} changes no flare of this stare",
+                "a quantity that [stare] and [[events]] do not fix",
+                key="sweep",
+                value=axis.quantity,
             )
 
 

@@ -85,9 +85,11 @@ class Study(Section):
     def _one_photosphere(self) -> Self:
         own = [number for number, star in enumerate(self.star) if star.effective_temperature_k is not None]
         if own and self.flare.geometry == "replaces" and self.flare.photosphere_temperature_k is not None:
-            raise ValueError(
-                f"flare.photosphere_temperature_k and star.{own[0]}.effective_temperature_k are both given, expected "
-                "one of them"
+            raise InputError(
+                f"flare.photosphere_temperature_k and star.{own[0]}.effective_temperature_k are both given",
+                "one of them",
+                key="flare.photosphere_temperature_k",
+                value=self.flare.photosphere_temperature_k,
             )
         return self
 
@@ -99,8 +101,11 @@ class Study(Section):
         data = toml(text, f"study file {shortened(path.name)}")
         if not _has_values(data):
             raise InputError(
-                f"study file {shortened(path.name)} sets nothing, expected at least one key, such as magnitude in "
-                "[[star]]; a verb without a study file answers the paper's question"
+                f"study file {shortened(path.name)} sets nothing",
+                "at least one key, such as magnitude in [[star]]; a verb without a study file answers "
+                "the paper's question",
+                key="study_file",
+                value=path.name,
             )
         if path.suffix == ".ecsv":
             locate_files(data, path)
@@ -154,7 +159,7 @@ class Study(Section):
         for text in settings:
             path, equals, value = (part.strip() for part in text.partition("="))
             if not (path and equals):
-                raise InputError(f"setting = {text!r}, expected key=value, such as run.fap=0.01")
+                raise InputError(f"setting = {text!r}", "key=value, such as run.fap=0.01", key="setting", value=text)
             set_key(data, path.split("."), parse_toml_value(value), text)
         return self.build(data, where)
 
@@ -233,7 +238,10 @@ class Study(Section):
         """
         if quantity not in QUANTITIES:
             raise InputError(
-                f"quantity {shortened(str(quantity))!r} is unknown, expected one of {', '.join(QUANTITIES)}"
+                f"quantity {shortened(str(quantity))!r} is unknown",
+                f"one of {', '.join(QUANTITIES)}",
+                key="quantity",
+                value=quantity,
             )
         one = QUANTITIES[quantity]
         return self.with_value(one.path, one.checked(value))
@@ -243,7 +251,7 @@ class Study(Section):
         stated = {*self.observation.changes, *(() if self.observation.temperature_c is None else ("temperature_c",))}
         priors = {name: prior for name, prior in self.unknowns.priors().items() if name not in stated}
         if self.unknowns.draws and not priors:
-            raise InputError("no instrument value is unknown, expected a prior, or unknowns.draws = 0")
+            raise InputError("no instrument value is unknown", "a prior, or unknowns.draws = 0", key="unknowns.draws")
         return priors
 
     def cells(self) -> list[tuple[dict[str, float | str], Self]]:

@@ -20,7 +20,7 @@ def read_embedded_study(path: Path) -> str:
     """Return the text of the study in an answer's metadata."""
     study = read_ecsv(path, "study", "an answer's ECSV table").meta.get("study")
     if not isinstance(study, str):
-        raise InputError(f"{path.name} contains no study, expected an answer's ECSV table")
+        raise InputError(f"{path.name} contains no study", "an answer's ECSV table", key="study", value=path.name)
     return study
 
 
@@ -67,8 +67,9 @@ def locate_files(data: dict[str, Any], table: Path) -> None:
                 break
         else:
             raise InputError(
-                f"{shortened(table.name)}: its file {shortened(name)} with sha256 {shortened(str(digest))} is missing "
-                "or has changed, expected it next to the table",
+                f"{shortened(table.name)}: its file {shortened(name)} with sha256 "
+                f"{shortened(str(digest))} is missing or has changed",
+                "it next to the table",
                 key=key,
                 value=name,
             )
@@ -106,13 +107,19 @@ def set_key(data: Any, path: list[str], value: Any, text: str) -> None:
         if isinstance(data, list | tuple):
             if part not in (numbers := [str(i) for i in range(len(data))]):
                 raise InputError(
-                    f"setting = {shortened(text)}: no entry {shortened(part)}, expected 0 to {len(numbers) - 1}"
+                    f"setting = {shortened(text)}: no entry {shortened(part)}",
+                    f"0 to {len(numbers) - 1}",
+                    key="setting",
+                    value=text,
                 )
             data = data[int(part)]
         elif isinstance(data, dict):
             data = data.setdefault(part, {})
     if not isinstance(data, dict):
         raise InputError(
-            f"setting = {shortened(text)}: {shortened('.'.join(parents))} is a value, expected a section with keys"
+            f"setting = {shortened(text)}: {shortened('.'.join(parents))} is a value",
+            "a section with keys",
+            key="setting",
+            value=text,
         )
     data[last] = value

@@ -79,7 +79,9 @@ def survey_star(study: Study, star: Star) -> StarSurvey:
     )
     survey = Survey(Components(quiet, own, templates.weights), stare, bank)
     if level.cycle and not len(survey.curves if survey.curves is not None else ()):
-        raise InputError("search.cycle is true but the stare has no unknown cycle, expected stare.cycles")
+        raise InputError(
+            "search.cycle is true but the stare has no unknown cycle", "stare.cycles", key="search.cycle", value=True
+        )
     return StarSurvey(source, quiet, templates, survey)
 
 
@@ -121,8 +123,8 @@ class Sizes:
         scale = energy_scale(study, star, source, kind, flare.temperature_k)
         if scale is None:
             raise InputError(
-                f"injections.of = {asked!r}, but the size of {source.name} is unknown, expected the star's "
-                "distance_pc, or radius_rsun and effective_temperature_k",
+                f"injections.of = {asked!r}, but the size of {source.name} is unknown",
+                "the star's distance_pc, or radius_rsun and effective_temperature_k",
                 key="injections.of",
                 value=asked,
             )
@@ -148,5 +150,10 @@ def injected_sizes(study: Study, sizes: Sizes, unit_snr: float, threshold: float
     low = DEFAULT_RANGE[0] * half.min() if asked.low is None else asked.low
     high = DEFAULT_RANGE[1] * half.max() if asked.high is None else asked.high
     if not low < high:
-        raise InputError(f"injected sizes run from {low:.3g} to {high:.3g}, expected low below high")
+        raise InputError(
+            f"injected sizes run from {low:.3g} to {high:.3g}",
+            "low below high",
+            key="injections.low",
+            value=(low, high),
+        )
     return np.geomspace(low, high, asked.sizes)

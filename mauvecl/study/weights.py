@@ -43,7 +43,7 @@ def read_columns(what: str, kind: str, path: Path) -> NDArray[np.float64]:
     """
     pairs = _columns(f"{what} {shortened(path.name)}", what, path)
     if pairs.ndim != 2 or pairs.shape[1] != 2:
-        raise InputError(f"{what} {shortened(path.name)} has no two columns, expected times and {kind}")
+        raise InputError(f"{what} {shortened(path.name)} has no two columns", f"times and {kind}", key=what)
     return pairs
 
 
@@ -73,18 +73,25 @@ def at_pixels(
     """
     if rows.ndim != 2 or rows.shape[1] != 2 or not np.all(np.diff(rows[:, 0]) > 0):
         raise InputError(
-            f"{what} have {rows.shape[1] if rows.ndim == 2 else 'no'} columns, expected ascending wavelengths in "
-            f"nm and {kind}"
+            f"{what} have {rows.shape[1] if rows.ndim == 2 else 'no'} columns",
+            f"ascending wavelengths in nm and {kind}",
+            key=what,
         )
     sizes = np.abs(rows)
     bad = ~((rows == 0) | ((sizes >= SMALLEST) & (sizes <= LARGEST)))
     if bad.any():
-        raise InputError(f"{what} hold {rows[bad][0]!r}, expected 0 or a size from {SMALLEST:g} to {LARGEST:g}")
+        raise InputError(
+            f"{what} hold {rows[bad][0]!r}",
+            f"0 or a size from {SMALLEST:g} to {LARGEST:g}",
+            key=what,
+            value=rows[bad][0].tolist(),
+        )
     values = np.interp(wavelength_nm, rows[:, 0], rows[:, 1], left=0.0, right=0.0)
     if not values.any():
         raise InputError(
-            f"{what} are 0 at every pixel, expected some of {wavelength_nm.min():.0f}-{wavelength_nm.max():.0f} nm to "
-            "count"
+            f"{what} are 0 at every pixel",
+            f"some of {wavelength_nm.min():.0f}-{wavelength_nm.max():.0f} nm to count",
+            key=what,
         )
     return np.asarray(values)
 

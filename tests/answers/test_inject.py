@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 from commands import run
+from refusals import refused
 
 from mauvecl.answers.stares.inject import inject
 from mauvecl.device.engine import Engine
@@ -14,7 +15,6 @@ from mauvecl.device.stares import Stares
 from mauvecl.lightcurve.search.injected_completeness import InjectedCompleteness
 from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.runs.pool import LocalWorkers, Pool
-from mauvecl.schema.errors import InputError
 from mauvecl.statistics.intervals import clopper_pearson
 from mauvecl.study.study import Study
 
@@ -116,8 +116,6 @@ def test_sweep_over_magnitude_and_temperature(stares):
     assert (half[1] > 1.5 * half[0]).all()
     # Hotter flares of the same amplitude have more ultraviolet light.
     assert (half[:, 1] < half[:, 0]).all()
-    with pytest.raises(InputError, match="sweep has the quantity 'amplitude'"):
-        inject(study(sweep={"axes": [{"quantity": "amplitude", "values": [0.1]}]}), stares)
 
 
 @pytest.mark.long
@@ -125,7 +123,7 @@ def test_search_that_leaves_out_a_cycle_is_told(stares):
     """A thermal cycle that the search does not know raises the threshold, or is refused where none is high enough."""
     quick = {"count": 10, "positions": 2, "fitted": 0, "widths": 2, "sizes": 2}
     changes = {"stare": {"cycles": {"temperature": 0.5}}, "injections": quick}
-    with pytest.raises(InputError, match="the search does not marginalise over"):
+    with refused("false_alarms"):
         inject(study(search={"cycle": False}, **changes), stares)
     small = {"stare": {"cycles": {"temperature": 0.002}}, "injections": quick}
     blind = inject(study(search={"cycle": False}, **small), stares)
@@ -183,20 +181,6 @@ def test_intervals_widen_where_positions_differ():
     assert never.never(0) == 1.0
 
 
-def test_refusals(stares):
-    with pytest.raises(InputError, match="distance_pc"):
-        inject(study(star=[{"library": "G2V", "magnitude": 7.4}], injections={"of": "energy"}), stares)
-    for section, key, value, match in (
-        ("search", "half_widths_s", [20.0, 10.0], "ascending"),
-        ("search", "offset", False, "without search.offset"),
-        ("injections", "low", -1.0, "greater than 0"),
-        ("injections", "half_width_low_s", 1e4, "above half_width_high_s"),
-        ("search", "per", "week", "day"),
-    ):
-        with pytest.raises(InputError, match=match):
-            study(**{section: {key: value}})
-
-
 @pytest.mark.long
 def test_command(tmp_path):
     """The verb with flags: its JSON, its files, its record."""
@@ -217,14 +201,11 @@ def test_sizes_may_be_energies():
     """In erg, which are beyond what other numbers may be."""
     asked = Study().with_settings(["injections.low=1e33", "injections.high=1e35"])
     assert (asked.injections.low, asked.injections.high) == (1e33, 1e35)
-    with pytest.raises(InputError, match=r"injections\.high = 1e\+50"):
-        Study().with_settings(["injections.high=1e50"])
 
 
 def test_a_size_that_a_star_has_not_is_told_before_any_is_searched(monkeypatch, stares):
     near = SMALL["star"][0]
     asked = study(star=[near, {**near, "distance_pc": None}], injections={"of": "energy"})
     monkeypatch.setattr("mauvecl.answers.stares.inject.survey_star", lambda *_: pytest.fail("searched"))
-    with pytest.raises(InputError) as error:
+    with refused("injections.of", value="energy"):
         inject(asked, stares)
-    assert (error.value.key, error.value.value) == ("injections.of", "energy")

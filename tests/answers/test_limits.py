@@ -112,13 +112,6 @@ def test_the_table_and_the_files(engine: Engine, tmp_path: Path) -> None:
     assert (tmp_path / "limit.png").stat().st_size > 10_000
 
 
-def test_what_cannot_be_reached_is_a_sentence(engine: Engine) -> None:
-    with pytest.raises(InputError, match=r"does not reach 0\.9 at magnitude"):
-        limiting_magnitude(study(run=FEW, flare={"amplitudes": [1e-6]}), engine)
-    with pytest.raises(InputError, match="leaves 20 of 20000"):
-        limiting_magnitude(study(run=FEW | {"fap": 1e-3}), engine)
-
-
 def test_one_stars_failure_does_not_lose_the_others(engine: Engine) -> None:
     stars = [{"library": "G2V", "magnitude": m} for m in (25.0, 7.0)]
     found = shortest_exposure(study(run=FEW, star=stars), engine)
@@ -145,8 +138,9 @@ def test_a_limit_of_more_than_a_day(engine: Engine, monkeypatch: pytest.MonkeyPa
 
 
 def test_a_flare_without_a_shape_is_a_sentence(engine: Engine) -> None:
-    with pytest.raises(InputError, match=r"flare 1 of G2V changes no pixel that counts, expected an amplitude above 0"):
+    with pytest.raises(InputError) as error:
         limiting_magnitude(study(run=FEW, flare={"amplitudes": [0.0]}), engine)
+    assert "an amplitude above 0" in str(error.value.expected)
 
 
 def test_a_limit_tells_of_saturation(engine: Engine) -> None:

@@ -10,7 +10,6 @@ from astropy.table import QTable
 
 from mauvecl.answers.detection.maps import detection_map
 from mauvecl.device.engine import Engine
-from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
 
 N = 20_000
@@ -83,24 +82,6 @@ def test_table_files_and_picture(engine: Engine, tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.probability, found.probability)
     found.plot(tmp_path / "map.png")
     assert (tmp_path / "map.png").stat().st_size > 10_000
-
-
-@pytest.mark.parametrize(
-    ("x", "sentence"),
-    [
-        ({"quantity": "magnitud"}, "map.x.quantity"),
-        ({"quantity": "magnitude"}, "neither or both"),
-        ({"quantity": "magnitude", "values": [5.0], "steps": 3}, "neither or both"),
-        ({"quantity": "magnitude", "values": ["G2V"]}, "expected numbers"),
-        ({"quantity": "star", "values": [5.0]}, "expected names of the library"),
-        ({"quantity": "magnitude", "start": 1.0, "stop": 99.0, "steps": 3}, "reaches 50"),
-        ({"quantity": "exposure", "start": 0.0, "stop": 9.0, "steps": 3, "log": True}, "logarithmic axis .* from 0"),
-        (AMPLITUDE, "both axes of the map are 'amplitude'"),
-    ],
-)
-def test_impossible_axes_are_a_sentence(x: dict, sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
-        study(x, AMPLITUDE)
 
 
 def test_saturation_is_told(engine: Engine) -> None:

@@ -10,17 +10,13 @@ import pytest
 from answers import small
 from typer.testing import CliRunner
 
-from mauvecl.answers.campaigns.plan import plan
 from mauvecl.answers.detection.detect import detect
 from mauvecl.answers.detection.maps import detection_map
 from mauvecl.answers.limits.limits import limiting_magnitude
 from mauvecl.answers.signal.simulate import simulate
 from mauvecl.answers.signal.snr import snr
-from mauvecl.answers.stares.inject import inject
-from mauvecl.answers.stares.stare import stare
 from mauvecl.cli.app import app
 from mauvecl.device.engine import Engine
-from mauvecl.device.stares import Stares
 from mauvecl.noise.unknowns import PROCESSES
 from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
@@ -80,24 +76,10 @@ def test_a_limit_that_does_not_settle_names_the_prior(engine: Engine, of: str) -
         processes={"light_loss": {"uniform": [0.6, 0.7]}},
         limit={"of": of, "power": 0.5},
     )
-    with pytest.raises(InputError, match=r"light_loss is drawn from 0\.6 to 0\.7, and the expectation.* has 0\.34"):
+    with pytest.raises(InputError) as error:
         limiting_magnitude(study, engine)
-
-
-@pytest.mark.parametrize("name", PRIORS)
-def test_stares_have_no_priors_of_exposures(name: str) -> None:
-    """Verbs of stares refuse them by name, so that none can miss the expectation."""
-    study = small(star=[{"library": "G2V", "magnitude": 7.4}], processes={name: {"uniform": PRIORS[name][1]}})
-    for completeness in ("closed form", "injections"):
-        planned = study.with_settings(
-            ["plan.targets=[{name = 'eps Eri'}]", "orbit.days=10", f"plan.completeness='{completeness}'"]
-        )
-        with pytest.raises(InputError, match=name):
-            plan(planned)
-    stares = Stares()
-    for verb in (stare, inject):
-        with pytest.raises(InputError, match=name):
-            verb(study, stares)
+    for fact in ("light_loss", "0.6 to 0.7", "0.34"):
+        assert fact in str(error.value)
 
 
 @pytest.mark.parametrize("name", PRIORS)

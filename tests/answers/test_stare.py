@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable
-from commands import ended, run
+from commands import run
 
 from mauvecl.answers.stares.stare import StareAnswer, stare
 from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
-from mauvecl.schema.errors import InputError
 from mauvecl.study.stare_expectation import stare_of
 from mauvecl.study.study import Study
 
@@ -289,52 +288,9 @@ def test_unknowns_of_a_stare_are_drawn_where_asked_for():
     assert spread == {"sky offset": 0.05, "star drift": 0.01, "temperature sine": 0.5, "temperature cosine": 0.5}
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["--gap", "10"], "--gap '10', expected two times in s, such as 1000:2000"),
-        (["--gap", "20:10"], "a gap from 20 to 10 s, expected two times, ascending"),
-        (["--duration", "-3"], "--duration -3.0, expected greater than 0"),
-        (["--shape", "gauss"], "flare shape 'gauss' is unknown, expected one of davenport2014"),
-        (
-            ["--energy", "1e33"],
-            "amplitude of a flare of 1e+33 erg on K2.5V is unknown, expected the star's distance_pc",
-        ),
-        (["--set", "stare.bands_nm=[[10,20]]"], "the band of 10 to 20 nm holds no pixel that is used"),
-        (["--set", "stare.thermal.period_s=100"], "a curve has none or several of amplitude, points and file"),
-        (["--set", "stare.jitters.star=0.1"], "a jitter of 'star', expected one of light, sky, temperature"),
-        (["--set", "stare.variability.file='none.txt'"], "none.txt"),
-        (["--set", "processes.jitter.uniform=[0,0.05]"], "processes.jitter applies to single exposures only"),
-        (
-            ["--set", "events=[{peak_s=1, peak=1, amplitude=1}]"],
-            "an event has amplitude and peak, expected one of them",
-        ),
-        (["--energy", "1e33", "--amplitude", "0.1"], "--energy is given beside --amplitude or --flares"),
-        (
-            ["--set", "events=[{peak_s=1e9, half_width_s=100}]"],
-            "flare 1, which peaks at 1e+09 s, sheds no light into the frames of the stare, expected some between 0 and",
-        ),
-        (["--duration", "2e7"], "a stare of 4000000 frames, each with a spectrum, expected at most 2000000"),
-        (["--duration", "1e12"], "has 2e+11 frames, expected at most 134217728"),
-        (["--sweep", "exposure=5,50"], "a sweep over exposure changes no flare of this stare"),
-        (
-            ["--sweep", "flare_temperature=6000,9000", "--set", "events=[{peak_s=1, temperature_k=9000}]"],
-            "a sweep over flare temperature changes no flare",
-        ),
-        (["--set", "stare.orbit_gap_s=6000"], "stare.orbit_gap_s = 6000 of an orbit of 5678.09 s"),
-    ],
-)
-def test_what_is_refused(words, told, tmp_path):
-    code, _, error = ended("stare", *words, "-o", "out", folder=tmp_path)
-    assert (code, error.count("\n")) == (2, 1), error
-    assert told in error
-
-
 def test_pictures_of_long_stares_and_gaps(stares):
     study = SHORT.with_settings(["stare.duration_s=12000", "stare.gaps=[]", "stare.orbit_gap_s=2000"])
     long = stare(study, stares)
     for name in long.pictures:
         assert name in ("light-curve-1", "dynamic-spectrum-1")
     assert long.plot() is not None
-    with pytest.raises(InputError):
-        stare(study.with_settings(["stare.gaps=[[0, 12000]]"]), stares)

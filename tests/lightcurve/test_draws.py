@@ -13,7 +13,6 @@ from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
 from mauvecl.lightcurve.stares.components import Components
 from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.schema.errors import InputError
 
 METHODS = ["pixels", "cumulants"]
 
@@ -190,35 +189,3 @@ def test_components_are_the_expectations(stares: Stares) -> None:
     known = components.coefficients(month)
     assert known.shape == (518_400, 5)
     assert components.means(known).shape == (518_400, 3)
-
-
-def test_what_cannot_be_drawn_is_refused(stares: Stares) -> None:
-    quiet, flare = star(amplitudes=(1.0,), exposure=5.0, payload=instrument(part=True))
-    n = quiet.wavelength_nm.size
-    one, stare = np.ones((1, n)), Stare.of(50.0)
-    components = Components.of(quiet, [flare], one)
-
-    def refused(match: str, *given: Any, **how: Any) -> None:
-        with pytest.raises(InputError, match=match):
-            stares.frames(*given, **({"seed": 1} | how))
-
-    refused(r"seed = -1, expected 0", components, stare, seed=-1)
-    refused(r"0 stares from number 0, expected at least 1", components, stare, count=0)
-    refused(r"method = 'frames', expected 'pixels' or 'cumulants'", components, stare, method="frames")
-    refused(r"shape \(1, 9, 1\), expected \(1, 10, 1\)", components, stare, np.ones((9, 1)))
-    refused(r"flare coefficients of -1, expected 0 to", components, stare, -np.ones((10, 1)))
-    refused(r"amplitudes have the shape \(3,\)", components, stare, np.ones((10, 1)), amplitudes=np.ones(3))
-    refused(r"frames of 4 s in the stare, expected the instrument's 5 s", components, Stare.of(40.0, frame_s=4.0))
-    shaky = Stare.of(50.0, jitters={"light": 0.15})
-    refused(r"the light of a frame scatters by 0.15, expected less than 0.143", components, shaky)
-    refused(r"carries pixel \d+ .* expected less than 4.1943e\+06", components, stare, 1e9 * np.ones((10, 1)))
-    bright = 40.0 * np.ones((10, 1))
-    refused(r"comes within 8 sigma of zero or saturation", components, stare, bright * 100, method="cumulants")
-    two = Components.of(quiet, [flare], np.vstack([one, 2 * one]))
-    refused(r"one is a sum of others, expected independent ones", two, stare, method="cumulants")
-    many = Components.of(quiet, [flare], np.eye(n)[:9])
-    refused(r"9 spectral weights, expected at most 8", many, stare)
-    with pytest.raises(InputError, match=r"an exposure of 10 frames, expected one frame"):
-        Components.of(*star(payload=instrument(part=True)), [], one)
-    with pytest.raises(InputError, match=r"spectral weights have the shape \(1, 3\), expected \(n, \d+\)"):
-        Components.of(quiet, [], np.ones((1, 3)))

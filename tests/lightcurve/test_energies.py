@@ -14,7 +14,6 @@ from mauvecl.lightcurve.flares import energies
 from mauvecl.lightcurve.flares.energies import EnergyScale, share_within
 from mauvecl.lightcurve.flares.events import Event
 from mauvecl.lightcurve.flares.shapes import SHAPES
-from mauvecl.schema.errors import InputError
 
 
 @pytest.mark.parametrize(
@@ -110,19 +109,3 @@ def test_duration_peak_and_energy_follow_from_each_other(name):
     # And the duration is the integral of what frames are given.
     edges = np.arange(-100, 30_000) * 5.0
     assert 5.0 * 0.4 * SHAPES[name].mean_over(edges, 100.0, 33.0).sum() == pytest.approx(duration, rel=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("make", "told"),
-    [
-        (lambda: EnergyScale.of_blackbody(0.0, 5778.0), "radius_rsun = 0"),
-        (lambda: EnergyScale.of_blackbody(1.0, 10.0), "temperature_k = 10"),
-        (lambda: EnergyScale.of_blackbody(1.0, 5778.0, flare_k=10.0), "flare_k = 10"),
-        (lambda: EnergyScale.of_blackbody(1.0, 5778.0, band="Q"), "band 'Q' is unknown"),
-        (lambda: EnergyScale.of_star(Source.from_library("G2V"), -1.0), "distance_pc = -1"),
-        (lambda: EnergyScale.of_blackbody(1.0, 5778.0).equivalent_duration(0.0), "energy = 0 erg"),
-    ],
-)
-def test_energies_that_cannot_be(make, told):
-    with pytest.raises(InputError, match=told):
-        make()

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from refusals import refused
 from scenes import instrument, star
 from scipy.integrate import quad
 
 from mauvecl.lightcurve.defaults import ORBIT_S
 from mauvecl.lightcurve.stares.curves import Sinusoid, Table
-from mauvecl.lightcurve.stares.stare import Stare, StareUnknown
-from mauvecl.schema.errors import InputError
+from mauvecl.lightcurve.stares.stare import Stare
 
 
 def test_frames_and_gaps():
@@ -75,32 +75,8 @@ def test_the_dark_follows_the_instruments_law():
     np.testing.assert_allclose(stare.dark_factor(quiet), np.exp(0.0684))
 
 
-@pytest.mark.parametrize(
-    ("make", "told"),
-    [
-        (lambda: Stare.of(-5), "a stare of -5 s in frames of 5 s"),
-        (lambda: Stare.of(1e12), "expected at most 134217728"),
-        (lambda: Stare.of(100, gaps=[(0, 100)]), "the gaps leave no frame"),
-        (lambda: Stare.of(100, gaps=[(50, 40)]), "a gap from 50 to 40 s"),
-        (lambda: Stare.of(100, jitters={"star": 0.1}), "a jitter of 'star'"),
-        (lambda: Stare.of(100, jitters={"light": 0.5}), "light jitter has the standard deviation 0.5, expected 0"),
-        (lambda: Stare.of(86_400, drifts={"light": 0.05}), "light drift has the standard deviation"),
-        (lambda: Stare.of(100, offsets={"dark": 0.1}), "the unknown 'dark offset' is of 'dark'"),
-        (lambda: Stare.of(100, variability=Sinusoid(2.0)), None),
-        (lambda: Stare.of(6000, variability=Sinusoid(2.0)), "the factor on the star of frame"),
-        (lambda: Stare.of(100, orbit_s=0.0), "orbit_s = 0"),
-        (lambda: Sinusoid(1.0, -3.0), "a sinusoid of amplitude 1, period -3 s"),
-        (lambda: Table(np.array([1.0, 1.0]), np.zeros(2)), "times go from 1 to 1 s"),
-        (lambda: Table(np.array([1.0, 2.0]), np.zeros(3)), "2 times and 3 values"),
-        (lambda: Table(np.array([1.0, 2.0]), np.array([0.0, np.nan])), "not finite"),
-        (lambda: StareUnknown("x", "light", 0.0, np.ones(2)), "the x has the standard deviation 0, expected above 0"),
-        (lambda: Stare(np.array([0.0, 7.0]), 5.0, *[np.ones(2)] * 4), "ascending multiples of 5 s"),
-        (lambda: Stare(np.array([0.0, 5.0]), 5.0, *[np.ones(3)] * 4), "star of the stare has the shape"),
-    ],
-)  # fmt: skip
-def test_what_is_no_stare(make, told):
-    if told is None:
-        make()
-        return
-    with pytest.raises(InputError, match=told):
-        make()
+def test_variability_must_stay_positive_within_the_stare_only() -> None:
+    """A factor that falls below zero after the last frame is accepted."""
+    assert Stare.of(100, variability=Sinusoid(2.0)).star.min() > 0
+    with refused("star"):
+        Stare.of(6000, variability=Sinusoid(2.0))

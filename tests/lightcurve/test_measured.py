@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import scipy
+from refusals import refused
 
 from mauvecl import (
     Cooling,
@@ -15,7 +16,6 @@ from mauvecl import (
     Event,
     Expectation,
     FlareModel,
-    InputError,
     Instrument,
     Nuisances,
     Sinusoid,
@@ -150,20 +150,20 @@ def test_known_conditions_gaps_and_units() -> None:
 def test_stares_without_a_flare_have_no_bins(engine: Engine) -> None:
     """200 frames of noise. False failures: below 1e-9, for 20 000 runs of frames at 8 standard deviations."""
     raw = engine.realise(quiet(), count=200, seed=3)
-    with pytest.raises(InputError, match="no bin of the stare reaches snr_per_bin = 8"):
+    with refused("snr_per_bin", value=8.0):
         measure_along(raw, quiet(), model(), snr_per_bin=8.0)
 
 
-def test_what_cannot_be_is_named() -> None:
+def test_bad_frames_are_named() -> None:
     one = quiet().recorded_dn[None]
-    for frames, how, text in (
-        (one[:, :7], {}, r"shape \(1, 7\)"),
-        (one[0], {}, "shape"),
-        (one, {"snr_per_bin": 0.0}, "snr_per_bin = 0"),
-        (one, {"stare": Stare.of(50.0)}, r"expected \(10, "),
-        (one * np.nan, {}, "undefined"),
+    for frames, how, key in (
+        (one[:, :7], {}, "frames"),
+        (one[0], {}, "frames"),
+        (one, {"snr_per_bin": 0.0}, "snr_per_bin"),
+        (one, {"stare": Stare.of(50.0)}, "frames"),
+        (one * np.nan, {}, "frames"),
     ):
-        with pytest.raises(InputError, match=text):
+        with refused(key):
             measure_along(frames, quiet(), model(), **how)
-    with pytest.raises(InputError, match="an exposure of 10 frames"):
+    with refused("n_frames", value=10):
         measure_along(one, replace(quiet(), n_frames=10), model())

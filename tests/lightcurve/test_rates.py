@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 from scipy import stats
 
 from mauvecl.lightcurve.flares.energies import EnergyScale, in_band
@@ -26,7 +27,6 @@ from mauvecl.lightcurve.search.completeness import (
     search_threshold,
 )
 from mauvecl.lightcurve.search.yields import Yield, fit_power_law, recovered_per_day
-from mauvecl.schema.errors import InputError
 
 
 def test_davenport2019() -> None:
@@ -54,8 +54,6 @@ def test_presets() -> None:
     assert 1.5 < preset("G").alpha < preset("K").alpha < preset("M").alpha < 2.1
     # 8 a day of 1000 s and more in Si IV, at 160 times their energy.
     assert float(fiducial2018(1e26).per_day_above(160 * 1e29)) == pytest.approx(8.0)
-    with pytest.raises(InputError, match="G, K, M or sunlike"):
-        preset("B")
 
 
 def test_bands() -> None:
@@ -82,22 +80,6 @@ def test_own_table(tmp_path: Path) -> None:
     assert own.measured_erg == (1e31, 1e34)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("energy,rate\n1e31,1\n1e32,2\n", "do not fall"),
-        ("energy,rate\n1e32,2\n1e31,1\n", "do not ascend"),
-        ("energy,number\n1e32,2\n", "expected energy and rate"),
-        ("energy,rate\n1e32,a\n1e33,b\n", "no plain numbers"),
-        ("energy,rate\n1e32,1\n", "2 at least"),
-    ],
-)
-def test_bad_tables(tmp_path: Path, text: str, words: str) -> None:
-    (tmp_path / "own.csv").write_text(text)
-    with pytest.raises(InputError, match=words):
-        RateTable.read(tmp_path / "own.csv")
-
-
 def step_at(energy: float, band: str = "Kepler") -> Completeness:
     """All from an energy on, none below it."""
     grid = 10 ** np.array([28, np.log10(energy) - 1e-9, np.log10(energy), 38])
@@ -107,9 +89,8 @@ def step_at(energy: float, band: str = "Kepler") -> Completeness:
 def test_recovered_from_an_energy_on() -> None:
     law = davenport2019(mass_msun=0.5, age_myr=100)
     assert recovered_per_day(law, step_at(1e33)) == pytest.approx(float(law.per_day_above(1e33)), rel=0.02)
-    with pytest.raises(InputError) as error:
+    with refused("band", value="Kepler"):
         recovered_per_day(law, step_at(1e33, "bolometric"))
-    assert error.value.key == "band"
 
 
 def test_yield_is_poissons_without_scatter() -> None:
@@ -182,8 +163,6 @@ def test_frame_signal() -> None:
     light = (flare.source_electrons - quiet.source_electrons) * quiet.gain_dn_per_electron
     expected = np.sqrt(np.sum(light**2 / quiet.variance_dn2))
     assert frame_signal(quiet, flare, 0.01) * 0.01 == pytest.approx(expected)
-    with pytest.raises(InputError, match="one frame each"):
-        frame_signal(*Study().expectations(study.star[1])[:2])
 
 
 @pytest.mark.long
@@ -213,13 +192,6 @@ def test_the_yield_closes(alpha: float) -> None:
     assert inside.mean(axis=0) == pytest.approx([0.68, 0.68], abs=0.05)
 
 
-def test_a_fit_needs_flares() -> None:
-    with pytest.raises(InputError, match="at least 3"):
-        fit_power_law(np.array([1e33, 1e34]), step_at(1e32), 10.0)
-    with pytest.raises(InputError, match="time that was observed"):
-        fit_power_law(np.array([1e33, 1e34, 1e35]), step_at(1e32), 0.0)
-
-
 @pytest.mark.parametrize(("name", "factor"), [("M3V", 1.187), ("G2V", 1.049)])
 def test_published_energies_become_those_of_light(name: str, factor: float) -> None:
     """One flare, of one equivalent duration, has one rate, by whichever energy it is looked up."""
@@ -238,5 +210,5 @@ def test_published_energies_become_those_of_light(name: str, factor: float) -> N
     # A patch seen face on, weighted with energies: by a blackbody of the star's luminosity in the band.
     patch = sunlike().of_light(light.erg_per_s, luminosity)
     assert patch.measured_erg[0] == pytest.approx(4 * factor * 1e33, rel=1e-3)
-    with pytest.raises(InputError, match="expected a published definition"):
+    with refused("definition", value="light"):
         patch.of_light(light.erg_per_s, luminosity)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from mauvecl.lightcurve.flares.shapes import SHAPES, Fiducial, TableShape, half_width_of_altaipony, shape_of
-from mauvecl.schema.errors import InputError
+from mauvecl.lightcurve.flares.shapes import SHAPES, Fiducial, TableShape, half_width_of_altaipony
 
 #: Where each shape has a kink or a step.
 KINKS = {"davenport2014": [-1.0, 0.0], "tovarmendoza2022": [0.0], "fiducial": [0.0, Fiducial.BOX], "table": [0.0, 1.0]}
@@ -166,19 +165,3 @@ def test_the_fiducial_flare_of_an_equivalent_duration():
 def test_altaiponys_durations():
     assert half_width_of_altaipony(120.0, "davenport2014") == 60.0
     assert half_width_of_altaipony(120.0, "tovarmendoza2022") == 120.0
-
-
-@pytest.mark.parametrize(
-    ("make", "told"),
-    [
-        (lambda: shape_of("gauss"), "flare shape 'gauss' is unknown, expected one of davenport2014"),
-        (lambda: TableShape(np.array([0.0, 0.0]), np.ones(2)), "times that do not ascend"),
-        (lambda: TableShape(np.array([0.0, 1.0]), np.array([-1.0, 1.0])), "values from -1 to 1"),
-        (lambda: TableShape(np.array([0.0]), np.ones(1)), "1 times and 1 values"),
-        (lambda: TableShape(np.array([0.0, 1.0]), np.zeros(2)), "values from 0 to 0"),
-        (lambda: Fiducial.of(-1.0), "equivalent duration = -1 s"),
-    ],
-)
-def test_what_is_no_shape(make, told):
-    with pytest.raises(InputError, match=told):
-        make()

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from refusals import refused
 from searches import spectra
 
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates, frame_nuisances
 from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.schema.errors import InputError
 
 CASES = {
     "known": {},
@@ -60,7 +60,7 @@ def test_refusals(star):
     quiet, _ = star
     stare = Stare.of(100.0)
     light = frame_nuisances(quiet, stare, {"light": np.inf})
-    with pytest.raises(InputError, match="cannot be distinguished from light"):
+    with refused("nuisances", value="light"):
         Templates.of(quiet, light.spectra, (1.0,), nuisances=light)
     jittered = Stare.of(100.0, jitters={"light": 0.01, "temperature": 0.1})
     assert frame_nuisances(quiet, stare) is None

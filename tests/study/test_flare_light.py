@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import tomli_w
 from astropy.table import Table
+from refusals import refused
 
 import mauvecl
 from mauvecl import EnergyScale, InputError, Instrument, Source, Study, expect
@@ -154,7 +155,7 @@ def test_sweeps_over_the_spectrum(quantity: str, values: list[float], name: str)
     assert (np.diff(snr) > 0).all() if quantity != "line_scale" else snr[0] != snr[1]
     nothing = study_of("blackbody")
     if quantity != "balmer_jump":
-        with pytest.raises(InputError):
+        with refused("second_area" if quantity.startswith("second") else "line_scale"):
             nothing.at(quantity, values[-1])
 
 
@@ -189,31 +190,8 @@ def test_flare_file_is_located_from_an_answers_table(tmp_path: Path) -> None:
     again = Study.read(tmp_path / "out" / "table.ecsv")
     assert again.flare.light().name == study.flare.light().name  # type: ignore[attr-defined]
     (tmp_path / QUIET.name).write_text("1 1\n2 2\n")
-    with pytest.raises(InputError) as error:
+    with refused("quiescent", value=QUIET.name):
         Study.read(tmp_path / "out" / "table.ecsv")
-    assert (error.value.key, error.value.value) == ("quiescent", QUIET.name)
-
-
-@pytest.mark.parametrize(
-    ("spectrum", "text"),
-    [
-        ({"file": "x.txt", "balmer_jump": 2.0}, "file and balmer_jump"),
-        ({"quiescent": "x.txt"}, "quiescent without a file"),
-        ({"second_area": 0.1}, "only one of second_temperature_k and second_area"),
-        ({"second_area": 0.1, "second_temperature_k": 2e4, "balmer_jump": 2.0}, "balmer_jump and second_area"),
-        ({"balmer_jump": 0.5}, "balmer_jump"),
-        ({"lines": {"X": 0.1}}, "'X'"),
-        ({"lines": {"Mg II": -0.1}}, "Mg II"),
-        ({"lines": {"Mg II": 0.1}, "line_fluxes": {"Mg II": 1e-12}}, "a fraction and a flux"),
-        (
-            {"electron_temperature_k": 1.0, "balmer_jump": 2.0},
-            "electron_temperature_k = 1.0, expected 1000 to 200000 K",
-        ),
-    ],
-)
-def test_invalid_spectra_raise(spectrum: dict[str, Any], text: str) -> None:
-    with pytest.raises(InputError, match=text):
-        Study.build({"flare": {"spectrum": spectrum}}, "test")
 
 
 def test_replacing_photosphere_needs_a_surface() -> None:

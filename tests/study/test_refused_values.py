@@ -8,12 +8,11 @@ from typing import Annotated, Any, get_args, get_origin
 
 import numpy as np
 import pytest
-from commands import run
 from pydantic import BaseModel, ValidationError
+from refusals import refused
 
 import mauvecl
 from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.schema.errors import InputError
 from mauvecl.schema.records import Record
 from mauvecl.study.study import Study
 
@@ -68,14 +67,9 @@ def test_booleans_as_numbers_raise(model: type[Record], name: str, value: Any) -
     assert any(fault["loc"][0] == name for fault in error.value.errors())
 
 
-def test_booleans_in_settings_and_files_raise(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"star\.0\.bin_nm = True"):
-        Study().with_settings(["star.0.bin_nm=true"])
-    with pytest.raises(InputError, match=r"observation\.changes = "):
+def test_booleans_of_instruments_raise() -> None:
+    with refused("observation.changes"):
         Study().with_settings(["observation.changes.read_noise_dn=true"]).observation.load_instrument()
-    study = tmp_path / "study.toml"
-    study.write_text("[flare]\namplitudes = [true]\n", encoding="utf-8")
-    assert "flare.amplitudes" in run("simulate", study, folder=tmp_path, code=2).stderr
     # Boolean keys accept booleans.
     assert Study().with_settings(["orbit.simbad=true"]).orbit.simbad
 
@@ -85,8 +79,7 @@ def test_study_file_without_keys_raises(tmp_path: Path, text: str) -> None:
     """Only verbs without a study file and `Study()` use the default study."""
     study = tmp_path / "empty.toml"
     study.write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=r"empty\.toml.*sets nothing, expected at least one key"):
+    with refused("study_file", value="empty.toml"):
         Study.read(study)
-    assert "sets nothing" in run("simulate", study, folder=tmp_path, code=2).stderr
     study.write_text("[run]\nseed = 1\n", encoding="utf-8")
     assert Study.read(study) == mauvecl.Study()

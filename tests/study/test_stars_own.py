@@ -43,13 +43,6 @@ def test_each_star_has_its_own_photosphere() -> None:
     assert own.at("star", "M3V").star[0].effective_temperature_k is None
 
 
-def test_two_photosphere_temperatures_raise() -> None:
-    with pytest.raises(InputError, match=r"photosphere_temperature_k and star\.0\.effective"):
-        study(
-            {"library": "G2V", "effective_temperature_k": 5000.0}, geometry="replaces", photosphere_temperature_k=5200.0
-        )
-
-
 def test_the_sky_is_common_to_both_hypotheses(engine: Engine) -> None:
     """The definition of the signal does not affect detection; a sky 1000 times brighter makes it harder."""
     settings = [

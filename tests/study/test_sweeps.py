@@ -19,7 +19,6 @@ from mauvecl.answers.signal.exposures import exposure_for
 from mauvecl.answers.signal.simulate import simulate
 from mauvecl.answers.signal.snr import snr
 from mauvecl.device.engine import Engine
-from mauvecl.schema.errors import InputError
 from mauvecl.study.study import PAPER_BUDGETS, Study
 
 
@@ -48,19 +47,6 @@ def test_cells() -> None:
     listed = study([MAGNITUDES, EXPOSURES], "list").cells()
     assert [tuple(at.values()) for at, _ in listed] == [(6, 5), (9, 50)]
     assert study([]).cells() == [({}, study([]))]
-
-
-@pytest.mark.parametrize(
-    ("axes", "how", "sentence"),
-    [
-        ([MAGNITUDES, MAGNITUDES], "product", "the sweep has the quantity 'magnitude' twice"),
-        ([MAGNITUDES, {"quantity": "exposure", "values": [5.0]}], "list", "a list of 2 of magnitude, 1 of exposure"),
-        ([{"quantity": "colour", "values": [1.0]}], "product", "sweep.axes.0.quantity"),
-    ],
-)
-def test_impossible_sweeps(axes: list[dict[str, Any]], how: str, sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
-        study(axes, how)
 
 
 def test_a_study_with_a_sweep_is_read_back(tmp_path: Any) -> None:
@@ -95,8 +81,6 @@ def test_limits_over_a_sweep(engine: Engine) -> None:
     assert value[0] > value[2]
     assert value[1] > value[3]
     assert value[1] > value[0]
-    with pytest.raises(InputError, match="the sweep runs over the magnitude that is asked for"):
-        limiting_magnitude(study([MAGNITUDES]), engine)
 
 
 def test_the_papers_noise_budgets(engine: Engine) -> None:

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refused
 from scipy import stats
 
 from mauvecl.answers.detection.maps import detection_map
 from mauvecl.answers.limits.limits import limiting_magnitude
 from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch
 from mauvecl.device.engine import Engine
-from mauvecl.schema.errors import InputError
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
@@ -121,16 +121,9 @@ def test_a_map_is_the_mean_of_its_draws(engine: Engine) -> None:
 def test_values_of_the_study_are_known() -> None:
     stated = study({}, observation={"temperature_c": 15.0, "changes": {"light_loss": 0.3}})
     assert not {"temperature_c", "light_loss"} & set(drawn(stated).names)
-    for unknowns, sentence in (
-        ({"draws": 1}, "unknowns.draws = 1"),
-        ({"known": ["colour"]}, "unknowns.known names 'colour'"),
-        ({"qe_scale": {"uniform": [1.0]}}, "unknowns.qe_scale.uniform"),
-    ):
-        with pytest.raises(InputError, match=sentence):
-            study(unknowns)
-    with pytest.raises(InputError, match="no instrument value is unknown"):
+    with refused("unknowns.draws"):
         drawn(study({"known": [*SURE["known"], "light_loss"]}))
-    with pytest.raises(InputError, match="the priors of unknown values include impossible ones"):
+    with refused("light_loss"):
         drawn(study({"light_loss": {"uniform": [0.9, 1.2]}}))
 
 

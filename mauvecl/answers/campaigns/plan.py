@@ -313,9 +313,9 @@ def plan(
     [100.0]
     """
     if not study.plan.targets:
-        raise InputError("the plan has no targets, expected some, such as `plan.targets='targets.csv'`")
+        raise InputError("the plan has no targets", "some, such as `plan.targets='targets.csv'`", key="plan.targets")
     if study.orbit.targets:
-        raise InputError("both orbit.targets and plan.targets are given, expected the plan's")
+        raise InputError("both orbit.targets and plan.targets are given", "plan.targets alone", key="orbit.targets")
     refuse_priors(study)
     stars = [star_of(study, text) for text in study.plan.targets]
     seen = visible(study)

@@ -164,8 +164,10 @@ def star_of(study: Study, text: PlanTarget) -> Star:
     missing = [name for name, value in given.items() if value is None]
     if missing:
         raise InputError(
-            f"target {text.name!r} has no {' and no '.join(missing)}, expected them in the table of targets: it is not "
-            "in the embedded list"
+            f"target {text.name!r} has no {' and no '.join(missing)}",
+            "them in the table of targets: it is not in the embedded list",
+            key="plan.targets",
+            value=text.name,
         )
     library = nearest_spectrum(given.pop("spectral_type"))
     return Star(library=library, **given)

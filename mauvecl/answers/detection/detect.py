@@ -352,7 +352,12 @@ def _wanted(asked: CampaignQuestion, tests: int, stack: int, seed: int) -> list[
         lines.append(f"{text}: `fap={one.at_least:.4g}`.")
     if asked.alarms is not None:
         if not asked.alarms < tests:
-            raise InputError(f"campaign.alarms = {asked.alarms:g} of {tests} tests, expected fewer than tests")
+            raise InputError(
+                f"campaign.alarms = {asked.alarms:g} of {tests} tests",
+                "fewer than tests",
+                key="campaign.alarms",
+                value=asked.alarms,
+            )
         alarms = "false alarm" if asked.alarms == 1 else "false alarms"
         lines.append(
             f"For {asked.alarms:g} {alarms} expected in the campaign each of its {tests} tests may have "

@@ -305,7 +305,12 @@ def limit(
     engine = engine or Default()
     result = LimitResult(study)
     if any(axis.quantity == study.limit.of for axis in study.sweep.axes):
-        raise InputError(f"the sweep runs over the {study.limit.of} that is asked for, expected other quantities")
+        raise InputError(
+            f"the sweep runs over the {study.limit.of} that is asked for",
+            "other quantities",
+            key="sweep",
+            value=study.limit.of,
+        )
     asked = [
         (one, statistic) for case in cases(study) for one in single_flares(case) for statistic in study.run.statistics
     ]

@@ -109,7 +109,12 @@ class LimitSearch:
             quiet, [flare], seed=seed, **self.case.detect_options(quiet) | {"statistics": (self.statistic,)}
         )
         for message in detection.messages:
-            raise InputError(f"at a {self.of} of {value:g}: {message} Expected a limit where some pixel tells")
+            raise InputError(
+                f"at a {self.of} of {value:g}: {message.rstrip('.')}",
+                "a limit where some pixel tells",
+                key="limit.of",
+                value=self.of,
+            )
         # Raises InputError where no threshold has the false-alarm probability.
         detection.threshold(self.fap, self.statistic)
         (probability,) = detection.detection_probability(self.fap, self.statistic)
@@ -165,9 +170,11 @@ class LimitSearch:
         )
         flare = "" if self.of == "amplitude" else f" with a flare of {100 * self.case.amplitudes[0]:.3g} %"
         return InputError(
-            f"the detection probability of {name}{flare} by {self.statistic} {verb} {self.power:g} at {self.of} = "
-            f"{value:g}, expected a limit between {_span(self.of)}{self.saturation_clause(value)}"
-            f"{self.sign_clause(value)}"
+            f"the detection probability of {name}{flare} by {self.statistic} {verb} {self.power:g} at "
+            f"{self.of} = {value:g}",
+            f"a limit between {_span(self.of)}{self.saturation_clause(value)}{self.sign_clause(value)}",
+            key="limit.of",
+            value=self.of,
         )
 
     def sign_clause(self, value: float) -> str:
@@ -278,7 +285,7 @@ def settle(question: LimitSearch, start: float) -> Interval:
     except InputError as error:
         outside = question.prior_clause(start)
         if outside:
-            raise InputError(f"{error}{outside}") from error
+            raise InputError(f"{error}{outside}", key=error.key, value=error.value) from error
         raise
 
 
@@ -288,8 +295,10 @@ def _settle(question: LimitSearch, start: float) -> Interval:
     slope, goal = question.slope(start), float(special.ndtri(question.power))
     if not slope > 0:
         raise InputError(
-            f"the detection probability does not rise towards an easier {of} at {start:g}, expected a slope there"
-            f"{question.saturation_clause(start)}{question.sign_clause(start)}"
+            f"the detection probability does not rise towards an easier {of} at {start:g}",
+            f"a slope there{question.saturation_clause(start)}{question.sign_clause(start)}",
+            key="limit.of",
+            value=of,
         )
     at = _coordinate(of, start)
     n = question.case.study.run.realisations
@@ -305,8 +314,10 @@ def _settle(question: LimitSearch, start: float) -> Interval:
             return Interval(_value(of, at + move), min(ends), max(ends))
         at += float(np.clip(move, -0.75, 0.75))
     raise InputError(
-        f"the limit of {of} did not settle in {MOST_EVALUATIONS} simulations near {_value(of, at):g}"
-        f"{question.saturation_clause(_value(of, at))}"
+        f"the limit of {of} did not settle near {_value(of, at):g}",
+        f"it within {MOST_EVALUATIONS} simulations{question.saturation_clause(_value(of, at))}",
+        key="limit.of",
+        value=of,
     )
 
 

@@ -230,12 +230,12 @@ def measure(
         For anything in the study that cannot be.
     """
     if study.flare.geometry != "added":
-        raise InputError("flare.geometry = 'replaces' in a measurement, expected 'added': fits take light for added")
+        raise InputError.of("flare.geometry", "replaces", "'added': fits take light for added")
     if study.measure.snr_per_bin is not None:
         check_sweep(study)
     prepared = cases(study)
     if any(not amplitude > 0.0 for case in prepared for amplitude in case.amplitudes):
-        raise InputError("flare amplitude = 0 in a measurement, expected one above 0")
+        raise InputError("flare amplitude = 0 in a measurement", "one above 0", key="flare.amplitudes", value=0)
     expectations = [x for case in prepared for x in case.expectations]
     if engine is None:
         from mauvecl.device.engine import Engine as Default

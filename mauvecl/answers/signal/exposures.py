@@ -133,10 +133,10 @@ def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
         If it lies outside the spectrum.
     """
     if per not in ("pixel", "element"):
-        raise InputError(f"S/N per {per!r}, expected pixel or element")
+        raise InputError(f"S/N per {per!r}", "pixel or element", key="per", value=per)
     first, last = float(x.wavelength_nm[0]), float(x.wavelength_nm[-1])
     if not first <= wavelength_nm <= last:
-        raise InputError(f"wavelength = {wavelength_nm:g} nm, expected {first:.1f} to {last:.1f} nm")
+        raise InputError.of("wavelength", wavelength_nm, f"{first:.1f} to {last:.1f} nm", unit="nm")
     pixel = int(np.argmin(np.abs(x.wavelength_nm - wavelength_nm)))
     return int(x.element[pixel]) if per == "element" else pixel
 
@@ -165,7 +165,11 @@ def exposure(
     snr, wavelength_nm, per = study.signal.snr, study.signal.wavelength_nm, study.signal.per
     if snr is None or wavelength_nm is None:
         missing = "S/N" if snr is None else "wavelength"
-        raise InputError(f"no wanted {missing}, expected `signal.snr` and `signal.wavelength_nm`")
+        raise InputError(
+            f"no wanted {missing}",
+            "`signal.snr` and `signal.wavelength_nm`",
+            key="signal.snr" if snr is None else "signal.wavelength_nm",
+        )
     answered, failed = [], []
     prepared = cases(study, swept=False)
     for done, case in enumerate(prepared, 1):
@@ -223,8 +227,10 @@ def _one(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposu
     one = snr_at(after(1), wavelength_nm, per)
     if not one > 0 or (snr / one) ** 2 * frame_s > LONGEST_S:
         raise InputError(
-            f"{case.one_frame.label} has an S/N of {one:.3g} per {per} at {wavelength_nm:g} nm in one frame, "
-            f"expected enough for {snr:g} within {LONGEST_S:g} s{frame.saturation_clause}"
+            f"{case.one_frame.label} has an S/N of {one:.3g} per {per} at {wavelength_nm:g} nm in one frame",
+            f"enough for {snr:g} within {LONGEST_S:g} s{frame.saturation_clause}",
+            key="signal.snr",
+            value=snr,
         )
     # S/N grows with the root of the frames, to rounding: the neighbours settle it.
     frames = max(int(np.ceil((snr / one) ** 2)), 1)

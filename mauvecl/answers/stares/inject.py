@@ -294,7 +294,9 @@ def inject(
     """
     idle = next((axis.quantity for axis in study.sweep.axes if axis.quantity in ("amplitude", "exposure")), None)
     if idle is not None:
-        raise InputError(f"the sweep has the quantity {idle!r}, which injections have none of, expected another")
+        raise InputError(
+            f"the sweep has the quantity {idle!r}, which injections have none of", "another", key="sweep", value=idle
+        )
     if engine is None:
         from mauvecl.device.stares import Stares as Default
 

@@ -386,7 +386,12 @@ def stare(
     # What is swept changes no frame.
     frames = stare_of(study).n_frames
     if frames > MOST_SHOWN:
-        raise InputError(f"a stare of {frames} frames, each with a spectrum, expected at most {MOST_SHOWN}")
+        raise InputError(
+            f"a stare of {frames} frames, each with a spectrum",
+            f"at most {MOST_SHOWN}",
+            key="stare.duration_s",
+            value=frames,
+        )
     # Everything is looked at before anything is drawn: bad input shows at once.
     prepared = [(star, at, cell, *expect_stare(cell, star)) for at, cell in study.cells() for star in cell.star]
     if engine is None:

@@ -105,7 +105,12 @@ class EnergyScale:
         """
         checked(Distance, "distance_pc", distance_pc)
         if source.unscaled:
-            raise InputError(f"the flux of {source.name} is of no scale: {source.unscaled}, expected a magnitude")
+            raise InputError(
+                f"the flux of {source.name} is of no scale: {source.unscaled}",
+                "a magnitude",
+                key="source",
+                value=source.name,
+            )
         source.magnitude(band)  # refuses a band that the spectrum does not cover
         return cls._of_light(
             source.wavelength_nm,
@@ -232,7 +237,7 @@ class EnergyScale:
             For an energy of 0 or less.
         """
         if not (np.isfinite(energy_erg) and energy_erg > 0):
-            raise InputError(f"energy = {energy_erg:g} erg, expected one above 0")
+            raise InputError.of("energy", energy_erg, "one above 0", unit="erg")
         return energy_erg / self.erg_per_s
 
 

@@ -48,8 +48,10 @@ class Cooling:
         reach = range_of(Temperature)
         if not (reach.low <= self.end_k <= self.peak_k <= reach.high and np.isfinite(self.fold_s) and self.fold_s > 0):
             raise InputError(
-                f"a flare that cools from {self.peak_k:g} to {self.end_k:g} K in {self.fold_s:g} s, expected "
-                f"temperatures from {reach.words('K')}, the end no hotter than the peak, and a time above 0"
+                f"a flare that cools from {self.peak_k:g} to {self.end_k:g} K in {self.fold_s:g} s",
+                f"temperatures from {reach.words('K')}, the end no hotter than the peak, and a time above 0",
+                key="cooling",
+                value=(self.peak_k, self.end_k, self.fold_s),
             )
 
     def at(self, since_peak_s: Float) -> Float:
@@ -97,9 +99,9 @@ class Event:
     def __post_init__(self) -> None:
         object.__setattr__(self, "shape", shape_of(self.shape))
         if not np.isfinite(self.peak_s):
-            raise InputError(f"a flare peaks at {self.peak_s:g} s, expected a time")
+            raise InputError.of("peak_s", self.peak_s, "a time", unit="s")
         if not 0 < self.half_width_s < np.inf:
-            raise InputError(f"the half width of a flare = {self.half_width_s:g} s, expected a time above 0")
+            raise InputError.of("half_width_s", self.half_width_s, "a time above 0", unit="s")
         checked(Amplitude, "amplitude", self.amplitude)
         if not isinstance(self.temperature, Cooling):
             checked(Temperature, "flare temperature", self.temperature)
@@ -129,7 +131,7 @@ class Event:
     ) -> Self:
         """Of an equivalent duration in the band, s."""
         if not 0 < half_width_s < np.inf:
-            raise InputError(f"the half width of a flare = {half_width_s:g} s, expected a time above 0")
+            raise InputError.of("half_width_s", half_width_s, "a time above 0", unit="s")
         return cls(peak_s, half_width_s, amplitude_of(equivalent_duration_s, half_width_s, shape), temperature, shape)
 
     @classmethod
@@ -221,8 +223,10 @@ def check_seen(events: Sequence[Event], start_s: Float, frame_s: float) -> list[
         share = float(mean.sum()) * frame_s / event.half_width_s / event.form.equivalent_duration
         if max(share, float(mean.max()) / event.form.peak) < LEAST_LIGHT:
             raise InputError(
-                f"flare {number}, which peaks at {event.peak_s:g} s, sheds no light into the frames of the stare, "
-                f"expected some between {start_s[0]:g} and {start_s[-1] + frame_s:g} s and not in a gap",
+                f"flare {number}, which peaks at {event.peak_s:g} s, sheds no light into the frames of the stare",
+                f"some between {start_s[0]:g} and {start_s[-1] + frame_s:g} s and not in a gap",
+                key="peak_s",
+                value=event.peak_s,
             )
         peak_s = event.peak_s + event.half_width_s * event.form.peak_at
         last = int(np.searchsorted(start_s, peak_s, side="right")) - 1
@@ -254,8 +258,10 @@ def temperatures_of(events: Sequence[Event], most: int = MOST_TEMPERATURES) -> F
     left = most - len(constant)
     if left < (LEAST_STEPS if cooling else 0):
         raise InputError(
-            f"flares of {len(constant)} constant temperatures{' and some that cool' if cooling else ''}, expected at "
-            f"most {most - (LEAST_STEPS if cooling else 0)}"
+            f"flares of {len(constant)} constant temperatures{' and some that cool' if cooling else ''}",
+            f"at most {most - (LEAST_STEPS if cooling else 0)}",
+            key="events",
+            value=len(constant),
         )
     if cooling:
         low, high = min(c.end_k for c in cooling), max(c.peak_k for c in cooling)
@@ -317,8 +323,10 @@ def _mixed(temperature: Float, nodes: Float) -> list[tuple[int, Float]]:
     """Share of each node in temperatures, linear in 1 / T."""
     if temperature.min() < nodes[0] - SAME_K or temperature.max() > nodes[-1] + SAME_K:
         raise InputError(
-            f"a flare of {temperature.min():g} to {temperature.max():g} K, expected temperatures within "
-            f"{nodes[0]:g} to {nodes[-1]:g} K"
+            f"a flare of {temperature.min():g} to {temperature.max():g} K",
+            f"temperatures within {nodes[0]:g} to {nodes[-1]:g} K",
+            key="temperature",
+            value=float(temperature.max()),
         )
     inverse = -1.0 / nodes
     place = np.interp(-1.0 / temperature, inverse, np.arange(nodes.size, dtype=np.float64))

@@ -65,9 +65,9 @@ class Rates(ABC):
     def __post_init__(self) -> None:
         low, high = self.measured_erg
         if not 0 < low < high < np.inf:
-            raise InputError(f"measured_erg = {low:g} to {high:g} erg, expected two rising energies above 0")
+            raise InputError.of("measured_erg", self.measured_erg, "two rising energies above 0", unit="erg")
         if not (np.isfinite(self.scatter_dex) and 0 <= self.scatter_dex <= 3):
-            raise InputError(f"scatter_dex = {self.scatter_dex}, expected 0 to 3")
+            raise InputError.of("scatter_dex", self.scatter_dex, "0 to 3")
 
     @abstractmethod
     def per_day_above(self, energy_erg: ArrayLike) -> Float:
@@ -112,7 +112,7 @@ class Rates(ABC):
             If the energies are those of light already; see `in_band`.
         """
         if self.definition == "light":
-            raise InputError(f"rates of {self.source} are by the energy of light, expected a published definition")
+            raise InputError.of("definition", self.definition, "a published definition, not that of light")
         published = luminosity_erg_s
         if self.definition == "patch":
             published *= band_factor(self.amplitude_band, BOLOMETRIC) / 4
@@ -151,11 +151,11 @@ class PowerLaw(Rates):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 1 < self.alpha < 10:
-            raise InputError(f"alpha = {self.alpha}, expected above 1, below 10")
+            raise InputError.of("alpha", self.alpha, "above 1, below 10")
         if not np.isfinite(self.log10_beta):
-            raise InputError(f"log10_beta = {self.log10_beta}, expected a finite number")
+            raise InputError.of("log10_beta", self.log10_beta, "a finite number")
         if not self.largest_erg > 0:
-            raise InputError(f"largest_erg = {self.largest_erg}, expected above 0")
+            raise InputError.of("largest_erg", self.largest_erg, "above 0")
 
     @classmethod
     def through(cls, alpha: float, energy_erg: float, per_day: float, **others: object) -> Self:
@@ -170,9 +170,9 @@ class PowerLaw(Rates):
         """
         for name, value in (("energy_erg", energy_erg), ("per_day", per_day)):
             if not (np.isfinite(value) and value > 0):
-                raise InputError(f"{name} = {value}, expected above 0")
+                raise InputError.of(name, value, "above 0")
         if not 1 < alpha < 10:
-            raise InputError(f"alpha = {alpha}, expected above 1, below 10")
+            raise InputError.of("alpha", alpha, "above 1, below 10")
         beta = np.log10(per_day * (alpha - 1)) + (alpha - 1) * np.log10(energy_erg)
         return cls(alpha=alpha, log10_beta=float(beta), **others)  # type: ignore[arg-type]
 
@@ -220,12 +220,22 @@ class RateTable(Rates):
         energy, rate = self.energy_erg, self.per_day
         if energy.ndim != 1 or energy.shape != rate.shape or energy.size < 2:
             raise InputError(
-                f"a table of rates has {energy.size} energies and {rate.size} rates, expected as many, 2 at least"
+                f"a table of rates has {energy.size} energies and {rate.size} rates",
+                "as many, 2 at least",
+                key="per_day",
+                value=rate.size,
             )
         if not (np.isfinite(energy).all() and (energy > 0).all() and (np.diff(energy) > 0).all()):
-            raise InputError("energies of a table of rates do not ascend, expected ascending ones above 0")
+            raise InputError(
+                "energies of a table of rates do not ascend", "ascending ones above 0", key="energy_erg", value=energy
+            )
         if not (np.isfinite(rate).all() and (rate > 0).all() and (np.diff(rate) <= 0).all()):
-            raise InputError("rates of a table do not fall, expected flares a day of each energy or more, above 0")
+            raise InputError(
+                "rates of a table do not fall",
+                "flares a day of each energy or more, above 0",
+                key="per_day",
+                value=rate,
+            )
 
     @classmethod
     def read(cls, path: str | Path, band: str = "Kepler") -> Self:
@@ -241,13 +251,21 @@ class RateTable(Rates):
         missing = next((name for name in ("energy", "rate") if name not in table.colnames), None)
         if missing is not None:
             raise InputError(
-                f"table of rates {shortened(path.name)} has no column {missing!r}, expected energy and rate"
+                f"table of rates {shortened(path.name)} has no column {missing!r}",
+                "energy and rate",
+                key="columns",
+                value=missing,
             )
         columns = []
         for name in ("energy", "rate"):
             values = np.ma.filled(np.ma.asarray(table[name]), np.nan)
             if values.dtype.kind not in "iuf":
-                raise InputError(f"table of rates {shortened(path.name)}: {name} holds no plain numbers, expected them")
+                raise InputError(
+                    f"table of rates {shortened(path.name)}: {name} holds no plain numbers",
+                    "plain numbers",
+                    key="columns",
+                    value=name,
+                )
             columns.append(np.asarray(values, np.float64))
         energy, rate = columns
         rates = cls(energy_erg=energy, per_day=rate, band=band, source=path.name)
@@ -300,13 +318,16 @@ def davenport2019(*, mass_msun: float, age_myr: float) -> PowerLaw:
     """
     for name, value, low, high in (("mass_msun", mass_msun, 0.1, 1.5), ("age_myr", age_myr, 1.0, 13_800.0)):
         if not low <= value <= high:
-            raise InputError(f"{name} = {value}, expected {low:g} to {high:g}")
+            raise InputError.of(name, value, f"{low:g} to {high:g}")
     t = float(np.log10(age_myr))
     slope, offset = -0.07 * t + 0.79 * mass_msun - 1.06, 2.01 * t - 25.15 * mass_msun + 33.99
     if slope >= 0:
         raise InputError(
-            f"the relation of Davenport et al. 2019 rises with energy for mass_msun = {mass_msun:g} and age_myr = "
-            f"{age_myr:g}, expected less mass or another distribution"
+            f"the relation of Davenport et al. 2019 rises with energy for mass_msun = {mass_msun:g} and "
+            f"age_myr = {age_myr:g}",
+            "less mass or another distribution",
+            key="mass_msun",
+            value=mass_msun,
         )
     return PowerLaw(
         alpha=1 - slope,
@@ -342,7 +363,7 @@ def fiducial2018(quiescent_si_iv_erg_s: float) -> PowerLaw:
     quiescent_si_iv_erg_s : float
     """
     if not (np.isfinite(quiescent_si_iv_erg_s) and quiescent_si_iv_erg_s > 0):
-        raise InputError(f"quiescent_si_iv_erg_s = {quiescent_si_iv_erg_s}, expected above 0")
+        raise InputError.of("quiescent_si_iv_erg_s", quiescent_si_iv_erg_s, "above 0")
     second = 160 * quiescent_si_iv_erg_s
     return PowerLaw.through(
         1.75, 1000 * second, 8.0, band=BOLOMETRIC, source="fiducial flares of Loyd et al. 2018 (arXiv 1809.07322)",
@@ -372,7 +393,7 @@ def preset(name: str) -> PowerLaw:
     if name == "sunlike":
         return sunlike()
     if name not in TYPICAL:
-        raise InputError(f"preset of flare rates {shortened(name)}, expected {', '.join(TYPICAL)} or sunlike")
+        raise InputError.of("preset", name, f"{', '.join(TYPICAL)} or sunlike")
     mass, age = TYPICAL[name]
     rates = davenport2019(mass_msun=mass, age_myr=age)
     return replace(rates, source=f"{rates.source} (typical of type {name}: assumption)")

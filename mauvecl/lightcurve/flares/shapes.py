@@ -263,7 +263,7 @@ class Fiducial(Shape):
     def of(cls, equivalent_duration_s: float) -> tuple[float, float]:
         """Amplitude and half width, s, of the fiducial flare of an equivalent duration, s: height 0.3 (delta/s)^0.6."""
         if not (np.isfinite(equivalent_duration_s) and equivalent_duration_s > 0):
-            raise InputError(f"equivalent duration = {equivalent_duration_s:g} s, expected a time above 0")
+            raise InputError.of("equivalent_duration_s", equivalent_duration_s, "a time above 0", unit="s")
         height = 0.3 * equivalent_duration_s**0.6
         return height, equivalent_duration_s / 1.5 / height / cls.BOX
 
@@ -317,13 +317,22 @@ class TableShape(Shape):
         tau, values = np.array(self.tau, np.float64), np.array(self.values, np.float64)
         told = f"the flare shape {shortened(self.name)}"
         if tau.ndim != 1 or tau.shape != values.shape or tau.size < 2:
-            raise InputError(f"{told} has {tau.size} times and {values.size} values, expected as many, at least 2")
+            raise InputError(
+                f"{told} has {tau.size} times and {values.size} values",
+                "as many, at least 2",
+                key="values",
+                value=values.size,
+            )
         if not (np.isfinite(tau).all() and (np.diff(tau) > 0).all()):
-            raise InputError(f"{told} has times that do not ascend, expected finite ones in ascending order")
+            raise InputError(
+                f"{told} has times that do not ascend", "finite ones in ascending order", key="tau", value=tau
+            )
         if not (np.isfinite(values).all() and values.min() >= 0 and values.max() > 0):
             raise InputError(
-                f"{told} has values from {values.min():g} to {values.max():g}, expected finite ones of at least 0, "
-                "some above it"
+                f"{told} has values from {values.min():g} to {values.max():g}",
+                "finite ones of at least 0, some above it",
+                key="values",
+                value=values,
             )
         values = values / values.max()
         for name, array in (("tau", tau), ("values", values)):

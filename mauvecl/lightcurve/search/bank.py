@@ -48,9 +48,9 @@ class Level:
 
     def __post_init__(self) -> None:
         if self.slope and not self.offset:
-            raise InputError("the baseline has a slope without an offset, expected both or the offset alone")
+            raise InputError.of("slope", self.slope, "no slope without an offset")
         if not (np.isfinite(self.window_s) and self.window_s >= 0):
-            raise InputError(f"the window of a search = {self.window_s:g} s, expected a time of at least 0")
+            raise InputError.of("window_s", self.window_s, "a time of at least 0", unit="s")
 
     @property
     def powers(self) -> tuple[int, ...]:
@@ -105,13 +105,18 @@ class Bank:
     def __post_init__(self) -> None:
         widths = self.half_widths_s
         if not widths or any(not (np.isfinite(w) and w > 0) for w in widths) or sorted(set(widths)) != list(widths):
-            raise InputError(f"half_widths_s = {list(widths)}, expected ascending times above 0")
+            raise InputError.of("half_widths_s", list(widths), "ascending times above 0")
         if not (np.isfinite(self.frame_s) and self.frame_s > 0):
-            raise InputError(f"frame_s = {self.frame_s:g}, expected a time above 0")
+            raise InputError.of("frame_s", self.frame_s, "a time above 0")
         kept = np.atleast_2d(np.array(self.directions, np.float64))
         length = np.linalg.norm(kept, axis=1, keepdims=True)
         if not (length > 0).all():
-            raise InputError("a direction of the bank is zero, expected flares that change a sum of a frame")
+            raise InputError(
+                "a direction of the bank is zero",
+                "flares that change a sum of a frame",
+                key="directions",
+                value=self.directions,
+            )
         kept = kept / length
         kept.setflags(write=False)
         object.__setattr__(self, "directions", kept)

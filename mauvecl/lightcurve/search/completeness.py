@@ -49,11 +49,11 @@ class DurationLaw:
     def __post_init__(self) -> None:
         for name in ("half_width_s", "at_erg"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise InputError(f"{name} = {getattr(self, name)}, expected above 0")
+                raise InputError.of(name, getattr(self, name), "above 0")
         if not 0 <= self.exponent < 1:
-            raise InputError(f"exponent = {self.exponent}, expected 0 to 1, since amplitudes rise with energy")
+            raise InputError.of("exponent", self.exponent, "0 to 1, since amplitudes rise with energy")
         if not 0 <= self.scatter_dex <= 2:
-            raise InputError(f"scatter_dex = {self.scatter_dex}, expected 0 to 2")
+            raise InputError.of("scatter_dex", self.scatter_dex, "0 to 2")
 
     def half_width(self, energy_erg: ArrayLike) -> Float:
         """Return the median half-width, s, shape of the energy."""
@@ -88,12 +88,19 @@ class Completeness:
         energy, p = self.energy_erg, self.probability
         if energy.ndim != 1 or energy.shape != p.shape or energy.size < 2:
             raise InputError(
-                f"a completeness has {energy.size} energies and {p.size} probabilities, expected equal numbers"
+                f"a completeness has {energy.size} energies and {p.size} probabilities",
+                "equal numbers",
+                key="probability",
+                value=p.size,
             )
         if not ((energy > 0).all() and (np.diff(energy) > 0).all() and np.isfinite(energy).all()):
-            raise InputError("energies of a completeness do not ascend, expected ascending energies above 0")
+            raise InputError(
+                "energies of a completeness do not ascend", "ascending energies above 0", key="energy_erg", value=energy
+            )
         if not ((p >= 0) & (p <= 1)).all():
-            raise InputError(f"a completeness runs from {p.min():g} to {p.max():g}, expected probabilities")
+            raise InputError(
+                f"a completeness runs from {p.min():g} to {p.max():g}", "probabilities", key="probability", value=p
+            )
 
     def at(self, energy_erg: ArrayLike) -> Float:
         """Return the interpolated probability, constant outside the table, shape of the energy."""
@@ -150,10 +157,10 @@ class Completeness:
         law : DurationLaw, optional
         """
         if scale.kind != "bolometric":
-            raise InputError(f"an energy scale of the kind {scale.kind!r}, expected a bolometric one")
+            raise InputError.of("kind", scale.kind, "bolometric")
         for name, value in (("signal_per_frame", signal_per_frame), ("window_s", window_s)):
             if not (np.isfinite(value) and value > 0):
-                raise InputError(f"{name} = {value}, expected above 0")
+                raise InputError.of(name, value, "above 0")
         law, bank = law or DurationLaw(), bank or default_bank()
         threshold = search_threshold(false_alarms_per_day, bank)
         widths, gain = _gains(bank.shape, window_s, bank.frame_s)
@@ -192,7 +199,7 @@ def search_threshold(false_alarms_per_day: float, bank: Bank | None = None) -> f
     Raises InputError if it is not between 2 and 20 sigma.
     """
     if not (np.isfinite(false_alarms_per_day) and false_alarms_per_day > 0):
-        raise InputError(f"false_alarms_per_day = {false_alarms_per_day}, expected above 0")
+        raise InputError.of("false_alarms_per_day", false_alarms_per_day, "above 0")
     grid = TemplateGrid.from_bank(bank or default_bank())
 
     def over(threshold: float) -> float:
@@ -200,7 +207,7 @@ def search_threshold(false_alarms_per_day: float, bank: Bank | None = None) -> f
 
     if over(THRESHOLDS[0]) < 0 or over(THRESHOLDS[1]) > 0:
         most, least = (grid.false_alarms_per_second(u) * DAY_S for u in THRESHOLDS)
-        raise InputError(f"false_alarms_per_day = {false_alarms_per_day:g}, expected {least:.2g} to {most:.3g}")
+        raise InputError.of("false_alarms_per_day", false_alarms_per_day, f"{least:.2g} to {most:.3g}")
     return float(optimize.brentq(over, *THRESHOLDS, xtol=1e-9))
 
 
@@ -219,7 +226,12 @@ def frame_signal(
         Additional variance, such as that of particle hits.
     """
     if quiet.n_frames != 1 or flare.n_frames != 1:
-        raise InputError(f"expectations have {quiet.n_frames} and {flare.n_frames} frames, expected one frame each")
+        raise InputError(
+            f"expectations have {quiet.n_frames} and {flare.n_frames} frames",
+            "one frame each",
+            key="n_frames",
+            value=(quiet.n_frames, flare.n_frames),
+        )
     light = (flare.source_electrons - quiet.source_electrons) * quiet.gain_dn_per_electron / amplitude
     variance = quiet.unsaturated_variance_dn2 + (0.0 if added_variance_dn2 is None else added_variance_dn2)
     used = ~quiet.saturated

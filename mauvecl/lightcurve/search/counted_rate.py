@@ -49,8 +49,10 @@ class CountedRate:
         alarmed = -np.expm1(-rate * self.days)
         if min(alarmed, 1 - alarmed) * n < MIN_ALARMS:
             raise InputError(
-                f"{rate:g} false alarms per star-day occur in {alarmed * n:.3g} of {n} simulated stares, expected at "
-                f"least {MIN_ALARMS} with an alarm and as many without"
+                f"{rate:g} false alarms per star-day occur in {alarmed * n:.3g} of {n} simulated stares",
+                f"at least {MIN_ALARMS} with an alarm and as many without",
+                key="false_alarms",
+                value=rate,
             )
         low, high = central_counts(n, 1 - alarmed)
         places = np.clip([round(n * (1 - alarmed)), low, high], 0, n - 1)

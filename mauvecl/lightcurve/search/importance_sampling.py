@@ -143,9 +143,9 @@ class SampledRate:
         if self.shifted and most >= -np.expm1(-rate * self.days):
             least = -np.log1p(-min(most, 1 - 1e-16)) / self.days
             raise InputError(
-                f"{rate:g} false alarms per star-day, expected at least {least:.2g}: "
-                "what is unknown of the stare moves the level in ways that the search does not marginalise over (see "
-                "search.cycle, slope, offset and window_s)",
+                f"{rate:g} false alarms per star-day",
+                f"at least {least:.2g}: what is unknown of the stare moves the level in ways that the "
+                "search does not marginalise over (see search.cycle, slope, offset and window_s)",
                 key="false_alarms",
                 value=rate,
             )
@@ -154,8 +154,10 @@ class SampledRate:
         if not self.log_rate(high)[0] <= goal <= self.log_rate(low)[0]:
             ends = [float(np.exp(self.log_rate(u)[0])) for u in (high, low)]
             raise InputError(
-                f"{rate:g} false alarms per star-day, expected {ends[0]:.2g} to {ends[1]:.2g} for importance sampling "
-                f"of stares of {self.days:.3g} star-days"
+                f"{rate:g} false alarms per star-day",
+                f"{ends[0]:.2g} to {ends[1]:.2g} for importance sampling of stares of {self.days:.3g} star-days",
+                key="false_alarms",
+                value=rate,
             )
         value = float(brentq(lambda u: self.log_rate(u)[0] - goal, low, high, xtol=1e-6))
         # The rate falls by about a factor exp(-u) per unit of u.
@@ -170,7 +172,7 @@ class SampledRate:
     def _check(self, threshold: float) -> None:
         low, high = self._ends
         if not low <= threshold <= high:
-            raise InputError(f"a threshold of {threshold:g}, expected {low:g} to {high:g} for importance sampling")
+            raise InputError.of("threshold", threshold, f"{low:g} to {high:g} for importance sampling")
 
 
 def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate:
@@ -183,7 +185,12 @@ def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate
     tried = [np.flatnonzero(row.per_amplitude > 0) for row in rows]
     sizes = np.array([t.size for t in tried])
     if not sizes.any():
-        raise InputError("no template of the bank fits into the stare, expected a longer one")
+        raise InputError(
+            "no template of the bank fits into the stare",
+            "a longer one",
+            key="half_widths_s",
+            value=search.bank.half_widths_s,
+        )
     weights = TemplateGrid.from_bank(search.bank).peak_probabilities(WEIGHTING_THRESHOLD)
     weights = np.maximum(weights, MIN_WEIGHT * weights.max())
     shares = np.cumsum(weights * sizes[:, None])

@@ -61,11 +61,13 @@ class Injections:
 
     def __post_init__(self) -> None:
         if not self.half_widths_s or not all(np.isfinite(w) and w > 0 for w in self.half_widths_s):
-            raise InputError(f"half_widths_s = {list(self.half_widths_s)}, expected times above 0")
+            raise InputError.of("half_widths_s", list(self.half_widths_s), "times above 0")
         if self.positions < 1 or not 1 <= self.draws <= NUMBERS:
             raise InputError(
-                f"there are {self.positions} positions x {self.draws} draws, expected at least one of each and at most "
-                f"{NUMBERS} draws"
+                f"there are {self.positions} positions x {self.draws} draws",
+                f"at least one of each and at most {NUMBERS} draws",
+                key="draws",
+                value=(self.positions, self.draws),
             )
 
     @cached_property

@@ -74,13 +74,9 @@ class Search:
 
     def __init__(self, bank: Bank, stare: Stare, curves: Float | None = None, variance: Float | None = None) -> None:
         if abs(stare.frame_s - bank.frame_s) > 1e-9 * bank.frame_s:
-            raise InputError(
-                f"the stare has frames of {stare.frame_s:g} s, expected {bank.frame_s:g} s, as in the bank",
-                key="frame_s",
-                value=stare.frame_s,
-            )
+            raise InputError.of("frame_s", stare.frame_s, f"{bank.frame_s:g} s, as in the bank", unit="s")
         if bank.level.cycle != (curves is not None and len(curves) > 0):
-            raise InputError("only one of curves and level.cycle is given, expected both or neither", key="curves")
+            raise InputError("only one of curves and level.cycle is given", "both or neither", key="curves")
         self.bank, self.stare = bank, stare
         self._first = int(stare.numbers[0])
         self._at = stare.numbers - self._first
@@ -91,7 +87,7 @@ class Search:
         for curve in np.zeros((0, stare.n_frames)) if curves is None else curves:
             scale = float(np.std(curve))
             if not scale > 0:
-                raise InputError("a baseline curve is constant over the stare, expected one that varies", key="curves")
+                raise InputError("a baseline curve is constant over the stare", "one that varies", key="curves")
             series.append((curve - np.mean(curve)) / scale)
         # Terms of the baseline: a power of time in the window, and the index of a series in the stare.
         self._terms = [(power, 0) for power in bank.level.powers] + [(0, 1 + k) for k in range(len(series) - 1)]
@@ -192,7 +188,8 @@ class Search:
         expected = (self.stare.n_frames, self.bank.directions.shape[1])
         if sums.ndim != 3 or sums.shape[1:] != expected:
             raise InputError(
-                f"sums have the shape {sums.shape}, expected (n_stare, {expected[0]}, {expected[1]})",
+                f"sums have the shape {sums.shape}",
+                f"(n_stare, {expected[0]}, {expected[1]})",
                 key="sums",
                 value=sums.shape,
             )

@@ -85,7 +85,9 @@ class Templates:
         """
         used = ~quiet.saturated
         if not used.any():
-            raise InputError(f"every pixel of {quiet.name} saturates, expected some that do not")
+            raise InputError(
+                f"every pixel of {quiet.name} saturates", "some that do not", key="quiet", value=quiet.name
+            )
         variance, flares = np.where(used, quiet.variance_dn2, 0.0), flares_dn * used
         plain = np.divide(flares, variance, out=np.zeros_like(flares), where=used)
         optimal = plain
@@ -97,7 +99,10 @@ class Templates:
         if not (power > 1e-10 * np.einsum("tp,tp->t", plain, flares)).all():
             names = join_names(nuisances.names) if nuisances else "nothing"
             raise InputError(
-                f"a flare cannot be distinguished from {names} in one frame, expected fewer nuisance parameters"
+                f"a flare cannot be distinguished from {names} in one frame",
+                "fewer nuisance parameters",
+                key="nuisances",
+                value=names,
             )
         length = np.sqrt(power)
         values, vectors = np.linalg.eigh(gram / np.outer(length, length))

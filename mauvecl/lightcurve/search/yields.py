@@ -75,11 +75,7 @@ def smallest_integer(reached: Callable[[int], bool], most: float) -> int:
 def recovered_per_day(rates: Rates, completeness: Completeness) -> float:
     """Return the recovered flares per day, the integral of rate times completeness over energy."""
     if rates.band != completeness.band:
-        raise InputError(
-            f"rates are in {rates.band!r} and the completeness in {completeness.band!r}, expected the same band",
-            key="band",
-            value=rates.band,
-        )
+        raise InputError.of("band", rates.band, f"{completeness.band!r}, the band of the completeness")
     low, high = completeness.decades
     edges = 10 ** np.linspace(low, high, max(2, round((high - low) * PER_DECADE)))
     above = rates.per_day_above(edges)
@@ -90,7 +86,7 @@ def recovered_per_day(rates: Rates, completeness: Completeness) -> float:
 
 def _checked(days: float) -> float:
     if not (np.isfinite(days) and days >= 0):
-        raise InputError(f"days = {days}, expected at least 0")
+        raise InputError.of("days", days, "at least 0")
     return days
 
 
@@ -136,9 +132,11 @@ def fit_power_law(
     """
     logs = np.log10(np.asarray(energy_erg, np.float64))
     if logs.size < 3 or not np.isfinite(logs).all():
-        raise InputError(f"energy_erg has {logs.size} flares, expected at least 3 with energies above 0")
+        raise InputError(
+            f"energy_erg has {logs.size} flares", "at least 3 with energies above 0", key="energy_erg", value=logs.size
+        )
     if _checked(days) == 0:
-        raise InputError("days = 0, expected a time that was observed")
+        raise InputError.of("days", days, "a time that was observed")
     pivot = float(np.median(logs))
     x = np.linspace(*completeness.decades, GRID)
     step = float(x[1] - x[0])

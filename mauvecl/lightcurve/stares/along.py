@@ -94,9 +94,9 @@ def stare_along(
     """
     for name in ("gaps", "temperature_c", "thermal"):
         if name in unknowns:
-            raise InputError(f"a stare along the orbit is given {name!r}, expected the orbit to say so")
+            raise InputError.of(name, unknowns[name], "none, since the orbit gives it")
     if not (np.isfinite(duration_s) and 0 < duration_s <= MOST_FRAMES * frame_s):
-        raise InputError(f"a stare of {duration_s:g} s, expected a time above 0")
+        raise InputError.of("duration_s", duration_s, "a time above 0", unit="s")
     place = target if isinstance(target, Target) else Target.of(target)
     thermal, particles = thermal or Thermal(), particles or Particles()
     count = int(np.ceil(duration_s / frame_s * (1 - 1e-12)))
@@ -106,8 +106,10 @@ def stare_along(
     seen = visible.seen[:, 0]
     if not seen.any():
         raise InputError(
-            f"target {place.name!r} is never seen in {duration_s / 3600:g} h from {times.iso(0.0)}, expected another "
-            "time or other limits"
+            f"target {place.name!r} is never seen in {duration_s / 3600:g} h from {times.iso(0.0)}",
+            "another time or other limits",
+            key="target",
+            value=place.name,
         )
     # Everything about the frames but the temperature is the whole stare's with frames left out.
     whole = Stare.of(count * frame_s, frame_s=frame_s, **unknowns)

@@ -60,23 +60,47 @@ class Components:
     def __post_init__(self) -> None:
         n_pixel = self.quiet.wavelength_nm.size
         if self.quiet.n_frames != 1:
-            raise InputError(f"an exposure of {self.quiet.n_frames} frames, expected one frame of the stare")
+            raise InputError(
+                f"an exposure of {self.quiet.n_frames} frames",
+                "one frame of the stare",
+                key="n_frames",
+                value=self.quiet.n_frames,
+            )
         for name, what, least in (("flare_electrons", "flare spectra", 0), ("weights", "spectral weights", 1)):
             kept = np.array(getattr(self, name), np.float64)
             if kept.ndim != 2 or kept.shape[1] != n_pixel or len(kept) < least:
-                raise InputError(f"{what} have the shape {kept.shape}, expected (n, {n_pixel})")
+                raise InputError(f"{what} have the shape {kept.shape}", f"(n, {n_pixel})", key=name, value=kept.shape)
             if not np.isfinite(kept).all():
-                raise InputError(f"{what} of pixel {int(np.argmin(np.isfinite(kept).all(axis=0)))} are not finite")
+                raise InputError(
+                    f"{what} of pixel {int(np.argmin(np.isfinite(kept).all(axis=0)))} are not finite",
+                    "finite numbers",
+                    key=name,
+                )
             kept.setflags(write=False)
             object.__setattr__(self, name, kept)
         if (self.flare_electrons < 0).any():
             pixel = int(np.argmax((self.flare_electrons < 0).any(axis=0)))
-            raise InputError(f"a flare takes light from pixel {pixel}, expected flare spectra of 0 and above")
+            raise InputError(
+                f"a flare takes light from pixel {pixel}",
+                "flare spectra of 0 and above",
+                key="flare_electrons",
+                value=pixel,
+            )
         if len(self.flare_electrons) > MOST_FLARES:
-            raise InputError(f"{len(self.flare_electrons)} flare spectra, expected at most {MOST_FLARES}")
+            raise InputError(
+                f"{len(self.flare_electrons)} flare spectra",
+                f"at most {MOST_FLARES}",
+                key="flare_electrons",
+                value=len(self.flare_electrons),
+            )
         unusable = self.quiet.saturated & (self.weights != 0).any(axis=0)
         if unusable.any():
-            raise InputError(f"pixel {int(np.argmax(unusable))} saturates and has a weight, expected 0 there")
+            raise InputError(
+                f"pixel {int(np.argmax(unusable))} saturates and has a weight",
+                "0 there",
+                key="weights",
+                value=int(np.argmax(unusable)),
+            )
 
     @classmethod
     def of(cls, quiet: Expectation, flares: Sequence[Expectation], weights: Float) -> Self:
@@ -166,7 +190,10 @@ class Components:
         if flare is not None:
             if np.shape(flare) != (stare.n_frames, self.n_flares):
                 raise InputError(
-                    f"flare coefficients have the shape {np.shape(flare)}, expected {(stare.n_frames, self.n_flares)}"
+                    f"flare coefficients have the shape {np.shape(flare)}",
+                    f"{(stare.n_frames, self.n_flares)}",
+                    key="flare",
+                    value=np.shape(flare),
                 )
             factors[:, 3:] = stare.light[:, None] * flare
         return factors

@@ -36,8 +36,10 @@ class Sinusoid:
     def __post_init__(self) -> None:
         if not (np.isfinite([self.amplitude, self.period_s, self.phase]).all() and self.period_s > 0):
             raise InputError(
-                f"a sinusoid of amplitude {self.amplitude:g}, period {self.period_s:g} s and phase {self.phase:g}, "
-                "expected finite numbers and a period above 0"
+                f"a sinusoid of amplitude {self.amplitude:g}, period {self.period_s:g} s and phase {self.phase:g}",
+                "finite numbers and a period above 0",
+                key="sinusoid",
+                value=(self.amplitude, self.period_s, self.phase),
             )
 
     def mean_over(self, start_s: Float, frame_s: float) -> Float:
@@ -67,15 +69,20 @@ class Table:
             object.__setattr__(self, name, kept)
         if self.time_s.ndim != 1 or self.time_s.shape != self.values.shape or self.time_s.size < 2:
             raise InputError(
-                f"a curve has {self.time_s.size} times and {self.values.size} values, expected as many, at least 2"
+                f"a curve has {self.time_s.size} times and {self.values.size} values",
+                "as many, at least 2",
+                key="values",
+                value=self.values.size,
             )
         if not (np.isfinite(self.time_s).all() and np.isfinite(self.values).all()):
-            raise InputError("a curve holds a time or value that is not finite, expected numbers")
+            raise InputError(
+                "a curve holds a time or value that is not finite", "numbers", key="values", value=self.values
+            )
         steps = np.diff(self.time_s)
         if not (steps > 0).all():
             place = int(np.argmin(steps > 0))
-            raise InputError(
-                f"a curve's times go from {self.time_s[place]:g} to {self.time_s[place + 1]:g} s, expected ascending"
+            raise InputError.of(
+                "time_s", (float(self.time_s[place]), float(self.time_s[place + 1])), "ascending", unit="s"
             )
 
     def mean_over(self, start_s: Float, frame_s: float) -> Float:

@@ -127,22 +127,31 @@ def measure_along(
     """
     raw = np.asarray(frames, np.float64)
     if raw.ndim != 2:
-        raise InputError(f"frames of the shape {raw.shape}, expected two dimensions: frames and pixels")
+        raise InputError(
+            f"frames of the shape {raw.shape}", "two dimensions: frames and pixels", key="frames", value=raw.shape
+        )
     if stare is None:
         here = quiet.conditions["temperature_c"]
         stare = Stare.of(max(len(raw), 1) * quiet.frame_s, frame_s=quiet.frame_s, temperature_c=here)
     n_pixel = quiet.wavelength_nm.size
     if raw.shape != (stare.n_frames, n_pixel):
-        raise InputError(f"frames of the shape {raw.shape}, expected {(stare.n_frames, n_pixel)}")
+        raise InputError(
+            f"frames of the shape {raw.shape}", f"{(stare.n_frames, n_pixel)}", key="frames", value=raw.shape
+        )
     if not np.isfinite(raw).all():
-        raise InputError("frames hold undefined values, expected finite numbers")
+        raise InputError("frames hold undefined values", "finite numbers", key="frames")
     if quiet.n_frames != 1:
-        raise InputError(f"an exposure of {quiet.n_frames} frames, expected one frame of the quiescent star")
+        raise InputError(
+            f"an exposure of {quiet.n_frames} frames",
+            "one frame of the quiescent star",
+            key="n_frames",
+            value=quiet.n_frames,
+        )
     if not 0.0 < snr_per_bin < np.inf:
-        raise InputError(f"snr_per_bin = {snr_per_bin:g}, expected a number above 0")
+        raise InputError.of("snr_per_bin", snr_per_bin, "a number above 0")
     bins = _bins(raw, quiet, model, nuisances, _known(stare, quiet), stare, snr_per_bin)
     if not bins:
-        raise InputError(f"no bin of the stare reaches snr_per_bin = {snr_per_bin:g}, expected a lower one")
+        raise InputError.of("snr_per_bin", snr_per_bin, "one that some bin of the stare reaches")
     first, end = np.array(bins).T
     return fit_bins(raw, quiet, model, nuisances, stare, first, end - first, levels)
 

@@ -190,10 +190,7 @@ def seen(staring: StareExpectation, bands_nm: Sequence[tuple[float, float]], dra
     for low, high in bands_nm:
         row = used * ((quiet.wavelength_nm >= low) & (quiet.wavelength_nm < high))
         if not row.any():
-            raise InputError(
-                f"the band of {low:g} to {high:g} nm holds no pixel that is used, expected some"
-                f"{quiet.saturation_clause}"
-            )
+            raise InputError.of("bands_nm", (low, high), f"a band with usable pixels{quiet.saturation_clause}")
         rows.append(row)
     elements = used * (quiet.element == np.arange(quiet.element_wavelength_nm.size)[:, None])
     filled = np.flatnonzero(elements.any(axis=1))

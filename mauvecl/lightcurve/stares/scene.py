@@ -65,21 +65,25 @@ class Flares:
             given = given[None]
         if given.shape[1:] != (n_frames, n_flares) or given.shape[0] not in (1, count):
             raise InputError(
-                f"flare coefficients have the shape {given.shape}, expected ({count}, {n_frames}, {n_flares}), or one "
-                "row for all stares"
+                f"flare coefficients have the shape {given.shape}",
+                f"({count}, {n_frames}, {n_flares}), or one row for all stares",
+                key="flare",
+                value=given.shape,
             )
         factors = np.ones((1, 1)) if amplitudes is None else np.asarray(amplitudes)
         if factors.ndim != 2 or factors.shape[1] not in (1, count) or not 1 <= len(factors) <= MOST_SCENARIOS:
             raise InputError(
-                f"amplitudes have the shape {factors.shape}, expected (n, {count}) or (n, 1) with n of 1 to "
-                f"{MOST_SCENARIOS} scenarios"
+                f"amplitudes have the shape {factors.shape}",
+                f"(n, {count}) or (n, 1) with n of 1 to {MOST_SCENARIOS} scenarios",
+                key="amplitudes",
+                value=factors.shape,
             )
         # One that is no number is the least, too.
         ends = [("flare coefficients", given.min(initial=0.0)), ("amplitudes", factors.min(initial=0.0))]
         ends += [("flare coefficients", most) for most in _largest(given)] + [("amplitudes", factors.max())]
         for what, end in ends:
             if not 0 <= end <= LARGEST:
-                raise InputError(f"{what} of {end:g}, expected 0 to {LARGEST:g}")
+                raise InputError.of(what, end, f"0 to {LARGEST:g}")
         return cls(given, factors.astype(np.float32))
 
     @cached_property
@@ -154,14 +158,24 @@ class StareScene:
         """
         x, n_pixel = components.quiet, components.quiet.wavelength_nm.size
         if abs(stare.frame_s - x.frame_s) > 1e-9 * x.frame_s:
-            raise InputError(f"frames of {stare.frame_s:g} s in the stare, expected the instrument's {x.frame_s:g} s")
+            raise InputError.of("frame_s", stare.frame_s, f"the instrument's {x.frame_s:g} s")
         if components.n_statistics > MOST_STATISTICS:
-            raise InputError(f"{components.n_statistics} spectral weights, expected at most {MOST_STATISTICS}")
+            raise InputError(
+                f"{components.n_statistics} spectral weights",
+                f"at most {MOST_STATISTICS}",
+                key="weights",
+                value=components.n_statistics,
+            )
         if len(stare.unknowns) > MOST_UNKNOWNS:
-            raise InputError(f"{len(stare.unknowns)} unknowns of a stare, expected at most {MOST_UNKNOWNS}")
+            raise InputError(
+                f"{len(stare.unknowns)} unknowns of a stare",
+                f"at most {MOST_UNKNOWNS}",
+                key="unknowns",
+                value=len(stare.unknowns),
+            )
         scene = prepare([x], processes=Processes(cosmic_rays=cosmic_rays))
         if not scene.joint:
-            raise InputError(_apart(x.name))
+            raise _apart(x.name)
         size = padded(n_pixel)
         mixtures = np.zeros(size, layout.MIXTURE)
         mixtures["variance"] = 1.0
@@ -277,8 +291,10 @@ class StareScene:
         for of in ("light", "star", "sky"):
             if (REACH_SIGMA * spread[of] >= 1.0).any():
                 raise InputError(
-                    f"the {of} of a frame scatters by {float(spread[of].max()):.3g}, expected less than "
-                    f"{1 / REACH_SIGMA:.3g}, lest it be drawn below zero"
+                    f"the {of} of a frame scatters by {float(spread[of].max()):.3g}",
+                    f"less than {1 / REACH_SIGMA:.3g}, lest it be drawn below zero",
+                    key=of,
+                    value=float(spread[of].max()),
                 )
         x, mean = self.components.quiet, self.components.mean_dn
         _, high = self._ends
@@ -288,8 +304,10 @@ class StareScene:
         if not (reach < REACH_DN).all():
             pixel = int(np.argmax(~(reach < REACH_DN)))
             raise InputError(
-                f"the stare carries pixel {pixel} of {x.name} to {reach[pixel]:.3g} DN in a frame, expected less than "
-                f"{REACH_DN:g}"
+                f"the stare carries pixel {pixel} of {x.name} to {reach[pixel]:.3g} DN in a frame",
+                f"less than {REACH_DN:g}",
+                key="flare",
+                value=float(reach[pixel]),
             )
         one = Cumulants.of(x, 1)
         for light, dark in self.extremes(flares):
@@ -297,7 +315,7 @@ class StareScene:
             other = x.read_noise_dn**2 + (0.0 if self.counts else x.gain_dn_per_electron * light)
             met = replace(one, gaussian=other, photons=photons, dark_dn=dark * one.dark_dn)
             if not joint_is_exact(met).all():
-                raise InputError(_apart(x.name))
+                raise _apart(x.name)
 
 
 def padded_frames(n_frames: int) -> int:
@@ -327,8 +345,10 @@ def _known(components: Components, stare: Stare) -> Floats:
     return np.asarray(_padded(np.stack([*changes, stare.light]), np.float32))
 
 
-def _apart(name: str) -> str:
-    return (
-        f"the noise of a frame of {name} cannot be drawn jointly under all conditions of the stare, expected Gaussian "
-        "noise of 1.5 Poisson counts and more in each pixel, more where counts are few"
+def _apart(name: str) -> InputError:
+    return InputError(
+        f"the noise of a frame of {name} cannot be drawn jointly under all conditions of the stare",
+        "Gaussian noise of 1.5 Poisson counts and more in each pixel, more where counts are few",
+        key="recipe",
+        value="joint",
     )

@@ -106,25 +106,36 @@ class Stare:
         for name in ("start_s", "star", "light", "sky", "temperature_c"):
             object.__setattr__(self, name, _kept(getattr(self, name)))
         if not (np.isfinite(self.frame_s) and self.frame_s > 0):
-            raise InputError(f"frame_s = {self.frame_s:g}, expected a time above 0")
+            raise InputError.of("frame_s", self.frame_s, "a time above 0")
         n = self.start_s.size
         if not 1 <= n <= MOST_FRAMES:
-            raise InputError(f"a stare of {n} frames, expected 1 to {MOST_FRAMES}")
+            raise InputError.of("n_frames", n, f"1 to {MOST_FRAMES}")
         for name, values in self._per_frame():
             if values.shape != (n,):
-                raise InputError(f"{name} of the stare has the shape {values.shape}, expected ({n},)")
+                raise InputError(
+                    f"{name} of the stare has the shape {values.shape}", f"({n},)", key=name, value=values.shape
+                )
             if not np.isfinite(values).all():
-                raise InputError(f"{name} of frame {int(np.argmin(np.isfinite(values)))} is not finite")
+                raise InputError(
+                    f"{name} of frame {int(np.argmin(np.isfinite(values)))} is not finite", "finite numbers", key=name
+                )
         off = np.abs(self.start_s / self.frame_s - self.numbers)
         if not (off < 1e-6).all() or self.numbers[0] < 0 or not (np.diff(self.numbers) > 0).all():
             raise InputError(
-                f"the frames of a stare start at {self.start_s[0]:g} ... {self.start_s[-1]:g} s, expected ascending "
-                f"multiples of {self.frame_s:g} s from 0"
+                f"the frames of a stare start at {self.start_s[0]:g} ... {self.start_s[-1]:g} s",
+                f"ascending multiples of {self.frame_s:g} s from 0",
+                key="start_s",
+                value=self.start_s,
             )
         for name, values in (("star", self.star), ("light", self.light), ("sky", self.sky)):
             if not (values >= 0).all():
                 k = int(np.argmin(values >= 0))
-                raise InputError(f"the factor on the {name} of frame {k} = {values[k]:g}, expected at least 0")
+                raise InputError(
+                    f"the factor on the {name} of frame {k} = {values[k]:g}",
+                    "at least 0",
+                    key=name,
+                    value=float(values[k]),
+                )
         for of, sd in self.jitters.items():
             _check_spread(f"{of} jitter", of, sd, least=0.0)
         for unknown in self.unknowns:
@@ -183,16 +194,21 @@ class Stare:
             For a length, gap or spread that cannot be, or nothing left between the gaps.
         """
         if not (np.isfinite(duration_s) and duration_s > 0 and np.isfinite(frame_s) and frame_s > 0):
-            raise InputError(f"a stare of {duration_s:g} s in frames of {frame_s:g} s, expected times above 0")
+            raise InputError(
+                f"a stare of {duration_s:g} s in frames of {frame_s:g} s",
+                "times above 0",
+                key="duration_s",
+                value=(duration_s, frame_s),
+            )
         count = np.ceil(duration_s / frame_s * (1 - 1e-12))
         if count > MOST_FRAMES:
-            raise InputError(f"a stare of {duration_s:g} s has {count:g} frames, expected at most {MOST_FRAMES}")
+            raise InputError.of("duration_s", duration_s, f"at most {MOST_FRAMES} frames", unit="s")
         if not (np.isfinite(orbit_s) and orbit_s > 0):
-            raise InputError(f"orbit_s = {orbit_s:g}, expected a period above 0")
+            raise InputError.of("orbit_s", orbit_s, "a period above 0")
         start: Float = np.arange(max(1, int(count)), dtype=np.float64) * float(frame_s)
         start = start[_outside(gaps, start, float(frame_s))]
         if not start.size:
-            raise InputError(f"the gaps leave no frame of a stare of {duration_s:g} s, expected some")
+            raise InputError(f"the gaps leave no frame of a stare of {duration_s:g} s", "some", key="gaps", value=gaps)
 
         def over_frames(curve: Curve | None) -> Float:
             return np.zeros(start.size) if curve is None else curve.mean_over(start, float(frame_s))
@@ -201,7 +217,7 @@ class Stare:
         known = STARE_CHANGES["jitters"]
         other = next((name for name in spread if name not in known), None)
         if other is not None:
-            raise InputError(f"a jitter of {other!r}, expected one of {', '.join(known)}")
+            raise InputError.of("jitters", other, f"one of {', '.join(known)}")
         return cls(
             start,
             float(frame_s),
@@ -283,7 +299,7 @@ def _outside(gaps: Sequence[tuple[float, float]], start: Float, frame_s: float) 
     kept, hair = np.ones(start.size, np.bool_), 1e-9 * frame_s
     for first, last in gaps:
         if not (np.isfinite([first, last]).all() and first < last):
-            raise InputError(f"a gap from {first:g} to {last:g} s, expected two times, ascending")
+            raise InputError.of("gaps", (first, last), "two times, ascending", unit="s")
         kept &= (start + frame_s <= first + hair) | (start >= last - hair)
     return kept
 
@@ -314,7 +330,7 @@ def _kept(values: Float) -> Float:
 
 def _check_of(name: str, of: str) -> None:
     if of not in CHANGING:
-        raise InputError(f"the unknown {name!r} is of {of!r}, expected one of {', '.join(CHANGING)}")
+        raise InputError.of("of", of, f"one of {', '.join(CHANGING)}")
 
 
 def _check_spread(name: str, of: Changing, sd: float, least: float = 1e-300) -> None:
@@ -322,4 +338,4 @@ def _check_spread(name: str, of: Changing, sd: float, least: float = 1e-300) -> 
     if not least <= sd <= most:
         unit = STARE_CHANGES["offsets"][of].unit
         above = "0" if least == 0 else "above 0"
-        raise InputError(f"the {name} has the standard deviation {sd:g}, expected {above} to {most:g} {unit}".rstrip())
+        raise InputError.of(name, sd, f"a standard deviation of {above} to {most:g} {unit}".rstrip())

@@ -73,7 +73,9 @@ class SumTable:
         covariance = constant + each[: len(STEADY)].sum(axis=0)
         sd = np.sqrt(np.diag(covariance))
         if (sd == 0).any() or np.linalg.eigvalsh(covariance / np.outer(sd, sd))[0] < 1e-9:
-            raise InputError(f"{n} spectral weights of which one is a sum of others, expected independent ones")
+            raise InputError(
+                f"{n} spectral weights of which one is a sum of others", "independent ones", key="weights", value=n
+            )
         lower = np.linalg.cholesky(covariance)
         white = Components(
             components.quiet,
@@ -106,7 +108,12 @@ def check_sums(scene: StareScene, flares: Flares) -> None:
     InputError
     """
     if scene.scene.cosmic:
-        raise InputError("cosmic rays with method 'cumulants', expected method 'pixels': they are rare and large")
+        raise InputError(
+            "cosmic rays with method 'cumulants'",
+            "method 'pixels': they are rare and large",
+            key="method",
+            value="cumulants",
+        )
     x = scene.components.quiet
     used = (scene.components.weights != 0).any(axis=0)
     for light, dark in scene.extremes(flares):
@@ -117,14 +124,18 @@ def check_sums(scene: StareScene, flares: Flares) -> None:
         if near.any():
             pixel = int(np.argmax(near))
             raise InputError(
-                f"pixel {pixel} of {x.name} comes within {RAIL_SIGMA:g} sigma of zero or saturation and has a weight, "
-                "expected method 'pixels', which clips, or weight 0 there"
+                f"pixel {pixel} of {x.name} comes within {RAIL_SIGMA:g} sigma of zero or saturation and has a weight",
+                "method 'pixels', which clips, or weight 0 there",
+                key="method",
+                value="cumulants",
             )
         if (used & (variance < LEAST_VARIANCE)).any():
             pixel = int(np.argmax(used & (variance < LEAST_VARIANCE)))
             raise InputError(
-                f"pixel {pixel} of {x.name} scatters by {sd[pixel]:.2g} DN, too little for its rounding to be noise, "
-                "expected method 'pixels'"
+                f"pixel {pixel} of {x.name} scatters by {sd[pixel]:.2g} DN, too little for its rounding to be noise",
+                "method 'pixels'",
+                key="method",
+                value="cumulants",
             )
 
 
@@ -167,8 +178,11 @@ def _fourths_are_needed(components: Components) -> bool:
     if (beyond > least).any():
         row = int(np.argmax(beyond))
         raise InputError(
-            f"the sum with spectral weight {row} has a skewness of {abs(shapes[0][row]):.2g} in a frame of "
-            f"{components.quiet.name}, too much for method 'cumulants', expected method 'pixels'"
+            f"the sum with spectral weight {row} has a skewness of {abs(shapes[0][row]):.2g} in a frame "
+            f"of {components.quiet.name}, too much for method 'cumulants'",
+            "method 'pixels'",
+            key="method",
+            value="cumulants",
         )
     g3, g4 = shapes[0], shapes[1]
     cubic, linear = g4 / 24 - g3**2 / 18, g3**2 * (5 / 36 - 6 / 36)
