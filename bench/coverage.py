@@ -2,8 +2,9 @@
 
     python bench/coverage.py [--fits 4000] [--device NAME] [--output bench/results/coverage.ecsv]
 
-M3V at V = 9, 50 s; exposures are drawn pixel by pixel. S/N is that with everything known. "free": dark and star with no
-prior, sky with one of 10 %, drawn as dark 0.5 deg C, light 1 %, sky 10 %.
+M3V at V = 9, 50 s; exposures are drawn pixel by pixel. S/N is what is left of the flare when the unknowns are
+marginalised over. "free": dark and star with no prior, sky with one of 10 %, drawn as dark 0.5 deg C, light 1 %, sky 10 %.
+The column "curvature" states how far the quantity is from linear in what is uncertain: see `curvature`.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from astropy.table import Table
 from tables import processor, versions, write
 
 from mauvecl import BalmerFlare, Engine, FlareModel, Instrument, Nuisances, Source, expect, fit, forecast
+from mauvecl.results.measurements.model import derived_values
+from mauvecl.results.measurements.reduction import Reduction
 from mauvecl.statistics.intervals import clopper_pearson
 
 SNRS, TEMPERATURES_K = (3.0, 5.0, 10.0, 30.0, 100.0, 300.0), (6_000.0, 10_000.0, 20_000.0, 30_000.0)
@@ -27,7 +30,7 @@ DRAWN = {"dark": 0.5, "star": 0.01, "sky": 0.1}
 def main() -> None:
     """Print the table and write it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--fits", type=int, default=4000)
+    parser.add_argument("--fits", type=int, default=10_000)
     parser.add_argument("--device")
     parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results" / "coverage.ecsv")
     options = parser.parse_args()
@@ -43,32 +46,29 @@ def main() -> None:
                     amplitude = 0.5
                     for _ in range(8):
                         linear = model.amplitudes(kelvin, amplitude, jump=jump)
-                        amplitude *= snr / forecast(quiet, model, kelvin, linear).snr
+                        amplitude *= snr / forecast(quiet, model, kelvin, linear, unknown).snr
                     lit = expect(star.flaring(amplitude, spectrum=BalmerFlare(kelvin, jump)), mauve, exposure=50.0)
                     raw = engine.realise(lit, count=options.fits, seed=len(rows)).astype(np.float64)
                     if unknown is not None:
                         sizes = np.array([DRAWN[name] for name in unknown.names])
                         raw += (rng.standard_normal((options.fits, sizes.size)) * sizes) @ unknown.spectra
                     found = fit(raw, quiet, model, unknown)
-                    truth = model.values(kelvin, model.amplitudes(kelvin, amplitude, jump=jump))
+                    linear = model.amplitudes(kelvin, amplitude, jump=jump)
+                    truth = model.values(kelvin, linear)
+                    plain = forecast(quiet, model, kelvin, linear).snr
+                    bend = dict(zip(model.names, curvature(quiet, model, kelvin, linear, unknown), strict=True))
+                    where = jump, "known" if unknown is None else "free", kelvin, snr, plain
                     for name in QUANTITIES:
                         if name in found.names:
-                            rows.append(
-                                (
-                                    jump,
-                                    "known" if unknown is None else "free",
-                                    kelvin,
-                                    snr,
-                                    name,
-                                    *covered(found, name, truth),
-                                )
-                            )
+                            rows.append((*where, name, bend[name], *covered(found, name, truth)))
     names = (
         "jump",
         "unknowns",
         "temperature",
         "snr",
+        "snr_known",
         "quantity",
+        "curvature",
         "coverage_68",
         "coverage_95",
         "low_95",
@@ -76,11 +76,30 @@ def main() -> None:
         "one_sided",
     )
     table = Table(rows=rows, names=names)
-    for name in names[5:]:
+    for name in names[6:]:
         table[name].format = ".4f"
     write(
         table, options.output, fits=options.fits, processor=processor(), device=engine.device_name, versions=versions()
     )
+
+
+def curvature(quiet, model: FlareModel, kelvin: float, linear: np.ndarray, unknown) -> np.ndarray:
+    """Return how far quantities are from linear within one standard error: second over first order of their change.
+
+    Along the amplitudes that fit best at temperatures one standard error below and above the true one.
+    """
+    reduction = Reduction.of(model, quiet, model.counts(kelvin, linear), unknown)
+    error = forecast(quiet, model, kelvin, linear, unknown)
+    log_k = np.log(kelvin)
+    step = min(error.errors[0] / kelvin, np.log(kelvin / 3000.0), np.log(200_000.0 / kelvin))
+    signal = linear[0] * reduction.spline(log_k) + linear[1:] @ reduction.fixed
+    values = []
+    for there in (log_k - step, log_k, log_k + step):
+        components = np.vstack([reduction.spline(there), reduction.fixed])
+        best = np.linalg.lstsq(components.T, signal, rcond=None)[0]
+        values.append(derived_values(model, np.array([there]), best[None])[0])
+    second = np.abs(values[0] + values[2] - 2 * values[1]) / 2
+    return second / error.errors
 
 
 def covered(found, name: str, truth: dict[str, float]) -> tuple[float, ...]:

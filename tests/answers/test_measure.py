@@ -44,6 +44,7 @@ def test_the_right_model_covers_and_the_simple_one_is_rejected(jump: MeasureAnsw
     assert quality["blackbody"]["rejected"] > 0.99
     assert quality["balmer"]["rejected"] < 0.05
     assert any("'blackbody' gives" in text for text in jump.messages)
+    assert not any("cover 94" in text for text in jump.messages)
     # Known: MEASURE's table of a jump of 2.5 has S/N 134.56 and a blackbody of 12 170 K with everything known.
     assert quality["balmer"]["snr"] == pytest.approx(134.56, rel=0.01)
 
@@ -78,6 +79,7 @@ def test_detected_flares_near_the_threshold_are_too_bright(engine: Engine) -> No
     rows = {row["quantity"]: row for row in one.rows()}
     assert rows["flux 200-320 nm"]["bias_selected"] > rows["flux 200-320 nm"]["bias"]
     assert rows["flux 200-320 nm"]["bias_selected"] > 0
+    assert any("intervals of 95 % cover 94 to 99 %" in text for text in answer.messages)
 
 
 @pytest.mark.parametrize("amplitude", [1e-4, 0.01, 30.0])

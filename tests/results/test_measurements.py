@@ -6,6 +6,7 @@ Draws are normal with the variance of the flaring exposure, by seeds fixed befor
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ import scipy
 from refusals import refused
 
 from mauvecl import Engine, Expectation, Instrument, Nuisances, Source, expect
-from mauvecl.host.stars.flare_spectra import LINES_NM, BalmerFlare
+from mauvecl.host.stars.flare_spectra import LINES_NM, BalmerFlare, ObservedFlare
 from mauvecl.results.measurements.fit import fit, fit_sums, forecast
 from mauvecl.results.measurements.model import FlareModel
 from mauvecl.results.measurements.reduction import Reduction, drawn_sums
@@ -259,6 +260,37 @@ def test_bounded_intervals_are_those_of_brute_force() -> None:
         assert (found.estimates[k] >= np.array(found.bounds)).all()
     line = found.column("line Mg II")
     assert found.one_sided[0, :, line].any()
+
+
+@pytest.mark.parametrize(
+    ("file", "misfits", "jumps", "optical_k"),
+    [("spectra/ADLeo_912s.dat", (150.0, 120.0), (1.4, 2.1), (8500.0, 10_500.0)),
+     ("flares/ADLeo_1497s.dat", (10.0, 10.0), (1.2, 3.0), (6500.0, 12_500.0))],
+    ids=["912s", "1497s"],
+)  # fmt: skip
+def test_great_flare_of_ad_leo(
+    file: str, misfits: tuple[float, float], jumps: tuple[float, float], optical_k: tuple[float, float]
+) -> None:
+    """The mean exposure: no blackbody, a Balmer jump, and the 9500 K of the optical within its interval."""
+    data, units = Path(__file__).parents[1] / "data", {"wavelength_unit": "Angstrom"}
+    ad_leo = Source.read(data / "flares" / "adleo_quiescent2.dat", extend="M3V", **units)  # type: ignore[arg-type]
+    flare = ObservedFlare.read(data / file, data / "flares" / "adleo_quiescent2.dat", continue_at_k=9500.0, **units)  # type: ignore[arg-type]
+    nm = flare.grid(ad_leo.wavelength_nm)
+    light = np.interp(nm, ad_leo.wavelength_nm, ad_leo.flux_flam) + flare.flux(nm)
+    x, lit = (expect(one, MAUVE, exposure=50.0) for one in (ad_leo, Source(nm, light, "flaring", "test")))
+    plain, jump = (FlareModel.of(ad_leo, MAUVE, x, jump=with_jump) for with_jump in (False, True))
+    gap = (322.0, 368.0)
+    assert fit(lit.recorded_dn, x, plain).chi2[0] > misfits[0]
+    assert fit(lit.recorded_dn, x, plain, skipped_nm=[gap]).chi2[0] > misfits[1]
+    column = jump.names.index("jump")
+    for skipped in ([gap], [(200.0, 300.0), gap]):
+        found = fit(lit.recorded_dn, x, jump, skipped_nm=skipped)
+        assert jumps[0] < found.estimates[0, column] < jumps[1]
+    assert found.chi2[0] < misfits[0] / 1.5
+    assert found.low[1, 0, 0] < 9500.0 < found.high[1, 0, 0]
+    optical = fit(lit.recorded_dn, x, plain, skipped_nm=[(200.0, 400.0)])
+    assert optical_k[0] < optical.low[0, 0, 0] < 9500.0 < optical.high[1, 0, 0]
+    assert optical.estimates[0, 0] < optical_k[1]
 
 
 def test_limits_at_a_bound_cover() -> None:

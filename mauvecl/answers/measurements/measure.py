@@ -53,6 +53,8 @@ BIN_COLUMNS = (
     Column("flux_bolometric", heading="bolometric flux (erg/s/cm2)", format=".3g"),
     Column("p_value", heading="p-value", format=".2g"),
 )
+#: S/N below which the coverage of intervals differs from their nominal one, by bench/coverage.py.
+WILKS_SNR = 10.0
 #: A good fit is rejected where one of its p-value is less probable.
 REJECTED = 0.01
 
@@ -251,7 +253,7 @@ def measure(
     stares = [measured_stare(case, engine, snr) for case in prepared if snr is not None]
     messages = collect_messages(expectations)
     messages += [one.drawn for one in stares if isinstance(one.drawn, str)]
-    return MeasureAnswer(study, flares, [*messages, *_wrong(flares)], stares)
+    return MeasureAnswer(study, flares, [*messages, *_faint(flares), *_wrong(flares)], stares)
 
 
 def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine | Pool) -> list[MeasuredFlare]:
@@ -298,6 +300,17 @@ def _coverage(found: Measurement, truth: Float, level: int, which: NDArray[np.bo
 def _scatter(estimates: Float) -> Float:
     low, high = np.quantile(estimates, [0.15865, 0.84135], axis=0)
     return np.asarray((high - low) / 2)
+
+
+def _faint(flares: Sequence[MeasuredFlare]) -> list[str]:
+    """Return a message for each flare whose intervals are approximate because it is faint."""
+    found = {f"{one.title}, flare of {100 * one.amplitude:g} %": one.snr[1] for one in flares}
+    return [
+        f"{title}: of an S/N of {snr:.2g} with unknowns marginalised over; below {WILKS_SNR:g} intervals of 95 % cover "
+        "94 to 99 %: the table counts how often they do."
+        for title, snr in found.items()
+        if snr < WILKS_SNR
+    ]
 
 
 def _wrong(flares: Sequence[MeasuredFlare]) -> list[str]:
