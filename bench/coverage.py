@@ -3,8 +3,8 @@
     python bench/coverage.py [--fits 4000] [--device NAME] [--output bench/results/coverage.ecsv]
 
 M3V at V = 9, 50 s; exposures are drawn pixel by pixel. S/N is what is left of the flare when the unknowns are
-marginalised over. "free": dark and star with no prior, sky with one of 10 %, drawn as dark 0.5 deg C, light 1 %, sky 10 %.
-The column "curvature" states how far the quantity is from linear in what is uncertain: see `curvature`.
+marginalised over. "free": dark and star with no prior, sky with one of 10 %, drawn as dark 0.5 deg C, light 1 %, sky
+10 %. The column "curvature" states how far the quantity is from linear in what is uncertain: see `curvature`.
 """
 
 from __future__ import annotations
