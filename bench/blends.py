@@ -18,8 +18,9 @@ from mauvecl.answers.stares.stare import _log_energy
 from mauvecl.lightcurve.flares.events import Event, coefficients
 from mauvecl.lightcurve.search.alarms import Alarm, alarms
 from mauvecl.lightcurve.search.blends import Factor
+from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
-from mauvecl.study.surveys import StarSurvey, survey_star
+from mauvecl.study.surveys import StarSurvey
 
 THRESHOLD = 4.92
 SQUARE = 0.72148
@@ -30,13 +31,17 @@ FIRST_SEED = 1000
 class Known:
     """A star's search, and the energies of flares at it."""
 
-    study: Study
-    surveyed: StarSurvey
+    case: Case
+
+    @property
+    def surveyed(self) -> StarSurvey:
+        """The star's search."""
+        return self.case.survey
 
     @cached_property
     def log_energy(self) -> Factor | None:
         """As `stare` has it."""
-        return _log_energy(self.study, self.study.star[0], self.surveyed)
+        return _log_energy(self.case)
 
 
 def found(known: Known, events: list[Event], seed: int) -> list[Alarm]:
@@ -118,5 +123,5 @@ def _peak(alarm: Alarm) -> float:
 if __name__ == "__main__":
     study = Study().with_settings(['star=[{library="M3V", magnitude=9, distance_pc=5}]'])
     what, number, snrs = sys.argv[1], int(sys.argv[2]), tuple(float(each) for each in sys.argv[3:])
-    known = Known(study, survey_star(study, study.star[0]))
+    known = Known(Case(study))
     {"coverage": coverage, "pairs": pairs}[what](known, number, *((snrs,) if snrs else ()))

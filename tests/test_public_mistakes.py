@@ -41,7 +41,7 @@ INNER = (
     "Detection.collect", "Detection.of", "DaskWorkers", "LocalWorkers.submit", "Engine.count", "Linear.", "TableShape.",
     "Nuisances.rows", "Nuisances.finite", "Processes.factors", "Normal.quantile", "Uniform.quantile",
     "Stares.", "Pool.stares", "Sinusoid.mean_over", "PixelMap.over", "Instrument.per_pixel", "Stare.along",
-    "Engine.realise_and_count", "Study.detecting", "bulk.unfinished", "bulk.state", "bulk.draw",
+    "Engine.realise_and_count", "bulk.unfinished", "bulk.state", "bulk.draw",
 )  # fmt: skip
 
 

@@ -10,15 +10,22 @@ from typing import TYPE_CHECKING, Any, Self
 from mauvecl.study.questions import Sweep
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from mauvecl.host.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.sky.zodiacal import Sky
     from mauvecl.host.stars.source import Source
+    from mauvecl.lightcurve.flares.events import Event
+    from mauvecl.lightcurve.stares.observed import StareExpectation
+    from mauvecl.lightcurve.stares.stare import Stare
     from mauvecl.noise.processes import Processes
     from mauvecl.statistics.nuisances import Nuisances
     from mauvecl.statistics.statistic import Setting
     from mauvecl.study.sections import Observation, SkyLight, Star
     from mauvecl.study.study import Study
+    from mauvecl.study.surveys import StarSurvey
 
 
 #: Number of stars whose spectra a study's cases keep, since a sweep may have any number of them.
@@ -61,7 +68,7 @@ class Case:
 
     study: Study  # with this star alone, at these values, without a sweep
     at: Mapping[str, float | str] = field(default_factory=dict)  # sweep values by quantity
-    loader: Loader = field(default_factory=Loader)
+    loader: Loader = field(default_factory=Loader, compare=False, repr=False)
 
     @property
     def star(self) -> Star:
@@ -178,6 +185,50 @@ class Case:
         """The same case with an exposure of a single frame."""
         exposure = {"exposure_s": self.instrument.frame_s}
         return self.with_sections(observation=self.study.observation.model_copy(update=exposure))
+
+    def flare_electrons(self, temperatures_k: NDArray[np.float64] | tuple[float, ...]) -> NDArray[np.float64]:
+        """Return the electrons that flares of unit amplitude add to an exposure, shape (n_temperature, n_pixel).
+
+        Raises InputError if some lines of the flare do not scale with its amplitude.
+        """
+        import numpy as np
+
+        from mauvecl.host.stars.flare import check_scales
+
+        check_scales(self.study.flare.light())
+        # A flare that replaces photosphere is linear in its amplitude, but an amplitude of 1 may exceed the whole disc.
+        unit = 1.0 if self.study.flare.geometry == "added" else 0.01
+        flaring = self.expect(*(self.flaring(unit, float(k)) for k in temperatures_k))
+        electrons = [(x.source_electrons - self.quiet.source_electrons) / unit for x in flaring]
+        return np.reshape(electrons, (len(temperatures_k), self.quiet.wavelength_nm.size))
+
+    @cached_property
+    def stare(self) -> Stare:
+        """The study's stare."""
+        from mauvecl.study.stare_expectation import stare_of
+
+        return stare_of(self)
+
+    @cached_property
+    def stare_expectation(self) -> StareExpectation:
+        """Expectation of the stare at the star, with its flares."""
+        from mauvecl.study.stare_expectation import expect_stare
+
+        return expect_stare(self)
+
+    @cached_property
+    def events(self) -> list[Event]:
+        """Flares in the stare."""
+        from mauvecl.study.stare_expectation import events_of
+
+        return events_of(self)
+
+    @cached_property
+    def survey(self) -> StarSurvey:
+        """Search of the stare for flares."""
+        from mauvecl.study.surveys import survey_star
+
+        return survey_star(self)
 
 
 def cases(study: Study, *, swept: bool = True) -> list[Case]:

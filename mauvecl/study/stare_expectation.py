@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.stars.flare import check_scales
 from mauvecl.lightcurve.flares.energies import EnergyScale, Kind, amplitude_of, amplitude_of_peak
 from mauvecl.lightcurve.flares.events import Cooling, Event, check_seen, coefficients, temperatures_of
 from mauvecl.lightcurve.stares.observed import StareExpectation
@@ -20,20 +19,20 @@ from mauvecl.study.stare_section import EventText
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from mauvecl.host.stars.source import Source
     from mauvecl.lightcurve.stares.curves import Curve
-    from mauvecl.study.sections import Star
+    from mauvecl.study.cases import Case
+    from mauvecl.study.sections import NoiseProcesses
     from mauvecl.study.stare_section import CurveText
     from mauvecl.study.study import Study
 
 Float = NDArray[np.float64]
 
 
-def refuse_priors(study: Study) -> None:
+def refuse_priors(processes: NoiseProcesses) -> None:
     """Raise InputError for processes that only apply to single exposures, in questions about stares."""
-    processes = study.processes.processes()
-    if processes.modulations:
-        name, _ = processes.modulations[0]
+    modulations = processes.processes().modulations
+    if modulations:
+        name, _ = modulations[0]
         raise InputError(
             f"processes.{name} applies to single exposures only",
             "jitters, offsets, drifts or cycles in [stare]",
@@ -41,13 +40,13 @@ def refuse_priors(study: Study) -> None:
         )
 
 
-def stare_of(study: Study) -> Stare:
-    """Return the stare of a study.
+def stare_of(case: Case) -> Stare:
+    """Return the stare of a case.
 
     Raises InputError if the study has processes that only apply to single exposures.
     """
-    refuse_priors(study)
-    q, instrument = study.stare, study.observation.load_instrument()
+    study, q, instrument = case.study, case.study.stare, case.instrument
+    refuse_priors(study.processes)
     spreads: dict[str, dict[Changing, float]] = {
         how: {of: getattr(q, how)[of] for of in CHANGING if of in getattr(q, how)} for how in COURSES
     }
@@ -97,31 +96,19 @@ def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare
     )
 
 
-def expect_stare(study: Study, star: Star) -> tuple[StareExpectation, list[Event]]:
-    """Compute the expectation of a study's stare at a star, and return it with its flares."""
-    source, stare = star.source(), stare_of(study)
-    events = events_of(study, star, source)
+def expect_stare(case: Case) -> StareExpectation:
+    """Compute the expectation of a case's stare with its flares."""
+    stare, events = case.stare, case.events
     check_seen(events, stare.start_s, stare.frame_s)
-    check_scales(study.flare.light())
     kelvin = temperatures_of(events)
-    frames = study.model_copy(
-        update={"observation": study.observation.model_copy(update={"exposure_s": stare.frame_s})}
-    )
-    # A flare that replaces photosphere is linear in its amplitude, but an amplitude of 1 may exceed the whole disc.
-    unit = 1.0 if study.flare.geometry == "added" else 0.01
-    flares = [
-        frames.model_copy(update={"flare": study.flare.model_copy(update={"temperature_k": float(k)})}) for k in kelvin
-    ]
-    quiet, *flaring = frames.expect([source, *(one.flaring(source, unit) for one in flares)])
-    electrons = [(x.source_electrons - quiet.source_electrons) / unit for x in flaring]
-    spectra = np.reshape(electrons, (kelvin.size, quiet.wavelength_nm.size))
-    return StareExpectation(quiet, stare, spectra, coefficients(events, stare.start_s, stare.frame_s, kelvin)), events
+    amplitudes = coefficients(events, stare.start_s, stare.frame_s, kelvin)
+    return StareExpectation(case.one_frame.quiet, stare, case.one_frame.flare_electrons(kelvin), amplitudes)
 
 
-def unused_lines(study: Study, staring: StareExpectation, events: Sequence[Event]) -> list[str]:
+def unused_lines(case: Case) -> list[str]:
     """Return messages about settings without effect on the stare: the exposure, and flares that peak outside it."""
-    exposure_s, frame_s = study.observation.exposure_s, staring.stare.frame_s
-    lines = check_seen(events, staring.stare.start_s, frame_s)
+    exposure_s, frame_s = case.study.observation.exposure_s, case.stare.frame_s
+    lines = check_seen(case.events, case.stare.start_s, frame_s)
     if exposure_s != frame_s:
         lines.insert(
             0, f"A stare is made of frames of {frame_s:g} s: observation.exposure_s = {exposure_s:g} s is not used."
@@ -129,14 +116,14 @@ def unused_lines(study: Study, staring: StareExpectation, events: Sequence[Event
     return lines
 
 
-def orbit_lines(study: Study) -> list[str]:
+def orbit_lines(case: Case) -> list[str]:
     """Return messages about the orbit of a stare with `along_orbit`."""
     from mauvecl.host.orbit.time_grid import DAY_S, TimeGrid
 
-    if not study.stare.along_orbit:
+    if not case.study.stare.along_orbit:
         return []
-    o = study.orbit
-    times = TimeGrid(o.start, study.stare.duration_s / DAY_S, study.observation.load_instrument().frame_s)
+    o = case.study.orbit
+    times = TimeGrid(o.start, case.study.stare.duration_s / DAY_S, case.instrument.frame_s)
     assumed = (
         "Limits, temperatures and windows of a stare along the orbit are assumptions; stray light is not modelled."
     )
@@ -152,51 +139,49 @@ def threshold_line(title: str, threshold: float) -> str:
     )
 
 
-def energy_scale(study: Study, star: Star, source: Source, kind: Kind, flare_k: float) -> EnergyScale | None:
+def energy_scale(case: Case, kind: Kind, flare_k: float) -> EnergyScale | None:
     """Return the energy of flares of a temperature per second of equivalent duration.
 
     It follows from the star's distance or else from its radius and temperature; None if neither is known.
     """
-    flare = study.flare
+    flare, star = case.study.flare, case.star
     how: dict[str, Any] = {
         "band": flare.band, "flare": flare.light(flare_k), "kind": kind, "geometry": flare.geometry,
         "photosphere_k": flare.photosphere_temperature_k,
     }  # fmt: skip
     if star.distance_pc is not None:
-        return EnergyScale.of_star(source, star.distance_pc, **how)
+        return EnergyScale.of_star(case.source, star.distance_pc, **how)
     if star.radius_rsun is not None and star.effective_temperature_k is not None:
         return EnergyScale.of_blackbody(star.radius_rsun, star.effective_temperature_k, **how)
     return None
 
 
-def energy_of(
-    study: Study, star: Star, source: Source, event: Event, kind: Kind, temperatures_k: Float | None = None
-) -> float | None:
+def energy_of(case: Case, event: Event, kind: Kind, temperatures_k: Float | None = None) -> float | None:
     """Return the energy of a flare, erg, or None if the star's distance and radius are unknown.
 
     `temperatures_k` are the temperatures between which flare spectra are interpolated; see `Event.total_energy`.
     """
-    if energy_scale(study, star, source, kind, event.hottest_k) is None:
+    if energy_scale(case, kind, event.hottest_k) is None:
         return None
 
     def scale_of(kelvin: float) -> EnergyScale:
-        scale = energy_scale(study, star, source, kind, kelvin)
+        scale = energy_scale(case, kind, kelvin)
         assert scale is not None
         return scale
 
     return event.total_energy(scale_of, temperatures_k)
 
 
-def events_of(study: Study, star: Star, source: Source) -> list[Event]:
-    """Return the flares of a star: `events`, or one per energy or amplitude, evenly spaced over the stare.
+def events_of(case: Case) -> list[Event]:
+    """Return the flares of a case: `events`, or one per energy or amplitude, evenly spaced over the stare.
 
     Raises InputError if an energy is given for a star of unknown distance and radius.
     """
-    texts = study.events or _evenly_spaced(study)
-    events = [_event(study, text) for text in texts]
+    texts = case.study.events or _evenly_spaced(case.study)
+    events = [_event(case.study, text) for text in texts]
     # The spectrum of a cooling flare is interpolated between the temperatures of all flares.
     kelvin = temperatures_of(events)
-    return [_of_energy(study, star, source, text, event, kelvin) for text, event in zip(texts, events, strict=True)]
+    return [_of_energy(case, text, event, kelvin) for text, event in zip(texts, events, strict=True)]
 
 
 def _evenly_spaced(study: Study) -> Sequence[EventText]:
@@ -230,15 +215,15 @@ def _event(study: Study, text: EventText) -> Event:
     return Event(text.peak_s, half, amplitude, temperature, shape)
 
 
-def _of_energy(study: Study, star: Star, source: Source, text: EventText, event: Event, temperatures_k: Float) -> Event:
+def _of_energy(case: Case, text: EventText, event: Event, temperatures_k: Float) -> Event:
     """Return the flare with the amplitude that follows from its energy, if one is given."""
     if text.energy_erg is None:
         return event
     # The energy is linear in the amplitude.
-    one = energy_of(study, star, source, event, text.energy, temperatures_k)
+    one = energy_of(case, event, text.energy, temperatures_k)
     if one is None:
         raise InputError(
-            f"the amplitude of a flare of {text.energy_erg:g} erg on {source.name} is unknown",
+            f"the amplitude of a flare of {text.energy_erg:g} erg on {case.source.name} is unknown",
             "the star's distance_pc, or radius_rsun and effective_temperature_k",
             key="events.energy_erg",
             value=text.energy_erg,

@@ -36,9 +36,6 @@ if TYPE_CHECKING:
     import astropy.units as u
 
     from mauvecl.host.expectation import Expectation
-    from mauvecl.host.stars.source import Source
-    from mauvecl.noise.processes import Prior
-    from mauvecl.statistics.statistic import Setting
 
 #: The paper's two stars.
 PAPER_STARS = (Star(library="K3V", magnitude=3.7), Star(library="G2V", magnitude=7.4))
@@ -246,79 +243,11 @@ class Study(Section):
         one = QUANTITIES[quantity]
         return self.with_value(one.path, one.checked(value))
 
-    def unknown_priors(self) -> dict[str, Prior]:
-        """Return the priors of unknown instrument values; values that the study sets are known."""
-        stated = {*self.observation.changes, *(() if self.observation.temperature_c is None else ("temperature_c",))}
-        priors = {name: prior for name, prior in self.unknowns.priors().items() if name not in stated}
-        if self.unknowns.draws and not priors:
-            raise InputError("no instrument value is unknown", "a prior, or unknowns.draws = 0", key="unknowns.draws")
-        return priors
-
-    def cells(self) -> list[tuple[dict[str, float | str], Self]]:
-        """Return the values of each cell of the sweep, and the study at these values."""
-        cells = []
-        for values in self.sweep.cells():
-            study = self.model_copy(update={"sweep": Sweep()})
-            for quantity, value in values.items():
-                study = study.at(quantity, value)
-            cells.append((values, study))
-        return cells
-
-    @property
-    def drawing(self) -> dict[str, Any]:
-        """Arguments of the engine's methods: mode, recipe and processes."""
-        o = self.observation
-        processes = self.processes.processes()
-        if self.nuisances.usual:
-            processes = self.nuisances.processes(processes, self.observation.load_instrument().temperature_c)
-        return {"mode": o.mode, "recipe": o.recipe, "processes": processes}
-
-    def detecting(self, quiet: Expectation) -> dict[str, Any]:
-        """Return all arguments of `Engine.detect` except expectations and seed.
-
-        Parameters
-        ----------
-        quiet : Expectation
-            The star without a flare, for which nuisance spectra are computed.
-        """
-        run = self.run
-        how = {"realisations": run.realisations, "statistics": run.statistics, "tails": run.tails}
-        marginal = {"nuisances": self.nuisances.marginalised(quiet)}
-        return self.drawing | how | marginal | {"comparison": run.comparison()}
-
-    def setting(self, quiet: Expectation, *flares: Expectation) -> Setting:
-        """Return the input of statistics for closed forms."""
-        from mauvecl.noise.factor_distributions import FactorDistributions
-        from mauvecl.statistics.statistic import Setting
-
-        unknown = self.nuisances.marginalised(quiet)
-        drawn = FactorDistributions.from_processes(self.drawing["processes"], quiet) if unknown else None
-        return Setting(quiet, ~quiet.saturated, self.run.comparison(), flares, unknown, drawn)
-
     def expectations(self, star: Star) -> list[Expectation]:
         """Return the expectations of a star without a flare and with each flare."""
         from mauvecl.study.cases import Case
 
         return Case(self.model_copy(update={"star": (star,)})).expectations
-
-    def flaring(self, source: Source, amplitude: float) -> Source:
-        """Return a star with a flare of the study's spectrum and geometry."""
-        f = self.flare
-        return source.flaring(
-            amplitude,
-            spectrum=f.light(),
-            band=f.band,
-            geometry=f.geometry,
-            photosphere_temperature=f.photosphere_temperature_k,
-        )
-
-    def expect(self, sources: list[Source]) -> list[Expectation]:
-        """Compute the expectations of sources for the study's instrument, sky and exposure."""
-        from mauvecl.host.expectation import expect
-
-        instrument, sky, o = self.observation.load_instrument(), self.sky.sky(), self.observation
-        how: dict[str, Any] = {"exposure": o.exposure_s, "sky": sky, "order": o.order, "signal": o.signal}
-        return [expect(s, instrument, **how) for s in sources]
 
 
 def _has_values(data: Any) -> bool:

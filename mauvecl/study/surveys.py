@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.stars.flare import check_scales
 from mauvecl.lightcurve.flares.shapes import shape_of
 from mauvecl.lightcurve.search.bank import Bank
 from mauvecl.lightcurve.search.flare_fit import Fit
@@ -17,14 +16,12 @@ from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates, frame
 from mauvecl.lightcurve.stares.components import Components
 from mauvecl.schema.errors import InputError
 from mauvecl.study.flare_light import FlareLight
-from mauvecl.study.stare_expectation import energy_scale, stare_of
+from mauvecl.study.stare_expectation import energy_scale
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
-    from mauvecl.host.stars.source import Source
+    from mauvecl.study.cases import Case
     from mauvecl.study.searches import Size
-    from mauvecl.study.sections import Flare, Star
-    from mauvecl.study.study import Study
 
 #: Default range of injected sizes, in units of the size with a completeness of one half.
 DEFAULT_RANGE = (0.3, 3.0)
@@ -34,7 +31,6 @@ DEFAULT_RANGE = (0.3, 3.0)
 class StarSurvey:
     """A star of a study with its search."""
 
-    source: Source
     quiet: Expectation  # of one frame
     templates: Templates
     survey: Survey  # its only flare component is the study's flare
@@ -53,18 +49,14 @@ class StarSurvey:
         return float(np.linalg.norm(x.means(unit)))
 
 
-def survey_star(study: Study, star: Star) -> StarSurvey:
-    """Build the search of a study for a star."""
-    source, stare = star.source(), stare_of(study)
-    choice = study.search
-    frames = study.model_copy(
-        update={"observation": study.observation.model_copy(update={"exposure_s": stare.frame_s})}
-    )
-    check_scales(study.flare.light())
+def survey_star(case: Case) -> StarSurvey:
+    """Build the search of a case's stare."""
+    frame, stare, choice, flare = case.one_frame, case.stare, case.study.search, case.study.flare
+    own = frame.flare_electrons((flare.temperature_k,))
     # Templates are blackbodies if the study's flare has no temperature to vary.
-    hot = frames if study.flare.spectrum.file is None else frames.model_copy(update={"flare": _blackbody(study.flare)})
-    quiet, electrons = flare_electrons(hot, source, TEMPERATURES_K)
-    _, own = flare_electrons(frames, source, (study.flare.temperature_k,))
+    blackbody = flare.model_copy(update={"spectrum": FlareLight()})
+    hot = frame if flare.spectrum.file is None else frame.with_sections(flare=blackbody)
+    quiet, electrons = frame.quiet, hot.flare_electrons(TEMPERATURES_K)
     nuisances = frame_nuisances(quiet, stare, choice.spreads())
     templates = Templates.of(
         quiet,
@@ -73,7 +65,7 @@ def survey_star(study: Study, star: Star) -> StarSurvey:
         nuisances=nuisances,
         rank=choice.sums,
     )
-    level = choice.level(stare, study.stare.orbit_s)
+    level = choice.level(stare, case.study.stare.orbit_s)
     bank = Bank(
         choice.half_widths_s, templates.directions[list(templates.chosen)], shape_of(choice.shape), stare.frame_s, level
     )
@@ -82,20 +74,7 @@ def survey_star(study: Study, star: Star) -> StarSurvey:
         raise InputError(
             "search.cycle is true but the stare has no unknown cycle", "stare.cycles", key="search.cycle", value=True
         )
-    return StarSurvey(source, quiet, templates, survey)
-
-
-def _blackbody(flare: Flare) -> Flare:
-    return flare.model_copy(update={"spectrum": FlareLight()})
-
-
-def flare_electrons(study: Study, source: Source, kelvin: tuple[float, ...]) -> tuple[Expectation, NDArray[np.float64]]:
-    """Return one frame and the electrons added by flares of unit amplitude, shape (n_temperature, n_pixel)."""
-    # A flare that replaces photosphere is linear in its amplitude, but an amplitude of 1 may exceed the whole disc.
-    unit = 1.0 if study.flare.geometry == "added" else 0.01
-    each = [study.model_copy(update={"flare": study.flare.model_copy(update={"temperature_k": k})}) for k in kelvin]
-    quiet, *flaring = study.expect([source, *(one.flaring(source, unit) for one in each)])
-    return quiet, np.array([(x.source_electrons - quiet.source_electrons) / unit for x in flaring])
+    return StarSurvey(quiet, templates, survey)
 
 
 @dataclass(frozen=True)
@@ -107,23 +86,22 @@ class Sizes:
     per_unit: float  # size of a flare of unit amplitude and a half-width of 1 s
 
     @classmethod
-    def chosen(cls, study: Study, star: Star, source: Source) -> Sizes:
-        """Return the measure that a study chooses; raises InputError for energies of a star of unknown size."""
-        asked = study.injections.of
-        flare = study.flare
-        bolometric = energy_scale(study, star, source, "bolometric", flare.temperature_k)
+    def chosen(cls, case: Case) -> Sizes:
+        """Return the measure that a case's study chooses; raises InputError for energies of a star of unknown size."""
+        asked, flare_k = case.study.injections.of, case.study.flare.temperature_k
+        bolometric = energy_scale(case, "bolometric", flare_k)
         if asked is None:
             asked = "amplitude" if bolometric is None else "energy"
         if asked == "amplitude":
             return cls("amplitude", 0, 1.0)
-        area = shape_of(study.search.shape).equivalent_duration
+        area = shape_of(case.study.search.shape).equivalent_duration
         if asked == "duration":
             return cls("duration", 1, area)
         kind: Any = "bolometric" if asked == "energy" else "band"
-        scale = energy_scale(study, star, source, kind, flare.temperature_k)
+        scale = energy_scale(case, kind, flare_k)
         if scale is None:
             raise InputError(
-                f"injections.of = {asked!r}, but the size of {source.name} is unknown",
+                f"injections.of = {asked!r}, but the size of {case.source.name} is unknown",
                 "the star's distance_pc, or radius_rsun and effective_temperature_k",
                 key="injections.of",
                 value=asked,
@@ -139,13 +117,13 @@ class Sizes:
         return size / (half_width_s**self.power * self.per_unit)
 
 
-def injected_sizes(study: Study, sizes: Sizes, unit_snr: float, threshold: float) -> NDArray[np.float64]:
-    """Return the sizes that a study injects, ascending; by default around a completeness of one half."""
-    asked = study.injections
+def injected_sizes(case: Case, sizes: Sizes, threshold: float) -> NDArray[np.float64]:
+    """Return the sizes of injected flares, ascending; by default around a completeness of one half."""
+    asked = case.study.injections
     widths = np.array([asked.half_width_low_s, asked.half_width_high_s])
-    frames = widths / study.observation.load_instrument().frame_s
+    frames = widths / case.instrument.frame_s
     # S/N of a known flare on a known baseline: (A / sigma) sqrt(square integral x half-width in frames).
-    amplitude = threshold / unit_snr / np.sqrt(shape_of(study.search.shape).square_integral * frames)
+    amplitude = threshold / case.survey.unit_snr / np.sqrt(shape_of(case.study.search.shape).square_integral * frames)
     half = sizes.of_amplitude(amplitude, widths)
     low = DEFAULT_RANGE[0] * half.min() if asked.low is None else asked.low
     high = DEFAULT_RANGE[1] * half.max() if asked.high is None else asked.high

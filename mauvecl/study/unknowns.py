@@ -25,6 +25,7 @@ from mauvecl.statistics.intervals import CONFIDENCE, Interval
 from mauvecl.study.parts import First
 
 if TYPE_CHECKING:
+    from mauvecl.noise.priors import Prior
     from mauvecl.study.study import Study
 
 Float = NDArray[np.float64]
@@ -57,7 +58,7 @@ def drawn(study: Study) -> DrawnStudies:
     """
     from scipy.stats import qmc
 
-    asked, priors = study.unknowns, study.unknown_priors()
+    asked, priors = study.unknowns, _unknown_priors(study)
     sequence = qmc.LatinHypercube(len(priors), rng=np.random.default_rng(study.run.seed))
     even = sequence.random(asked.draws)
     values = np.column_stack([prior.quantile(even[:, k]) for k, prior in enumerate(priors.values())])
@@ -78,6 +79,16 @@ def drawn(study: Study) -> DrawnStudies:
             ) from error
         studies.append(changed)
     return DrawnStudies(tuple(priors), values, tuple(studies))
+
+
+def _unknown_priors(study: Study) -> dict[str, Prior]:
+    """Return the priors of unknown instrument values; values that the study sets are known."""
+    o = study.observation
+    known = {*o.changes, *(() if o.temperature_c is None else ("temperature_c",))}
+    priors = {name: prior for name, prior in study.unknowns.priors().items() if name not in known}
+    if study.unknowns.draws and not priors:
+        raise InputError("no instrument value is unknown", "a prior, or unknowns.draws = 0", key="unknowns.draws")
+    return priors
 
 
 def realisations_each(study: Study) -> int:

@@ -206,6 +206,6 @@ def test_sizes_may_be_energies():
 def test_a_size_that_a_star_has_not_is_told_before_any_is_searched(monkeypatch, stares):
     near = SMALL["star"][0]
     asked = study(star=[near, {**near, "distance_pc": None}], injections={"of": "energy"})
-    monkeypatch.setattr("mauvecl.answers.stares.inject.survey_star", lambda *_: pytest.fail("searched"))
+    monkeypatch.setattr("mauvecl.study.surveys.survey_star", lambda *_: pytest.fail("searched"))
     with refused("injections.of", value="energy"):
         inject(asked, stares)

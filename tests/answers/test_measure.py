@@ -13,6 +13,7 @@ from mauvecl import Engine, Study, measure
 from mauvecl.answers.measurements.measure import MeasureAnswer
 from mauvecl.host.stars.bands import photons
 from mauvecl.runs.pool import Pool
+from mauvecl.study.cases import Case
 
 
 def study_of(*settings: str, **flare: object) -> Study:
@@ -52,7 +53,7 @@ def test_the_right_model_covers_and_the_simple_one_is_rejected(jump: MeasureAnsw
 def test_truths_are_those_of_the_light_that_is_added(jump: MeasureAnswer) -> None:
     study = jump.study
     source = study.star[0].source()
-    lit = study.flaring(source, 0.5)
+    lit = Case(study).flaring(0.5)
     nm = np.union1d(lit.wavelength_nm, [200.0, 320.0, 700.0])
     added = np.interp(nm, lit.wavelength_nm, lit.flux_flam) - np.interp(nm, source.wavelength_nm, source.flux_flam)
     truth = dict(zip(jump.flares[1].found.names, jump.flares[1].truth, strict=True))

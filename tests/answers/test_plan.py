@@ -12,16 +12,16 @@ from scipy import stats
 from mauvecl import Study, plan
 from mauvecl.answers.campaigns.plan import PlanAnswer
 from mauvecl.answers.campaigns.plan_text import SUMMARY_COLUMNS, summary_rows, target_lines
-from mauvecl.answers.campaigns.planned import Looked
+from mauvecl.answers.campaigns.planned import TargetObservation
 from mauvecl.answers.campaigns.planned_injections import question_of
 from mauvecl.answers.report import write_study, write_table
 from mauvecl.lightcurve.flares.energies import EnergyScale, quiescent_luminosity
 from mauvecl.lightcurve.flares.rates import davenport2019
 from mauvecl.lightcurve.search.completeness import Completeness
 from mauvecl.lightcurve.stares.along import stare_along
+from mauvecl.study.cases import Case
 from mauvecl.study.orbits import read_targets
 from mauvecl.study.spectral_types import nearest_spectrum, subtype
-from mauvecl.study.stare_expectation import stare_of
 
 #: Injections take ten seconds a target.
 QUICK = {"completeness": "closed form"}
@@ -73,7 +73,7 @@ def test_a_closed_form_says_that_it_takes_the_stare_for_known(study: Study, answ
 
 
 def test_the_rates_are_those_asked_for(answer: PlanAnswer) -> None:
-    star = next(one.looked.star for one in answer.planned if one.name == "eps Eri")
+    star = next(one.observation.star for one in answer.planned if one.name == "eps Eri")
     source, distance = star.source(), star.distance_pc
     assert distance is not None
     scale = EnergyScale.of_star(source, distance, flare_k=10_000.0)
@@ -189,8 +189,8 @@ def test_markup_in_names_is_text(study: Study) -> None:
 
 
 def test_completeness_as_an_argument(study: Study) -> None:
-    def none_below(_: Study, looked: Looked) -> Completeness:
-        assert looked.window_s > 600
+    def none_below(observed: TargetObservation) -> Completeness:
+        assert observed.window_s > 600
         edge = np.array([1e30, 1e33 * (1 - 1e-12), 1e33, 1e40])
         return Completeness(edge, np.array([0.0, 0.0, 1.0, 1.0]), "bolometric", "a step")
 
@@ -211,17 +211,17 @@ def test_conditions_are_those_of_stares_along_the_orbit() -> None:
         "plan.completeness='closed form'",
     ]
     study = Study().with_settings(base)
-    looked = plan(study).planned[0].looked
-    assert looked.conditions is not None
+    observed = plan(study).planned[0].observation
+    assert observed.conditions is not None
     along = stare_along(study.orbit.orbit(), "GJ 205", "2026-10-01", 3 * 86_400.0, frame_s=60.0)
     # The plan begins in balance, the stare with its past.
-    assert looked.conditions.temperature_c == pytest.approx(along.stare.temperature_c.mean(), abs=0.2)
-    assert looked.hits_per_cm2_s == pytest.approx(along.mean_hits_per_cm2_s, rel=1e-9)
-    assert looked.quiet.conditions["temperature_c"] == looked.conditions.temperature_c
-    injected = question_of(study, looked)
-    stare = stare_of(injected)
+    assert observed.conditions.temperature_c == pytest.approx(along.stare.temperature_c.mean(), abs=0.2)
+    assert observed.hits_per_cm2_s == pytest.approx(along.mean_hits_per_cm2_s, rel=1e-9)
+    assert observed.quiet.conditions["temperature_c"] == observed.conditions.temperature_c
+    injected = question_of(observed)
+    stare = Case(injected).stare
     assert 13 < stare.temperature_c.min() < stare.temperature_c.mean() - 0.5 < stare.temperature_c.max() - 1 < 20
-    assert injected.processes.cosmic_rays.rate_per_cm2_s == looked.hits_per_cm2_s
+    assert injected.processes.cosmic_rays.rate_per_cm2_s == observed.hits_per_cm2_s
 
     still = plan(study.with_settings(["plan.along_orbit=false", "observation.temperature_c=21"]))
     assert still.stars["temperature"][0].value == 21.0
@@ -229,7 +229,7 @@ def test_conditions_are_those_of_stares_along_the_orbit() -> None:
     hot = study.with_settings(["observation.temperature_c=21"])
     rays = hot.with_settings(["processes.cosmic_rays.electrons=[5000, 10000]"])
     signals = [float(plan(one).stars["signal_per_frame"][0]) for one in (rays, hot)]
-    assert signals[0] < 0.9 * signals[1] < 0.9 * still.stars["signal_per_frame"][0] < 0.9 * looked.signal_per_frame
+    assert signals[0] < 0.9 * signals[1] < 0.9 * still.stars["signal_per_frame"][0] < 0.9 * observed.signal_per_frame
 
 
 def test_more_light_finds_smaller_flares(study: Study) -> None:

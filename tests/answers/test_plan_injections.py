@@ -5,7 +5,7 @@ import pytest
 
 from mauvecl import Study
 from mauvecl.answers.campaigns.plan import plan
-from mauvecl.answers.campaigns.planned import Looked, closed_form
+from mauvecl.answers.campaigns.planned import TargetObservation, closed_form
 from mauvecl.answers.campaigns.planned_injections import found_by_energy, question_of
 from mauvecl.answers.stares.inject import inject
 from mauvecl.lightcurve.flares.rates import PowerLaw
@@ -27,14 +27,14 @@ def test_shares_by_hand() -> None:
 
 def test_stretches_are_the_targets() -> None:
     study = Study().with_settings(["plan.targets=[{name='GJ 205'}]", "orbit.days=20", "search.false_alarms=2"])
-    seen: list[Looked] = []
+    seen: list[TargetObservation] = []
 
-    def kept(one: Study, looked: Looked) -> Completeness:
-        seen.append(looked)
-        return closed_form(one, looked)
+    def kept(observed: TargetObservation) -> Completeness:
+        seen.append(observed)
+        return closed_form(observed)
 
     plan(study, completeness=kept)
-    asked = question_of(study, seen[0])
+    asked = question_of(seen[0])
     orbit = study.orbit.orbit().elements.period_s
     assert asked.stare.orbit_s - asked.stare.orbit_gap_s == pytest.approx(seen[0].window_s)
     assert asked.stare.orbit_s == pytest.approx(orbit)
@@ -55,15 +55,15 @@ def test_campaigns_close_through_the_search() -> None:
         ["plan.targets=[{name='GJ 205'}]", "orbit.days=20", "plan.injections=200", "search.sums=1",
          "search.half_widths_s=[25, 50, 100, 200, 400]"]
     )  # fmt: skip
-    seen: list[Looked] = []
+    seen: list[TargetObservation] = []
 
-    def kept(one: Study, looked: Looked) -> Completeness:
-        seen.append(looked)
-        return closed_form(one, looked)
+    def kept(observed: TargetObservation) -> Completeness:
+        seen.append(observed)
+        return closed_form(observed)
 
     form = plan(study, completeness=kept).planned[0].completeness
     assert form is not None
-    star, law = inject(question_of(study, seen[0])).stars[0], study.plan.law()
+    star, law = inject(question_of(seen[0])).stars[0], study.plan.law()
     widths = np.array(star.injected.half_widths_s)
     first, second = (star.injected.critical[:, :, k::2].reshape(widths.size, -1) for k in (0, 1))
     energy = 10 ** np.arange(28.0, 38.0, 0.05)

@@ -17,7 +17,7 @@ from commands import run
 from mauvecl.answers.stares.stare import StareAnswer, stare
 from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
-from mauvecl.study.stare_expectation import stare_of
+from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 
 #: A G2V star for five minutes with a gap and a flare.
@@ -260,13 +260,13 @@ def test_a_study_file_with_curves_shapes_and_events(tmp_path, stares):
     study = Study.read(tmp_path / "study.toml")
     assert Study.build(tomllib.loads(study.toml()), "again").toml() == study.toml()
     found = stare(study, stares)
-    np.testing.assert_allclose(stare_of(study).star[[0, -1]], [1 + 0.03 * 2.5 / 300, 1 + 0.03 * 297.5 / 300])
+    np.testing.assert_allclose(Case(study).stare.star[[0, -1]], [1 + 0.03 * 2.5 / 300, 1 + 0.03 * 297.5 / 300])
     first, second = found.stares[0].flares
     assert first.bolometric_erg == pytest.approx(1e33, rel=1e-9)
     # Own shape: a triangle of 40 s with a peak of one.
     assert second.event.equivalent_duration_s == pytest.approx(2.0)
     assert second.event.peak == pytest.approx(0.1)
-    assert stare_of(study).unknowns[0].name == "light drift"
+    assert Case(study).stare.unknowns[0].name == "light drift"
 
 
 def test_the_two_flares_of_the_documentation(stares):
@@ -281,7 +281,10 @@ def test_the_two_flares_of_the_documentation(stares):
 
 
 def test_unknowns_of_a_stare_are_drawn_where_asked_for():
-    plain, usual = stare_of(SHORT), stare_of(SHORT.with_settings(["nuisances.usual=true", "stare.offsets.sky=0.05"]))
+    plain, usual = (
+        Case(SHORT).stare,
+        Case(SHORT.with_settings(["nuisances.usual=true", "stare.offsets.sky=0.05"])).stare,
+    )
     assert not plain.unknowns
     assert usual.light_jitter == pytest.approx(0.0144, abs=1e-4)
     spread = {unknown.name: unknown.sd for unknown in usual.unknowns}

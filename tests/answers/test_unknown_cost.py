@@ -29,6 +29,7 @@ from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, PROCESSES
 from mauvecl.results.requests.requests import DetectRequest
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.nuisances import Nuisances
+from mauvecl.study.cases import Case
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.study import Study
 from mauvecl.web.fields import points
@@ -161,7 +162,7 @@ def test_the_usual_unknowns_are_drawn_where_the_study_observes() -> None:
     asked = study(usual=True).with_settings(
         ["observation.temperature_c=13", "processes.jitter={uniform=[0.0, 0.01]}", "nuisances.dark=0.3"]
     )
-    processes = asked.drawing["processes"]
+    processes = Case(asked).processes
     assert processes.detector_temperature.mean == 13
     assert processes.jitter.high == 0.01
     quiet, _ = asked.expectations(asked.star[0])
@@ -172,7 +173,7 @@ def test_the_usual_unknowns_are_drawn_where_the_study_observes() -> None:
     found = dark_sky.nuisances.marginalised(dark_sky.expectations(asked.star[0])[0])
     assert found is not None
     assert found.names == ("dark", "light")
-    assert study().drawing["processes"].detector_temperature is None
+    assert Case(study()).processes.detector_temperature is None
 
 
 def test_the_documentation_holds_the_usual_unknowns() -> None:
@@ -192,7 +193,7 @@ def test_priors_have_their_joint_draw_on_both_instruments() -> None:
             star = Source.from_library("G2V").at_magnitude(magnitude)
             seen = [expect(star, mauve, exposure=exposure, sky=Sky.of_brightness(22.1))]
             asked = study(usual=True).with_settings([f"observation.temperature_c={temperature}"])
-            assert prepare(seen, processes=asked.drawing["processes"]).joint
+            assert prepare(seen, processes=Case(asked).processes).joint
 
 
 #: Draws of each scene, the false-alarm probability asked for, and scenes.
@@ -222,7 +223,7 @@ def test_false_alarms_as_asked_for_with_unknowns_drawn(engine: Engine) -> None:
         exposure = float(rng.choice([5.0, 50.0]))
         quiet, flare = (expect(s, payload, exposure=exposure, sky=sky) for s in (star, star.flaring(0.1)))
         choice = NuisanceChoice(usual=True)
-        how: dict[str, Any] = {"processes": choice.processes(study().drawing["processes"], temperature)}
+        how: dict[str, Any] = {"processes": choice.processes(Case(study()).processes, temperature)}
         marginal = {"statistics": statistics, "nuisances": choice.marginalised(quiet)}
         asked = DetectRequest.of(quiet, [flare], DRAWS, next(SEEDS), **marginal, **how)
         first, fresh = twice(engine, asked)

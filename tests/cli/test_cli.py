@@ -20,6 +20,7 @@ from mauvecl.answers.signal.simulate import simulate
 from mauvecl.device.engine import Engine
 from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
 from mauvecl.statistics.registry import STATISTICS
+from mauvecl.study.cases import Case
 from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
 
@@ -193,7 +194,7 @@ def test_a_study_may_ask_for_processes(tmp_path: Path, engine: Engine) -> None:
     processes = Processes(
         CosmicRays(rate_per_cm2_s=500), jitter=Uniform(0.0, 0.05), detector_temperature=Normal(21, 2, 13, 25)
     )
-    assert study.drawing == {"mode": "auto", "recipe": "joint", "processes": processes}
+    assert Case(study).draw_options == {"mode": "auto", "recipe": "joint", "processes": processes}
     (tmp_path / "again.toml").write_text(study.toml())
     assert Study.read(tmp_path / "again.toml") == study
     found = detect(study, engine).stars[0].detection

@@ -17,6 +17,7 @@ from mauvecl.host.expectation import Expectation, expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.host.stars.source import Source
+from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 
 
@@ -63,7 +64,7 @@ def test_signal_is_linear_in_the_light(sunlike: Source, mauve: Instrument) -> No
 
 def test_default_sky(sunlike: Source, mauve: Instrument) -> None:
     """`expect` and studies, and so the command line, have the same default."""
-    (study,) = Study().expect([sunlike])
+    (study,) = Case(Study()).expect(sunlike)
     np.testing.assert_array_equal(expect(sunlike, mauve, exposure=50).sky_electrons, study.sky_electrons)
     assert study.sky_electrons.any()
 

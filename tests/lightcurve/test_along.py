@@ -74,19 +74,20 @@ def test_the_constructor_of_stares(orbit: Orbit, night: OrbitStare) -> None:
 
 def test_a_studys_stare(orbit: Orbit, night: OrbitStare) -> None:
     from mauvecl import Study
-    from mauvecl.study.stare_expectation import orbit_lines, stare_of
+    from mauvecl.study.cases import Case
+    from mauvecl.study.stare_expectation import orbit_lines
 
     study = Study().with_settings(
         ["stare.along_orbit=true", f"stare.duration_s={HOURS * 3600}", "orbit.targets=['eps Eri']",
          f"orbit.start='{START}'", "stare.offsets.sky=0.1"]
     )  # fmt: skip
-    found = stare_of(study)
+    found = Case(study).stare
     assert found.start_s == pytest.approx(night.stare.start_s)
     assert found.temperature_c == pytest.approx(night.stare.temperature_c)
     assert [one.name for one in found.unknowns] == ["sky offset"]
-    assert "assumptions" in orbit_lines(study)[-1]
-    assert "mean Sun-synchronous" in orbit_lines(study.with_settings(["orbit.start=2027-06-01"]))[0]
-    assert orbit_lines(Study()) == []
+    assert "assumptions" in orbit_lines(Case(study))[-1]
+    assert "mean Sun-synchronous" in orbit_lines(Case(study.with_settings(["orbit.start=2027-06-01"])))[0]
+    assert orbit_lines(Case(Study())) == []
     for wrong in ("stare.orbit_gap_s=100", "orbit.targets=['eps Eri', 'Vega']"):
         with refused("stare.along_orbit"):
-            stare_of(study.with_settings([wrong]))
+            _ = Case(study.with_settings([wrong])).stare

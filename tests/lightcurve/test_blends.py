@@ -8,8 +8,9 @@ from scipy.stats import binom
 
 from mauvecl.lightcurve.flares.events import Event, coefficients
 from mauvecl.lightcurve.search.alarms import Alarm, alarms
+from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
-from mauvecl.study.surveys import StarSurvey, survey_star
+from mauvecl.study.surveys import StarSurvey
 
 #: One false alarm in a star-month.
 THRESHOLD = 4.92
@@ -17,7 +18,7 @@ THRESHOLD = 4.92
 
 def survey_of(*settings: str) -> StarSurvey:
     study = Study().with_settings(['star=[{library="M3V", magnitude=9}]', *settings])
-    return survey_star(study, study.star[0])
+    return Case(study).survey
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,9 @@ from mauvecl.host.stars.bands import band
 from mauvecl.host.stars.source import Source
 from mauvecl.lightcurve.flares.energies import EnergyScale, share_within
 from mauvecl.lightcurve.flares.events import Cooling, Event, coefficients, temperatures_of
+from mauvecl.study.cases import Case
 from mauvecl.study.sections import Flare, SkyLight, Star
-from mauvecl.study.stare_expectation import energy_of, expect_stare
+from mauvecl.study.stare_expectation import energy_of
 from mauvecl.study.stare_section import EventText
 from mauvecl.study.study import Study
 
@@ -76,7 +77,8 @@ def test_drawn_light_carries_the_stated_energy(seed: int) -> None:
         ["stare.duration_s=120000"]
     )
     source = star.source()
-    staring, flares = expect_stare(study, star)
+    case = Case(study)
+    staring, flares = case.stare_expectation, case.events
     kelvin = temperatures_of(flares)
     nm, sphere = source.wavelength_nm, 4 * np.pi * (star.distance_pc * u.pc).to_value(u.cm) ** 2
     spectra = [source.flaring(1.0, k, band=name).flux_flam - source.flux_flam for k in kelvin]
@@ -94,7 +96,7 @@ def test_drawn_light_carries_the_stated_energy(seed: int) -> None:
         }
         assert drawn[text.energy] == pytest.approx(text.energy_erg, rel=5e-4)
         for kind in ("band", "bolometric"):
-            stated = energy_of(study, star, source, flare, kind, kelvin)  # type: ignore[arg-type]
+            stated = energy_of(case, flare, kind, kelvin)  # type: ignore[arg-type]
             assert stated == pytest.approx(drawn[kind], rel=5e-4)
 
 

@@ -24,7 +24,8 @@ from mauvecl.host.stars.flare_spectra import (
     TwoBlackbodies,
 )
 from mauvecl.lightcurve.flares.rates import band_factor
-from mauvecl.study.stare_expectation import energy_of, expect_stare
+from mauvecl.study.cases import Case, cases
+from mauvecl.study.stare_expectation import energy_of
 
 DATA = Path(__file__).parent.parent / "data"
 FILE, QUIET = DATA / "spectra" / "ADLeo_912s.dat", DATA / "flares" / "adleo_quiescent2.dat"
@@ -115,18 +116,17 @@ def test_answers_take_any_spectrum(name: str) -> None:
     got = np.sqrt(np.sum((flare.signal_dn - seen.signal_dn) ** 2 / seen.variance_dn2))
     assert got == pytest.approx(wanted, rel=1e-9)
     one = study.with_settings(["stare.duration_s=600", "observation.exposure_s=5"])
-    staring, (event,) = expect_stare(one, one.star[0])
+    case = Case(one)
+    staring, (event,) = case.stare_expectation, case.events
     frames = [x.source_electrons for x in one.expectations(one.star[0])]
     np.testing.assert_allclose(0.05 * staring.flare_electrons[0], frames[1] - frames[0], rtol=1e-6, atol=1e-9)
     scale = EnergyScale.of_star(star, 5.0, flare=TEXTS[name][1])
-    energy = energy_of(one, one.star[0], star, event, "bolometric")
+    energy = energy_of(case, event, "bolometric")
     assert energy == pytest.approx(scale.erg_per_s * event.equivalent_duration_s, rel=1e-9)
 
 
 def test_search_injects_the_flare_of_the_file_and_has_blackbody_templates() -> None:
-    from mauvecl.study.surveys import survey_star
-
-    found = {name: survey_star(study_of(name), study_of(name).star[0]) for name in ("blackbody", "file", "jump")}
+    found = {name: Case(study_of(name)).survey for name in ("blackbody", "file", "jump")}
     np.testing.assert_array_equal(found["file"].templates.directions, found["blackbody"].templates.directions)
     assert not np.array_equal(found["jump"].templates.directions, found["blackbody"].templates.directions)
     assert found["file"].unit_snr > found["blackbody"].unit_snr
@@ -149,8 +149,8 @@ def test_sweeps_over_the_spectrum(quantity: str, values: list[float], name: str)
         }
     )
     snr = []
-    for _, cell in study.cells():
-        quiet, lit = cell.expectations(cell.star[0])
+    for case in cases(study):
+        quiet, lit = case.expectations
         snr.append(float(np.sqrt(np.sum((lit.signal_dn - quiet.signal_dn) ** 2 / quiet.variance_dn2))))
     assert (np.diff(snr) > 0).all() if quantity != "line_scale" else snr[0] != snr[1]
     nothing = study_of("blackbody")
@@ -172,7 +172,7 @@ def test_lines_of_a_fixed_flux_do_not_scale() -> None:
         star.flaring(1e-9, spectrum=fixed)
     study = study_of("blackbody").with_settings(['flare.spectrum.line_fluxes={"Mg II" = 1e-12}'])
     with pytest.raises(InputError, match="do not scale"):
-        expect_stare(study, study.star[0])
+        _ = Case(study).stare_expectation
 
 
 def test_flare_file_is_located_from_an_answers_table(tmp_path: Path) -> None:

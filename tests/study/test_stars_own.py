@@ -13,6 +13,7 @@ from mauvecl.cli.app import app
 from mauvecl.device.engine import Engine
 from mauvecl.host.stars.source import Source
 from mauvecl.schema.errors import InputError
+from mauvecl.study.cases import cases
 from mauvecl.study.study import Study
 
 PART = {"changes": {"output_min_nm": 300.0, "output_max_nm": 330.0}}
@@ -24,7 +25,7 @@ def study(*stars: dict[str, Any], **flare: Any) -> Study:
 
 
 def flux(asked: Study, number: int) -> np.ndarray:
-    return asked.flaring(asked.star[number].source(), 0.1).flux_flam
+    return cases(asked)[number].flaring(0.1).flux_flam
 
 
 def test_each_star_has_its_own_photosphere() -> None:

@@ -19,6 +19,7 @@ from mauvecl.answers.signal.exposures import exposure_for
 from mauvecl.answers.signal.simulate import simulate
 from mauvecl.answers.signal.snr import snr
 from mauvecl.device.engine import Engine
+from mauvecl.study.cases import cases
 from mauvecl.study.study import PAPER_BUDGETS, Study
 
 
@@ -38,15 +39,14 @@ EXPOSURES = {"quantity": "exposure", "values": [5.0, 50.0]}
 
 
 def test_cells() -> None:
-    both = study([MAGNITUDES, EXPOSURES]).cells()
-    assert [tuple(at.values()) for at, _ in both] == [(6, 5), (6, 50), (9, 5), (9, 50)]
-    assert all(
-        cell.star[0].magnitude == at["magnitude"] and cell.observation.exposure_s == at["exposure"] for at, cell in both
-    )
-    assert all(not cell.sweep.axes for _, cell in both)
-    listed = study([MAGNITUDES, EXPOSURES], "list").cells()
-    assert [tuple(at.values()) for at, _ in listed] == [(6, 5), (9, 50)]
-    assert study([]).cells() == [({}, study([]))]
+    both = cases(study([MAGNITUDES, EXPOSURES]))
+    assert [tuple(case.at.values()) for case in both] == [(6, 5), (6, 50), (9, 5), (9, 50)]
+    assert all(case.star.magnitude == case.at["magnitude"] for case in both)
+    assert all(case.study.observation.exposure_s == case.at["exposure"] for case in both)
+    assert all(not case.study.sweep.axes for case in both)
+    listed = cases(study([MAGNITUDES, EXPOSURES], "list"))
+    assert [tuple(case.at.values()) for case in listed] == [(6, 5), (9, 50)]
+    assert [(case.at, case.study) for case in cases(study([]))] == [({}, study([]))]
 
 
 def test_a_study_with_a_sweep_is_read_back(tmp_path: Any) -> None:
@@ -62,8 +62,8 @@ def test_a_detection_of_each_cell_is_its_own(engine: Engine) -> None:
     found = detect(asked, engine)
     assert list(found.table["magnitude"].value) == [6, 6, 9, 9]
     assert list(found.table["exposure"].value) == [5, 50, 5, 50]
-    for k, (_, cell) in enumerate(asked.cells()):
-        (alone,) = detect(cell, engine).table
+    for k, case in enumerate(cases(asked)):
+        (alone,) = detect(case.study, engine).table
         assert alone["probability"] == found.table["probability"][k]
         assert alone["threshold"] == found.table["threshold"][k]
     assert found.table["probability"][0] > found.table["probability"][2]

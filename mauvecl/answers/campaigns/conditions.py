@@ -1,4 +1,4 @@
-"""What the detector meets while a target is seen: its temperature through sun and shadow, hits of particles."""
+"""Detector temperature and particle hits while a target is visible."""
 
 from __future__ import annotations
 
@@ -19,59 +19,45 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Conditions:
-    """Those of one target.
+    """Conditions of one target."""
 
-    Attributes
-    ----------
-    temperature_c : float
-        Mean of the detector's while the target is seen.
-    swing : tuple of (s, deg C)
-        From the beginning of a stretch of median length on, for an orbit: the temperature less that mean.
-    hits_per_cm2_s : float
-        Mean of cosmic rays and trapped protons while the target is seen.
-    """
-
-    temperature_c: float
+    temperature_c: float  # mean of the detector while the target is visible
+    # Time (s) and deviation from the mean (deg C), for one orbit from the start of a window of median length.
     swing: tuple[tuple[float, float], ...]
-    hits_per_cm2_s: float
+    hits_per_cm2_s: float  # mean of cosmic rays and trapped protons while the target is visible
 
     def swings(self, orbits: int, orbit_s: float) -> tuple[tuple[float, float], ...]:
-        """The same orbit so many times over."""
+        """Return the swing of N orbits."""
         kept = [point for point in self.swing if point[0] < orbit_s]
         return tuple((n * orbit_s + t, value) for n in range(orbits) for t, value in kept)
 
     def rays(self, study: Rays | None) -> Rays:
-        """Hits as a study has them, at this rate."""
+        """Return a study's particle hits at this rate."""
         return (study or Rays()).model_copy(update={"rate_per_cm2_s": self.hits_per_cm2_s})
 
 
 @dataclass(frozen=True, eq=False)
-class Met:
-    """The same at every step of a plan.
+class OrbitConditions:
+    """Conditions at every time step of a plan."""
 
-    Attributes
-    ----------
-    temperature_c, hits_per_cm2_s : ndarray, shape (n,)
-    """
-
-    temperature_c: Float
-    hits_per_cm2_s: Float
+    temperature_c: Float  # shape (n_time,)
+    hits_per_cm2_s: Float  # shape (n_time,)
 
     @classmethod
-    def along(cls, track: Track, thermal: Thermal | None = None, particles: Particles | None = None) -> Met:
-        """As the orbit gives it; both are assumed unless given."""
+    def along(cls, track: Track, thermal: Thermal | None = None, particles: Particles | None = None) -> OrbitConditions:
+        """Compute the conditions along an orbit, by default with the assumed models."""
         light = sunlight(track.position_km, track.bodies.sun, track.bodies.sun_km)
         temperature = (thermal or Thermal()).temperature_c(light, track.times.step_s)
         return cls(temperature, (particles or Particles()).rate_per_cm2_s(track))
 
     def of(self, visibility: Visibility, k: int, orbit_s: float) -> Conditions | None:
-        """Those of one target; None if it is never seen."""
+        """Return the conditions of target `k`, or None if it is never visible."""
         seen, windows = visibility.seen[:, k], visibility.windows(k)
         if not seen.any():
             return None
         mean = float(self.temperature_c[seen].mean())
         step = visibility.track.times.step_s
-        # Of windows of one length the first.
+        # The first window if several have the median length.
         typical = int(np.argmin(np.abs(windows.length_s - np.median(windows.length_s))))
         first = round(float(windows.start_s[typical]) / step)
         orbit = self.temperature_c[first : first + int(np.ceil(orbit_s / step))] - mean
@@ -80,7 +66,7 @@ class Met:
 
 
 def hits_variance_dn2(rays: Rays, quiet: Expectation) -> Float:
-    """What hits add to the variance of each pixel of a frame, DN^2, (n_pixel,): that of the charge that is drawn."""
+    """Return the variance that particle hits add to each pixel of a frame, DN^2, shape (n_pixel,)."""
     charge = rays.rays().charge(quiet.frame_s)
     electrons = np.arange(charge.size)
     variance = float(charge @ electrons**2 - (charge @ electrons) ** 2)

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from mauvecl.answers.answer import Answer
-from mauvecl.answers.campaigns.conditions import Met
+from mauvecl.answers.campaigns.conditions import OrbitConditions
 from mauvecl.answers.campaigns.planned import (
     NOTHING,
     CompletenessOf,
-    Looked,
     Planned,
+    TargetObservation,
     closed_form,
-    looked_of,
+    observe,
     rates_of,
     star_of,
 )
@@ -100,7 +100,7 @@ class PlanAnswer(Answer):
     @property
     def stars(self) -> QTable:
         """What is put in: one row per target."""
-        rows, nan = [one.looked for one in self.planned], float("nan")
+        rows, nan = [one.observation for one in self.planned], float("nan")
         a_day = [
             nan if one.rates is None or one.completeness is None else recovered_per_day(one.rates, one.completeness)
             for one in self.planned
@@ -236,7 +236,7 @@ class PlanAnswer(Answer):
     @cached_property
     def inputs(self) -> list[Expectation]:
         """One frame of each star."""
-        return [one.looked.quiet for one in self.planned]
+        return [one.observation.quiet for one in self.planned]
 
     @property
     def messages(self) -> list[str]:
@@ -316,18 +316,18 @@ def plan(
         raise InputError("the plan has no targets", "some, such as `plan.targets='targets.csv'`", key="plan.targets")
     if study.orbit.targets:
         raise InputError("both orbit.targets and plan.targets are given", "plan.targets alone", key="orbit.targets")
-    refuse_priors(study)
-    stars = [star_of(study, text) for text in study.plan.targets]
+    refuse_priors(study.processes)
+    stars = [star_of(text, study.orbit.simbad) for text in study.plan.targets]
     seen = visible(study)
     names, hours = seen.visibility.by_month()
     completeness = completeness or _completeness(study, engine)
-    met = Met.along(seen.visibility.track) if study.plan.along_orbit else None
+    along = OrbitConditions.along(seen.visibility.track) if study.plan.along_orbit else None
 
-    def looked() -> Iterator[tuple[int, Looked]]:
-        for k, (text, star, target) in enumerate(zip(study.plan.targets, stars, seen.targets, strict=True)):
-            yield k, looked_of(study, text, star, target, seen, k, met)
+    def observations() -> Iterator[tuple[int, TargetObservation]]:
+        for k, (text, star) in enumerate(zip(study.plan.targets, stars, strict=True)):
+            yield k, observe(study, text, star, seen, k, along)
 
-    def planned_for(item: tuple[int, Looked]) -> Planned:
+    def planned_for(item: tuple[int, TargetObservation]) -> Planned:
         k, one = item
         exposed = float(seen.visibility.hours[k])
         observed = exposed if study.plan.hours is None else min(exposed, study.plan.hours)
@@ -335,8 +335,8 @@ def plan(
         best = tuple(names[i] for i in sorted(order) if hours[i, k] > 0)
         its = None
         if one.window_s > 0:
-            its = completeness(study, one) if one.signal_per_frame > 0 else NOTHING
-        rates, why = rates_of(study, study.plan.targets[k], one)
+            its = completeness(one) if one.signal_per_frame > 0 else NOTHING
+        rates, why = rates_of(study.plan.targets[k], one)
         recovered = None
         if rates is not None:
             days = observed * 3600 / DAY_S
@@ -347,7 +347,7 @@ def plan(
     if progress is not None:
         progress(0, len(stars))
     # With a pool, the noise of one target is drawn while the threshold of the next is sampled.
-    for one in map_in_order(engine, planned_for, looked()):
+    for one in map_in_order(engine, planned_for, observations()):
         planned.append(one)
         if progress is not None:
             progress(len(planned), len(stars))
@@ -355,13 +355,13 @@ def plan(
 
 
 def _completeness(study: Study, engine: Stares | Pool | None) -> CompletenessOf:
-    """That which a study asks for."""
+    """Return the function for the completeness that a study asks for."""
     if study.plan.completeness == "closed form":
         return closed_form
-    from mauvecl.answers.campaigns.planned_injections import injected
+    from mauvecl.answers.campaigns.planned_injections import inject_target
 
     if engine is None:
         from mauvecl.device.stares import Stares as Default
 
         engine = Default()
-    return partial(injected, engine=engine)
+    return partial(inject_target, engine=engine)

@@ -62,26 +62,26 @@ def months(names: tuple[str, ...]) -> str:
 
 def target_lines(answer: PlanAnswer, k: int) -> list[tuple[str, str, str]]:
     """Everything said of a target: what, how much, and the file and column that have it."""
-    one, looked = answer.planned[k], answer.planned[k].looked
-    place, seen = looked.target, answer.seen
+    one, observation = answer.planned[k], answer.planned[k].observation
+    place, seen = observation.target, answer.seen
     lines = [
         ("right ascension, declination", f"{place.ra_deg:.4f}, {place.dec_deg:.4f} deg ({place.source})",
          "stars: ra, dec, position"),
-        ("type; spectrum that stands for it", f"{place.spectral_type}; {looked.star.library}",
+        ("type; spectrum that stands for it", f"{place.spectral_type}; {observation.star.library}",
          "stars: spectral_type, spectrum"),
-        ("V; distance", f"{looked.star.magnitude:g}; {looked.star.distance_pc:g} pc", "stars: V, distance"),
+        ("V; distance", f"{observation.star.magnitude:g}; {observation.star.distance_pc:g} pc", "stars: V, distance"),
         ("seen; observed", f"{one.seen_h:.0f} h; {one.hours:.0f} h", "plan: seen, hours"),
     ]  # fmt: skip
     if one.seen_h == 0:
         return [*lines, ("never seen", seen.reason(place.name), "assumptions")]
     away = seen.elongation_deg(k)
     lines += [
-        ("median stretch", f"{looked.window_s / 60:.0f} min", "stars: window"),
+        ("median stretch", f"{observation.window_s / 60:.0f} min", "stars: window"),
         ("best months", months(one.best_months), "plan: best_months; months"),
         ("angle from the Sun", f"{away.min():.0f} to {away.max():.0f} deg", "days: elongation"),
-        ("detector; hits by particles", f"{looked.quiet.conditions['temperature_c']:.1f} deg C; "
-         f"{looked.hits_per_cm2_s:.2f} per cm^2 and s", "stars: temperature, hits"),
-        ("S/N of a frame at amplitude 1", f"{looked.signal_per_frame:.4g}", "stars: signal_per_frame"),
+        ("detector; hits by particles", f"{observation.quiet.conditions['temperature_c']:.1f} deg C; "
+         f"{observation.hits_per_cm2_s:.2f} per cm^2 and s", "stars: temperature, hits"),
+        ("S/N of a frame at amplitude 1", f"{observation.signal_per_frame:.4g}", "stars: signal_per_frame"),
         ("half of flares recovered from", energy(one.energy_at(0.5), " erg"), "plan: E50; energies: recovered"),
         ("90 % of flares recovered from", energy(one.energy_at(0.9), " erg"), "plan: E90; energies: recovered"),
     ]  # fmt: skip

@@ -1,111 +1,104 @@
-"""One target of a plan: its star and stretches, what is recovered of its flares, how often it has them."""
+"""Targets of a plan: their frames, flare rates, and the flares that are recovered."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.campaigns.conditions import Conditions, Met, hits_variance_dn2
+from mauvecl.answers.campaigns.conditions import Conditions, OrbitConditions, hits_variance_dn2
 from mauvecl.host.orbit.targets import Target
 from mauvecl.lightcurve.flares.energies import EnergyScale, quiescent_luminosity
 from mauvecl.lightcurve.flares.rates import BOLOMETRIC, Rates
 from mauvecl.lightcurve.search.completeness import Completeness, frame_signal
 from mauvecl.lightcurve.search.yields import Yield
 from mauvecl.schema.errors import InputError
+from mauvecl.study.cases import Case
 from mauvecl.study.orbits import PlanTarget
 from mauvecl.study.sections import SkyLight, Star
 from mauvecl.study.spectral_types import nearest_spectrum
 from mauvecl.study.stare_expectation import energy_scale
-from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
     from mauvecl.answers.campaigns.visible import VisibleAnswer
     from mauvecl.host.expectation import Expectation
+    from mauvecl.study.study import Study
 
-#: Amplitude of the flare whose light per amplitude is looked at; its own photon noise is left out.
+#: Amplitude of the flare from which the signal per amplitude follows; its own photon noise is neglected.
 SMALL = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Looked:
-    """What a completeness is made of: one target, its star, the stretches in which it is seen.
-
-    Attributes
-    ----------
-    target : Target
-    star : Star
-    quiet : Expectation
-        One frame.
-    signal_per_frame : float
-        S/N of a frame with a flare of amplitude 1; 0 where every pixel saturates.
-    scale : EnergyScale
-        Bolometric.
-    window_s : float
-        Median length of a stretch; 0 where it is never seen.
-    sky : float or None
-        Zodiacal light behind it, V mag arcsec^-2, as `quiet` has it; the study's sky where it is None.
-    conditions : Conditions or None
-        Of the orbit while it is seen; the study's where it is None.
-    hits_per_cm2_s : float
-        By particles.
-    """
+class TargetObservation:
+    """A target as the satellite observes it."""
 
     target: Target
-    star: Star
-    quiet: Expectation
-    signal_per_frame: float
-    scale: EnergyScale
-    window_s: float
-    sky: float | None = None
-    conditions: Conditions | None = None
-    hits_per_cm2_s: float = 0.0
+    case: Case  # of one frame, with the sky and the conditions below
+    window_s: float  # median length of its windows; 0 if it is never visible
+    sky: float | None = None  # zodiacal light, V mag arcsec^-2; None for the study's sky
+    conditions: Conditions | None = None  # along the orbit; None for the study's
+
+    @property
+    def star(self) -> Star:
+        """The star of the library that stands for the target."""
+        return self.case.star
+
+    @property
+    def quiet(self) -> Expectation:
+        """Expectation of one frame."""
+        return self.case.quiet
+
+    @property
+    def hits_per_cm2_s(self) -> float:
+        """Rate of particle hits."""
+        rays = self.case.study.processes.cosmic_rays
+        return 0.0 if rays is None else rays.rate_per_cm2_s
+
+    @cached_property
+    def signal_per_frame(self) -> float:
+        """S/N of a frame with a flare of amplitude 1; 0 if every pixel saturates."""
+        (flare,) = self.case.expect(self.case.flaring(SMALL))
+        rays = self.case.study.processes.cosmic_rays
+        hits = None if rays is None else hits_variance_dn2(rays, self.quiet)
+        return frame_signal(self.quiet, flare, SMALL, added_variance_dn2=hits)
+
+    @cached_property
+    def scale(self) -> EnergyScale:
+        """Bolometric energy of flares."""
+        scale = energy_scale(self.case, "bolometric", self.case.study.flare.temperature_k)
+        assert scale is not None
+        return scale
 
 
-#: Of a star that saturates every pixel.
+#: Completeness for a star that saturates every pixel.
 NOTHING = Completeness(np.array([1e24, 1e40]), np.zeros(2), BOLOMETRIC, "every pixel saturates: no flare is recovered")
-#: A target's completeness, of bolometric energies; None for one that is never seen.
-CompletenessOf = Callable[[Study, Looked], Completeness]
+#: Computes a target's completeness for bolometric energies.
+CompletenessOf = Callable[[TargetObservation], Completeness]
 
 
 @dataclass(frozen=True, eq=False)
 class Planned:
-    """One target of a plan.
+    """A target of a plan, with the flares that are expected of it."""
 
-    Attributes
-    ----------
-    looked : Looked
-    seen_h, hours : float
-        In which it is seen, and of these observed.
-    completeness : Completeness, optional
-        None where it is never seen.
-    rates : Rates, optional
-        Of bolometric energies; None where none are known.
-    recovered : Yield, optional
-        With both of them.
-    best_months : tuple of str
-    no_rates : str
-        Why there are none.
-    """
-
-    looked: Looked
-    seen_h: float
-    hours: float
-    completeness: Completeness | None
-    rates: Rates | None
-    recovered: Yield | None
+    observation: TargetObservation
+    seen_h: float  # visible time
+    hours: float  # observed time
+    completeness: Completeness | None  # None if the target is never visible
+    rates: Rates | None  # of bolometric energies; None if unknown
+    recovered: Yield | None  # recovered flares; None if rates are unknown
     best_months: tuple[str, ...]
-    no_rates: str = ""
+    no_rates: str = ""  # reason for unknown rates
 
     @property
     def name(self) -> str:
-        """The target's."""
-        return self.looked.target.name
+        """Name of the target."""
+        return self.observation.target.name
 
     def energy_at(self, probability: float) -> float:
-        """Bolometric energy from which on a flare is recovered with a probability, erg; infinite where it never is."""
+        """Return the bolometric energy above which flares are recovered with a probability, erg; infinite if none."""
         return float("inf") if self.completeness is None else self.completeness.energy_at(probability)
 
     @property
@@ -117,45 +110,44 @@ class Planned:
         return not low <= self.energy_at(0.5) <= high
 
 
-def closed_form(study: Study, looked: Looked) -> Completeness:
-    """The completeness of a bank of matched filters in white noise; see `Completeness.of_search`."""
+def closed_form(observation: TargetObservation) -> Completeness:
+    """Return the completeness of a bank of matched filters in white noise; see `Completeness.of_search`."""
+    study = observation.case.study
     return Completeness.of_search(
-        looked.signal_per_frame,
-        looked.scale,
-        window_s=looked.window_s,
+        observation.signal_per_frame,
+        observation.scale,
+        window_s=observation.window_s,
         false_alarms_per_day=study.search.rate,
-        bank=study.search.white_bank(looked.quiet.frame_s),
+        bank=study.search.white_bank(observation.quiet.frame_s),
         law=study.plan.law(),
     )
 
 
-def rates_of(study: Study, text: PlanTarget, looked: Looked) -> tuple[Rates | None, str]:
-    """A target's flares by bolometric energy, or why none are known."""
+def rates_of(text: PlanTarget, observation: TargetObservation) -> tuple[Rates | None, str]:
+    """Return a target's flare rates by bolometric energy, or None and the reason why they are unknown."""
+    case, flare = observation.case, observation.case.study.flare
     try:
-        rates = text.distribution(looked.target.spectral_type or "")
+        rates = text.distribution(observation.target.spectral_type or "")
     except InputError as error:
         if any(getattr(text, name) is not None for name in ("mass_msun", "alpha", "rates_file", "rates")):
             raise
         return None, str(error)
     if rates.definition == "light":
-        return rates.in_band(BOLOMETRIC, flare=study.flare.light()), ""
-    source, band = looked.star.source(), rates.amplitude_band
-    measured = study.model_copy(update={"flare": study.flare.model_copy(update={"band": band})})
-    scale = energy_scale(measured, looked.star, source, "bolometric", study.flare.temperature_k)
+        return rates.in_band(BOLOMETRIC, flare=flare.light()), ""
+    band, distance_pc = rates.amplitude_band, case.star.distance_pc
+    measured = case.with_sections(flare=flare.model_copy(update={"band": band}))
+    scale = energy_scale(measured, "bolometric", flare.temperature_k)
     assert scale is not None
-    assert looked.star.distance_pc is not None
-    return rates.of_light(scale.erg_per_s, quiescent_luminosity(source, looked.star.distance_pc, band)), ""
+    assert distance_pc is not None
+    return rates.of_light(scale.erg_per_s, quiescent_luminosity(case.source, distance_pc, band)), ""
 
 
-def star_of(study: Study, text: PlanTarget) -> Star:
-    """The star of the library that stands for a target.
+def star_of(text: PlanTarget, simbad: bool) -> Star:
+    """Return the star of the library that stands for a target.
 
-    Raises
-    ------
-    InputError
-        If its type, magnitude or distance is neither given nor known.
+    Raises InputError if its type, magnitude or distance is neither given nor known.
     """
-    known = text.target(study.orbit.simbad)
+    known = text.target(simbad)
     given: dict[str, Any] = {
         "spectral_type": text.spectral_type or known.spectral_type,
         "magnitude": known.magnitude if text.magnitude is None else text.magnitude,
@@ -173,31 +165,17 @@ def star_of(study: Study, text: PlanTarget) -> Star:
     return Star(library=library, **given)
 
 
-def looked_of(
-    study: Study, text: PlanTarget, star: Star, target: Target, seen: VisibleAnswer, k: int, met: Met | None = None
-) -> Looked:
-    """One frame of a target, and what a flare adds to it."""
+def observe(
+    study: Study, text: PlanTarget, star: Star, seen: VisibleAnswer, k: int, along: OrbitConditions | None = None
+) -> TargetObservation:
+    """Return the observation of target `k`, with the sky behind it and the conditions along the orbit."""
+    target = seen.targets[k]
     if text.spectral_type is not None:
         target = replace(target, spectral_type=text.spectral_type)
-    conditions = None if met is None else met.of(seen.visibility, k, study.orbit.orbit().elements.period_s)
+    conditions = None if along is None else along.of(seen.visibility, k, study.orbit.orbit().elements.period_s)
     lengths = seen.windows[k].length_s
-    window = float(np.median(lengths)) if lengths.size else 0.0
-    sky, source = sky_behind(seen, k), star.source()
-    one = stared_at(study.at("exposure", study.observation.load_instrument().frame_s), star, sky, conditions)
-    quiet, flare = one.expect([source, one.flaring(source, SMALL)])
-    rays = one.processes.cosmic_rays
-    hits = None if rays is None else hits_variance_dn2(rays, quiet)
-    signal = frame_signal(quiet, flare, SMALL, added_variance_dn2=hits)
-    scale = energy_scale(study, star, source, "bolometric", study.flare.temperature_k)
-    assert scale is not None
-    return Looked(
-        target, star, quiet, signal, scale, window, sky, conditions, 0.0 if rays is None else rays.rate_per_cm2_s
-    )
-
-
-def stared_at(study: Study, star: Star, sky: float | None, conditions: Conditions | None) -> Study:
-    """The study with one star, the sky behind it, and what the orbit does to its frames."""
-    changes: dict[str, Any] = {"star": (star,)}
+    window, sky = float(np.median(lengths)) if lengths.size else 0.0, sky_behind(seen, k)
+    changes: dict[str, Any] = {}
     if sky is not None:
         changes["sky"] = SkyLight(surface_brightness=sky)
     if conditions is not None:
@@ -206,11 +184,12 @@ def stared_at(study: Study, star: Star, sky: float | None, conditions: Condition
         if study.observation.temperature_c is None:
             at = {"temperature_c": conditions.temperature_c}
             changes["observation"] = study.observation.model_copy(update=at)
-    return study.model_copy(update=changes)
+    case = Case(study.model_copy(update={"star": (star,), **changes})).one_frame
+    return TargetObservation(target, case, window, sky, conditions)
 
 
 def sky_behind(seen: VisibleAnswer, k: int) -> float | None:
-    """V mag arcsec^-2: the median over the days on which a target is seen, or over all."""
+    """Return the median sky brightness, V mag arcsec^-2, over the days on which a target is visible, or over all."""
     light, hours = seen.zodiacal[k], seen.visibility.by_day(k)
     used = np.isfinite(light) & (hours > 0)
     used = used if used.any() else np.isfinite(light)

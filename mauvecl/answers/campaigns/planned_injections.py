@@ -1,4 +1,4 @@
-"""The completeness of a plan's target by injections: flares put into stretches as it is seen, and searched for."""
+"""Completeness of a plan's target from flares injected into its windows."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.campaigns.planned import Looked, stared_at
+from mauvecl.answers.campaigns.planned import TargetObservation
 from mauvecl.answers.stares.inject import inject
 from mauvecl.lightcurve.flares.rates import BOLOMETRIC
 from mauvecl.lightcurve.search.completeness import PER_DECADE, Completeness, DurationLaw
@@ -23,31 +23,18 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Orbits of a stare: the window over which a search takes the level for a line reaches over its gaps.
+#: Orbits of a stare; the baseline window of a search spans several of them.
 ORBITS = 3
-#: Half-widths injected, and places of their peaks.
+#: Number and range of injected half-widths, and number of their peak times.
 WIDTHS, WIDTH_RANGE_S, POSITIONS = 10, (5.0, 3000.0), 20
 
 
-def injected(study: Study, looked: Looked, engine: Stares | Pool | None = None) -> Completeness:
-    """The share of injected flares that the study's search finds, by bolometric energy.
+def inject_target(observation: TargetObservation, engine: Stares | Pool | None = None) -> Completeness:
+    """Compute the share of injected flares that the study's search finds, by bolometric energy.
 
-    The stare is some orbits with one stretch in each, as long as the target's median; the search, its false alarms and
-    what is unknown of the stare are the study's.
-
-    Parameters
-    ----------
-    study : Study
-    looked : Looked
-    engine : Stares or Pool, optional
-        Who draws; the default device. The checkpoint of a pool keeps what is found for each target.
-
-    Raises
-    ------
-    InputError
-        As `inject`.
+    Each orbit of the stare has one window of the target's median length. The checkpoint of a pool keeps the result.
     """
-    question = question_of(study, looked)
+    study, question = observation.case.study, question_of(observation)
     energy = 10 ** np.arange(24.0, 40.0, 1 / PER_DECADE)
 
     def computed() -> Arrays:
@@ -61,32 +48,32 @@ def injected(study: Study, looked: Looked, engine: Stares | Pool | None = None) 
             "shifted": np.array(star.shifted),
         }
 
-    depends_on = ("completeness of a target", question.text(), looked.quiet, looked.scale)
+    depends_on = ("completeness of a target", question.text(), observation.quiet, observation.scale)
     found = kept(engine.checkpoint if isinstance(engine, Pool) else None, depends_on, computed)
     how = (
         f"{question.injections.count} injections of each of {WIDTHS} half-widths into stretches of "
-        f"{looked.window_s / 60:.0f} min, found above {float(found['threshold']):.2f} sigma, "
+        f"{observation.window_s / 60:.0f} min, found above {float(found['threshold']):.2f} sigma, "
         f"{study.search.false_alarms:g} false alarms per {study.search.per}"
         + (", allowing for unknowns that the search leaves in" if found["shifted"] else "")
     )
     return Completeness(energy, found["probability"], BOLOMETRIC, how)
 
 
-def question_of(study: Study, looked: Looked) -> Study:
-    """What is asked of `inject`: the target's star, its sky, its stretches, what the orbit does to its frames."""
+def question_of(observation: TargetObservation) -> Study:
+    """Return the study for `inject`, with the target's windows and conditions."""
+    study, conditions = observation.case.study, observation.conditions
     orbit_s = study.orbit.orbit().elements.period_s
-    gap = max(orbit_s - looked.window_s, 0.0)
+    gap = max(orbit_s - observation.window_s, 0.0)
     changes: dict[str, Any] = {
         "duration_s": ORBITS * orbit_s, "orbit_s": orbit_s, "orbit_gap_s": gap, "gaps": (), "along_orbit": False,
     }  # fmt: skip
-    if looked.conditions is not None and study.stare.thermal is None:
-        changes["thermal"] = CurveText(points=looked.conditions.swings(ORBITS, orbit_s))
+    if conditions is not None and study.stare.thermal is None:
+        changes["thermal"] = CurveText(points=conditions.swings(ORBITS, orbit_s))
     injections = InjectionQuestion(
         of="energy", sizes=2, widths=WIDTHS, half_width_low_s=WIDTH_RANGE_S[0], half_width_high_s=WIDTH_RANGE_S[1],
         count=study.plan.injections, positions=min(POSITIONS, study.plan.injections), fitted=0,
     )  # fmt: skip
-    one = stared_at(study, looked.star, looked.sky, looked.conditions)
-    return one.model_copy(
+    return study.model_copy(
         update={
             "stare": study.stare.model_copy(update=changes),
             "search": study.search.model_copy(update={"nulls": 0}),
@@ -96,13 +83,13 @@ def question_of(study: Study, looked: Looked) -> Study:
 
 
 def found_by_energy(critical_erg: Float, half_widths_s: Float, energy_erg: Float, law: DurationLaw) -> Float:
-    """Completeness by energy, over the half-widths that flares of an energy have, (n_energy,).
+    """Return the completeness by energy, averaged over the half-widths of an energy, shape (n_energy,).
 
     Parameters
     ----------
     critical_erg : ndarray, shape (n_half_width, n_draw)
-        Energy from which on each injection is found; zero where there is an alarm without it, which is left out: false
-        alarms are counted apart.
+        Smallest detected energy of each injection. It is zero if there is an alarm without the flare; these injections
+        are ignored, since false alarms are counted separately.
     half_widths_s : ndarray, shape (n_half_width,)
     energy_erg : ndarray, shape (n_energy,)
     law : DurationLaw

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import astuple, dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
@@ -22,11 +22,12 @@ from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import INTERVAL, Column, View, interval, number, percent, stacked, table_of
 from mauvecl.statistics.intervals import Interval
-from mauvecl.study.labels import label, place_columns
+from mauvecl.study.cases import Case, cases
+from mauvecl.study.labels import place_columns
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.stare_expectation import orbit_lines, threshold_line
 from mauvecl.study.study import Study
-from mauvecl.study.surveys import Sizes, StarSurvey, injected_sizes, survey_star
+from mauvecl.study.surveys import Sizes, StarSurvey, injected_sizes
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.lightcurve.stares.requests import StaresRequest
     from mauvecl.study.assumptions import Use
-    from mauvecl.study.sections import Star
 
 Float = NDArray[np.float64]
 
@@ -301,37 +301,35 @@ def inject(
         from mauvecl.device.stares import Stares as Default
 
         engine = Default()
-    cells = [(values, one, star) for values, one in study.cells() for star in one.star]
-    for _, one, star in cells:
-        # A size that no star has is told before the first of them is searched.
-        Sizes.chosen(one, star, star.source())
+    prepared = cases(study)
+    for case in prepared:
+        # Raise InputError for energies of stars of unknown size before the first search.
+        Sizes.chosen(case)
     q = study.injections
     each = q.count * q.sizes * q.widths
     answer = InjectAnswer(study, [])
-    for done, (values, one, star) in enumerate(cells):
+    for done, case in enumerate(prepared):
 
-        def told_of(part: float, done: int = done) -> None:
+        def report(part: float, done: int = done) -> None:
             if progress is not None:
-                progress(round((done + part) * each), len(cells) * each)
+                progress(round((done + part) * each), len(prepared) * each)
 
-        told_of(0.0)
-        answer.stars.append(_star(one, star, values, engine, told_of))
-    told_of(1.0)
+        report(0.0)
+        answer.stars.append(_completeness(case, engine, report))
+    report(1.0)
     answer.messages = [
         *(text for star in answer.stars for text in star.messages),
         *collect_messages(answer.inputs),
-        *orbit_lines(study),
+        *orbit_lines(prepared[0]),
     ]
     return answer
 
 
-def _star(
-    study: Study, star: Star, at: Mapping[str, float | str], engine: Stares | Pool, told_of: Callable[[float], None]
-) -> StarCompleteness:
-    choice, asked, seed = study.search, study.injections, study.run.seed
-    rays = study.processes.processes().cosmic_rays
-    known = survey_star(study, star)
-    survey = known.survey
+def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], None]) -> StarCompleteness:
+    """Inject flares into the stare of a case and search for them; `report` receives the share that is done."""
+    choice, asked, seed = case.study.search, case.study.injections, case.study.run.seed
+    rays = case.study.processes.processes().cosmic_rays
+    known, survey = case.survey, case.survey.survey
     drawn = None
     if choice.nulls:
         maxima = _reduced(engine, survey.null(choice.nulls, seed, rays))["maximum"]
@@ -340,15 +338,15 @@ def _star(
     threshold = (
         tail.threshold(choice.rate) if choice.null == "sampled" or drawn is None else drawn.threshold(choice.rate)
     )
-    sizes = Sizes.chosen(study, star, known.source)
-    values = injected_sizes(study, sizes, known.unit_snr, threshold.value)
+    sizes = Sizes.chosen(case)
+    values = injected_sizes(case, sizes, threshold.value)
     positions = min(asked.positions, asked.count)
     injections = Injections(
         survey, 0, asked.half_widths_s, threshold.value, seed, positions, -(-asked.count // positions), rays
     )
     widths = np.array(injections.half_widths_s)
     amplitudes = np.asarray(sizes.amplitude(values[None], widths[:, None]))
-    refit = Refit(known.fit, amplitudes, study.flare.temperature_k, -(-asked.fitted // positions))
+    refit = Refit(known.fit, amplitudes, case.study.flare.temperature_k, -(-asked.fitted // positions))
 
     def at_one_peak(position: int) -> Arrays:
         return _reduced(engine, injections.request(position, refit if refit.count else None))
@@ -356,16 +354,16 @@ def _star(
     parts: list[Arrays] = []
     for part in map_in_order(engine, at_one_peak, range(positions)):
         parts.append(part)
-        told_of(len(parts) / positions)
+        report(len(parts) / positions)
     critical = np.stack([part["critical"].T for part in parts], axis=1)
-    # Where a few stares in ten have an alarm, drawn ones say most of whether the two agree.
+    # The comparison with drawn stares has most power where a few in ten have an alarm.
     checked, likely, error = tail.likely
     simulated, expected = _checked(drawn, checked, likely, error, survey.stare.observed_s / DAY_S / tail.days)
     alarmed = 0 if drawn is None else int(np.sum(drawn.maxima >= threshold.value))
     should = float("nan") if drawn is None else drawn.maxima.size * -np.expm1(-choice.rate * drawn.days)
     return StarCompleteness(
-        label(star, known.quiet),
-        at,
+        case.label,
+        case.at,
         known,
         sizes,
         threshold,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import itemgetter
@@ -22,26 +22,23 @@ from mauvecl.runs.checkpoint import kept
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column, View, number, percent, records, table_of
-from mauvecl.study.labels import label, place_columns
+from mauvecl.study.cases import Case, cases
+from mauvecl.study.labels import place_columns
 from mauvecl.study.messages import collect_messages
-from mauvecl.study.stare_expectation import energy_of, expect_stare, orbit_lines, stare_of, threshold_line, unused_lines
+from mauvecl.study.stare_expectation import energy_of, orbit_lines, threshold_line, unused_lines
 from mauvecl.study.stare_section import check_sweep
 from mauvecl.study.study import Study
-from mauvecl.study.surveys import survey_star
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.device.stares import Stares
     from mauvecl.host.expectation import Expectation
-    from mauvecl.host.stars.source import Source
     from mauvecl.lightcurve.search.blends import Factor
     from mauvecl.lightcurve.search.flare_fit import FittedFlares
     from mauvecl.results.sums import Arrays
     from mauvecl.runs.checkpoint import Checkpoint
     from mauvecl.study.assumptions import Use
-    from mauvecl.study.sections import Star
-    from mauvecl.study.surveys import StarSurvey
 
 KINDS: tuple[Kind, ...] = ("band", "bolometric")
 #: Light curves in text, at most; longer ones are in their FITS files alone.
@@ -383,8 +380,9 @@ def stare(
         For anything in the study that cannot be.
     """
     check_sweep(study)
-    # What is swept changes no frame.
-    frames = stare_of(study).n_frames
+    prepared = cases(study)
+    # Sweeps do not change the frames.
+    frames = prepared[0].stare.n_frames
     if frames > MOST_SHOWN:
         raise InputError(
             f"a stare of {frames} frames, each with a spectrum",
@@ -392,21 +390,19 @@ def stare(
             key="stare.duration_s",
             value=frames,
         )
-    # Everything is looked at before anything is drawn: bad input shows at once.
-    prepared = [(star, at, cell, *expect_stare(cell, star)) for at, cell in study.cells() for star in cell.star]
+    # Bad input is refused before anything is drawn.
+    quiet = [case.stare_expectation.quiet for case in prepared]
     if engine is None:
         from mauvecl.device.stares import Stares as Default
 
         engine = Default()
     drawn: list[StarStare] = []
-    for one_star in prepared:
-        drawn.append(_drawn(study, engine, checkpoint, *one_star))
+    for case in prepared:
+        drawn.append(_draw(case, engine, checkpoint))
         if progress is not None:
             progress(len(drawn), len(prepared))
-    messages = collect_messages([staring.quiet for _, _, _, staring, _ in prepared]) + orbit_lines(study)
-    messages += dict.fromkeys(
-        line for *_, cell, staring, events in prepared for line in unused_lines(cell, staring, events)
-    )
+    messages = collect_messages(quiet) + orbit_lines(prepared[0])
+    messages += dict.fromkeys(line for case in prepared for line in unused_lines(case))
     messages += [one.searched for one in drawn if isinstance(one.searched, str)]
     messages += [
         threshold_line(one.title, one.searched.threshold)
@@ -420,37 +416,29 @@ def stare(
     return StareAnswer(study, drawn, messages)
 
 
-def _drawn(
-    study: Study,
-    stares: Stares,
-    checkpoint: Checkpoint | None,
-    star: Star,
-    at: Mapping[str, float | str],
-    cell: Study,
-    staring: StareExpectation,
-    events: list[Event],
-) -> StarStare:
-    q, rays = study.stare, study.processes.processes().cosmic_rays
+def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStare:
+    """Draw and search the stare of a case."""
+    q, seed, rays = case.study.stare, case.study.run.seed, case.study.processes.processes().cosmic_rays
+    staring = case.stare_expectation
 
     def draw(components: Any) -> Any:
         def computed() -> Arrays:
             what = components, staring.stare, staring.flare
-            return {"frames": stares.frames(*what, first=q.number, count=1, seed=study.run.seed, cosmic_rays=rays)[0]}
+            return {"frames": stares.frames(*what, first=q.number, count=1, seed=seed, cosmic_rays=rays)[0]}
 
-        depends_on = ("frames", components, staring.stare, staring.flare, q.number, study.run.seed, rays)
+        depends_on = ("frames", components, staring.stare, staring.flare, q.number, seed, rays)
         return kept(checkpoint, depends_on, computed)["frames"]
 
     light = seen(staring, q.bands_nm, draw)
-    searched = _searched(cell, star, staring, events, draw, checkpoint) if q.search else None
-    return StarStare(label(star, staring.quiet), at, staring, _flares(cell, star, staring, events), light, searched)
+    searched = _search(case, draw, checkpoint) if q.search else None
+    return StarStare(case.label, case.at, staring, _flares(case), light, searched)
 
 
-def _searched(
-    study: Study, star: Star, staring: StareExpectation, events: list[Event], draw: Draw, checkpoint: Checkpoint | None
-) -> Searched | str:
-    """What the study's search finds, or why it cannot be made."""
+def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> Searched | str:
+    """Search the stare of a case for flares, or return a message if no search is possible."""
+    study, staring, events = case.study, case.stare_expectation, case.events
     try:
-        known = survey_star(study, star)
+        known = case.survey
         survey = replace(known.survey, components=staring.components(known.templates.weights))
 
         def computed() -> Arrays:
@@ -460,8 +448,8 @@ def _searched(
         tail = kept(checkpoint, ("threshold", survey, study.text()), computed)
         threshold = float(tail["threshold"])
     except InputError as error:
-        return f"{label(star, staring.quiet)} is not searched: {error}."
-    scale = _log_energy(study, star, known)
+        return f"{case.label} is not searched: {error}."
+    scale = _log_energy(case)
     raised = alarms(survey, known.templates, draw(survey.components), threshold, scale)
     energies, nearest = [], []
     for alarm in raised:
@@ -471,7 +459,7 @@ def _searched(
             nearest.append(0)
             continue
         event = _event_of(study, fit)
-        energies.append(_found_energy(study, star, known.source, event))
+        energies.append(_found_energy(case, event))
         away = [abs(one.peak_s - event.peak_s) for one in events]
         near = int(np.argmin(away)) if away else -1
         close = near >= 0 and away[near] <= events[near].half_width_s + 2 * staring.stare.frame_s
@@ -485,38 +473,40 @@ def _event_of(study: Study, fit: FittedFlares) -> Event:
     return Event(float(fit.peak_s[0]), float(fit.half_width_s[0]), float(fit.amplitude[0]), kelvin, study.search.shape)
 
 
-def _log_energy(study: Study, star: Star, known: StarSurvey) -> Factor | None:
-    """Return the logarithm of the energy of a second of equivalent duration over that of the temperature, or None.
+def _log_energy(case: Case) -> Factor | None:
+    """Return the logarithm of the energy per second of equivalent duration as a function of log temperature.
 
-    None where the star's size is unknown, or a template's temperature gives no energy.
+    Returns None if the star's size is unknown, or a template's temperature gives no energy.
     """
-    kelvin = known.templates.temperatures_k
-    one = Event(0.0, 1.0, 1.0, kelvin[0], study.search.shape)
+    kelvin = case.survey.templates.temperatures_k
+    one = Event(0.0, 1.0, 1.0, kelvin[0], case.study.search.shape)
     events = [replace(one, temperature=k) for k in kelvin]
-    energies = np.array([_found_energy(study, star, known.source, event) for event in events])
+    energies = np.array([_found_energy(case, event) for event in events])
     if len(kelvin) < 2 or not (np.isfinite(energies) & (energies > 0)).all():
         return None
     spline = CubicSpline(np.log(kelvin), np.log(energies / one.equivalent_duration_s))
     return lambda x: (float(spline(x)), float(spline(x, 1)))
 
 
-def _found_energy(study: Study, star: Star, source: Source, event: Event) -> float:
-    """Return the bolometric energy of a flare that was found, erg; NaN where the star's size is unknown.
+def _found_energy(case: Case, event: Event) -> float:
+    """Return the bolometric energy of a detected flare, erg; NaN if the star's size is unknown.
 
-    NaN also where flares replace photosphere and the fitted temperature is no higher than the photosphere's.
+    Also NaN if flares replace photosphere and the fitted temperature is not above the photosphere's.
     """
-    photosphere = study.flare.photosphere_temperature_k or source.temperature_k
-    if study.flare.geometry == "replaces" and photosphere is not None and event.hottest_k <= photosphere:
+    flare = case.study.flare
+    photosphere = flare.photosphere_temperature_k or case.source.temperature_k
+    if flare.geometry == "replaces" and photosphere is not None and event.hottest_k <= photosphere:
         return float("nan")
-    energy = energy_of(study, star, source, event, "bolometric")
+    energy = energy_of(case, event, "bolometric")
     return float("nan") if energy is None else energy
 
 
-def _flares(study: Study, star: Star, staring: StareExpectation, events: list[Event]) -> tuple[Flaring, ...]:
-    source, kelvin, frames = star.source(), temperatures_of(events), staring.stare
+def _flares(case: Case) -> tuple[Flaring, ...]:
+    """Return the flares of a case's stare with their energies and S/N."""
+    staring, kelvin, frames = case.stare_expectation, temperatures_of(case.events), case.stare
     flares = []
-    for event in events:
-        energies = [energy_of(study, star, source, event, kind, kelvin) for kind in KINDS]
+    for event in case.events:
+        energies = [energy_of(case, event, kind, kelvin) for kind in KINDS]
         band, bolometric = (float("nan") if energy is None else energy for energy in energies)
         own = coefficients([event], frames.start_s, frames.frame_s, kelvin)
         flares.append(Flaring(event, band, bolometric, staring.snr(own)))
