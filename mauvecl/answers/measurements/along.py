@@ -15,7 +15,6 @@ from mauvecl.lightcurve.stares.requests import Arrays, StaresRequest
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool
 from mauvecl.schema.errors import InputError
-from mauvecl.study.stare_expectation import expect_stare
 
 if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
@@ -41,7 +40,7 @@ class MeasuredStare(InCell):
 def measured_stare(case: Case, engine: Engine | Pool, snr_per_bin: float) -> MeasuredStare:
     """Draw the stare of a case, and measure its flares with the model of the flare's spectrum."""
     study = case.study
-    staring, events = expect_stare(study, case.star)
+    staring, events = case.stare_expectation, case.events
     quiet, stare, seed = staring.quiet, staring.stare, study.run.seed
     rays = case.processes.cosmic_rays
     name, model = list(models_of(case.one_frame).items())[-1]
