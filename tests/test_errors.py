@@ -47,7 +47,7 @@ def test_sentences_of_each_kind() -> None:
             lambda: numbers("wavelengths", [1.0, -1.0], "nm", low=0.0),
             "wavelengths = -1.0 nm, expected nm of at least 0",
         ),
-        (lambda: Study().with_settings(["run.fap=3"]), "settings: run.fap = 3, expected less than 1"),
+        (lambda: Study().with_settings(["run.fap=3"]), "settings: run.fap = 3, expected a number above 0 and below 1"),
         (
             lambda: Instrument.load("mauve").with_(temprature_c=1),
             "mauve: unknown key 'temprature_c', did you mean 'temperature_c'?",

@@ -61,12 +61,7 @@ class PixelMap(ContentEquality):
                 continue
             values = np.array(getattr(self, name), np.float64)
             if values.ndim != 1:
-                raise InputError(
-                    f"{name} of the pixel map has the shape {values.shape}",
-                    "one value per pixel",
-                    key=name,
-                    value=values.shape,
-                )
+                raise InputError.of(name, values.shape, "one value per pixel, not this shape", where="pixel map")
             bad = ~(np.isfinite(values) & (values >= 0))
             if name == "gain":
                 bad |= values == 0
@@ -78,12 +73,7 @@ class PixelMap(ContentEquality):
             object.__setattr__(self, name, values)
             sizes.add(values.size)
         if len(sizes) != 1:
-            raise InputError(
-                f"the pixel map has columns of {sorted(sizes) or 'no'} pixels",
-                "one length",
-                key="pixel_map",
-                value=sizes,
-            )
+            raise InputError.of("pixel_map", sorted(sizes), "columns of one length", unit="pixels")
 
     @property
     def size(self) -> int:
