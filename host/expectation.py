@@ -326,7 +326,12 @@ class Expectation(Drawable, ContentEquality):
     def per_element(self, values: Float) -> Float:
         """Sum the values of pixels over resolution elements, from shape (n_pixel,) to (n_element,)."""
         if np.shape(values) != self.element.shape:
-            raise InputError.of("values.shape", np.shape(values), f"{self.element.shape}: one for each pixel")
+            raise InputError(
+                f"values of the shape {np.shape(values)}",
+                f"{self.element.shape}: one for each pixel",
+                key="values",
+                value=np.shape(values),
+            )
         return np.asarray(np.bincount(self.element, values, minlength=self.element_wavelength_nm.size), np.float64)
 
     def noise_budget(self) -> QTable:
@@ -442,7 +447,12 @@ def expect(
     # The margin makes 0.1 + 0.2 s three frames of 0.1 s despite rounding.
     n_frames = max(1, int(np.ceil(asked_s / instrument.frame_s * (1 - 1e-12))))
     if n_frames > MAX_FRAMES:
-        raise InputError.of("exposure", asked_s, f"at most {MAX_FRAMES} frames of {instrument.frame_s:g} s", unit="s")
+        raise InputError(
+            f"exposure = {asked_s:g} s has {n_frames} frames of {instrument.frame_s:g} s",
+            f"at most {MAX_FRAMES}",
+            key="exposure",
+            value=asked_s,
+        )
     low, high = instrument.output_min_nm, instrument.output_max_nm
     first, last = source.measured_nm or (float(source.wavelength_nm[0]), float(source.wavelength_nm[-1]))
     check_covers(source.name, (first, last), (low, high), f"{instrument.name}'s output range ")

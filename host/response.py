@@ -203,7 +203,12 @@ def _knots(instrument: Instrument, order: Order) -> tuple[float, ...]:
 def _nodes(wavelength_nm: ArrayLike) -> Float:
     nodes = np.ascontiguousarray(wavelength_nm, np.float64)
     if nodes.ndim != 1 or nodes.size < 2 or not np.isfinite(nodes).all() or not (np.diff(nodes) > 0).all():
-        raise InputError.of("wavelength_nm", wavelength_nm, "at least two, finite and strictly increasing, in nm")
+        raise InputError(
+            "the wavelengths of a spectrum",
+            "at least two, finite and strictly increasing, in nm",
+            key="wavelength_nm",
+            value=wavelength_nm,
+        )
     return nodes
 
 

@@ -28,12 +28,18 @@ class Curve:
         wavelength = np.asarray(self.wavelength_nm, dtype=np.float64)
         value = np.asarray(self.value, dtype=np.float64)
         if wavelength.ndim != 1 or wavelength.size == 0 or wavelength.shape != value.shape:
-            raise InputError.of(
-                "value.size", value.size, f"one or more, as many as wavelengths ({wavelength.size})", where="a curve"
+            raise InputError(
+                f"a curve has {wavelength.size} wavelengths and {value.size} values",
+                "as many, one or more",
+                key="value",
+                value=value.size,
             )
         if not (np.isfinite(wavelength).all() and (np.diff(wavelength) > 0).all()):
-            raise InputError.of(
-                "wavelength_nm", wavelength, "finite and strictly increasing wavelengths", where="a curve"
+            raise InputError(
+                "a curve's wavelengths are not finite and strictly increasing",
+                "nm in order",
+                key="wavelength_nm",
+                value=wavelength,
             )
         bad = ~(np.isfinite(value) & (value >= 0))
         if bad.any():
@@ -54,8 +60,11 @@ class Curve:
         """
         table = read_numbers(path, "curve file")
         if "wavelength" not in table.columns or len(table.columns) != 2:
-            raise InputError.of(
-                "columns", list(table.columns), "'wavelength' and one value", where=f"curve file {path}"
+            raise InputError(
+                f"curve file {path} has the columns {', '.join(table.columns)}",
+                "'wavelength' and one value",
+                key="columns",
+                value=table.columns,
             )
         name = next(column for column in table.columns if column != "wavelength")
         meta = table.meta

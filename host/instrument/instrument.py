@@ -206,7 +206,12 @@ class Instrument(Record):
         if not high > low:
             raise InputError.of("output_max_nm", high, f"more than output_min_nm = {low:g}")
         if self.wavelength_nm.size == 0:
-            raise InputError.of("output_min_nm", low, f"a range with at least one pixel up to output_max_nm = {high:g}")
+            raise InputError(
+                f"no pixel lies in the output range {low:g}-{high:g} nm",
+                "at least one",
+                key="output_min_nm",
+                value=(low, high),
+            )
         for name in CURVES:
             curve: Curve = getattr(self, name)
             if not curve.covers(low, high):
@@ -217,13 +222,23 @@ class Instrument(Record):
                     value=(curve.wavelength_nm[0], curve.wavelength_nm[-1]),
                 )
         if self.top_hat_width_nm == self.gaussian_fwhm_nm == 0:
-            raise InputError.of("top_hat_width_nm", 0.0, "a width above 0 where gaussian_fwhm_nm is 0")
+            raise InputError(
+                "top_hat_width_nm and gaussian_fwhm_nm are both 0",
+                "at least one above 0",
+                key="top_hat_width_nm",
+                value=0.0,
+            )
         for name in ("top_hat_width_nm", "gaussian_fwhm_nm"):
             # A width far below a pixel has no effect, but costs time and digits.
             if 0 < getattr(self, name) < 0.1:
                 raise InputError.of(name, getattr(self, name), "0 (none) or at least 0.1")
         if (most := float(self.quantum_efficiency(self.wavelength_nm).max())) > 1:
-            raise InputError.of("quantum_efficiency_a_per_w", most, "at most 1", unit="electrons per photon")
+            raise InputError(
+                f"quantum_efficiency_a_per_w stands for {most:.3g} electrons per photon",
+                "at most 1",
+                key="quantum_efficiency_a_per_w",
+                value=most,
+            )
         if self.resolution_element_nm < self.dispersion_nm_per_pixel:
             raise InputError.of(
                 "resolution_element_nm",
@@ -233,7 +248,12 @@ class Instrument(Record):
         if self.bias_dn >= min(self.saturation_dn, self.adc_max_dn):
             raise InputError.of("bias_dn", self.bias_dn, "below saturation")
         if self.pixel_map is not None and self.pixel_map.size != self.pixels:
-            raise InputError.of("pixel_map", self.pixel_map.size, f"the array's {self.pixels}", unit="pixels")
+            raise InputError(
+                f"pixel_map has {self.pixel_map.size} pixels",
+                f"the array's {self.pixels}",
+                key="pixel_map",
+                value=self.pixel_map.size,
+            )
         if not (self.throughput(self.wavelength_nm) * self.per_pixel("response", 1.0) > 0).any():
             dark = [name for name in CURVES if not (getattr(self, name).at(self.wavelength_nm) > 0).any()]
             what = f"{' and '.join(dark) or 'the throughput'} = 0 from {low:g} to {high:g} nm"

@@ -42,7 +42,12 @@ def _read(path: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], dict[str,
     if path.resolve() in seen:
         raise InputError(f"{path.name} extends itself", "a chain of files that ends", key="extends", value=path.name)
     if len(seen) == MAX_EXTENDED:
-        raise InputError.of("extends", path.name, f"a chain of at most {MAX_EXTENDED} files")
+        raise InputError(
+            f"{path.name} ends a chain of {MAX_EXTENDED} files that extend another",
+            "fewer",
+            key="extends",
+            value=path.name,
+        )
     content = toml(read_text(path, "instrument file"), f"instrument file {shortened(str(path))}")
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}

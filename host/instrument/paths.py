@@ -38,7 +38,12 @@ def instrument_path(name: str | Path, folder: Path) -> Path:
             f"instrument file {shortened(str(path))} does not exist", "a TOML file", key="instrument", value=name
         )
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.0)[0]
-    raise InputError.of("instrument", str(name), f"{' or '.join(names)} (nearest: {near!r}) or the path of a TOML file")
+    raise InputError(
+        f"unknown instrument {shortened(str(name))}",
+        f"{' or '.join(names)} (nearest: {near!r}) or the path of a TOML file",
+        key="instrument",
+        value=name,
+    )
 
 
 def _local(resource: Traversable) -> Path:

@@ -61,7 +61,12 @@ class PixelMap(ContentEquality):
                 continue
             values = np.array(getattr(self, name), np.float64)
             if values.ndim != 1:
-                raise InputError.of(name, values.shape, "one value per pixel, not this shape", where="pixel map")
+                raise InputError(
+                    f"{name} of the pixel map has the shape {values.shape}",
+                    "one value per pixel",
+                    key=name,
+                    value=values.shape,
+                )
             bad = ~(np.isfinite(values) & (values >= 0))
             if name == "gain":
                 bad |= values == 0
@@ -73,7 +78,12 @@ class PixelMap(ContentEquality):
             object.__setattr__(self, name, values)
             sizes.add(values.size)
         if len(sizes) != 1:
-            raise InputError.of("pixel_map", sorted(sizes), "columns of one length", unit="pixels")
+            raise InputError(
+                f"the pixel map has columns of {sorted(sizes) or 'no'} pixels",
+                "one length",
+                key="pixel_map",
+                value=sizes,
+            )
 
     @property
     def size(self) -> int:

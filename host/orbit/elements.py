@@ -31,10 +31,18 @@ class Elements:
         for number, line in enumerate((self.first, self.second), 1):
             _check(line, number)
         if self.first[2:7] != self.second[2:7]:
-            raise InputError.of("elements", [self.first[2:7], self.second[2:7]], "lines of one satellite")
+            raise InputError(
+                f"orbital elements are of satellites {self.first[2:7]!r} and {self.second[2:7]!r}",
+                "one",
+                key="elements",
+                value=(self.first[2:7], self.second[2:7]),
+            )
         if self.satellite.error:
-            raise InputError.of(
-                "elements", self.second, f"those of an orbit around the Earth (SGP4 error {self.satellite.error})"
+            raise InputError(
+                f"orbital elements {shortened(self.second)} are refused by SGP4 (error {self.satellite.error})",
+                "those of an orbit around the Earth",
+                key="elements",
+                value=self.second,
             )
 
     @classmethod
@@ -58,7 +66,12 @@ class Elements:
         for one, two in pairwise(lines):
             if one.startswith("1 ") and two.startswith("2 "):
                 return cls(one, two, source)
-        raise InputError.of("elements", named, "a line '1 ...' before '2 ...'")
+        raise InputError(
+            f"orbit file {named} holds no two lines of elements",
+            "a line '1 ...' before '2 ...'",
+            key="elements",
+            value=named,
+        )
 
     @cached_property
     def satellite(self) -> Any:
@@ -126,4 +139,9 @@ def _check(line: str, number: int) -> None:
         raise InputError.of("elements", line, f"line {number} with 69 characters")
     checksum = sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10
     if line[68] != str(checksum):
-        raise InputError.of("elements", line, f"a line that ends in its checksum {checksum}")
+        raise InputError(
+            f"orbital elements {shortened(line)} end in the checksum {line[68]!r}",
+            f"{checksum}: one is wrong",
+            key="elements",
+            value=line,
+        )

@@ -62,7 +62,12 @@ class Limits:
         if self.anomaly and (
             len(self.anomaly) < 3 or not all(math.isfinite(one) for corner in self.anomaly for one in corner)
         ):
-            raise InputError.of("anomaly", self.anomaly, "at least 3 finite corners")
+            raise InputError(
+                f"anomaly is a polygon of {len(self.anomaly)} corners",
+                "at least 3, finite",
+                key="anomaly",
+                value=self.anomaly,
+            )
         if not (math.isfinite(self.shortest_s) and self.shortest_s >= 0):
             raise InputError.of("shortest_s", self.shortest_s, ">= 0")
         if not 0 < self.duty_cycle <= 1:

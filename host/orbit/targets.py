@@ -64,8 +64,11 @@ class Target:
             near = difflib.get_close_matches(name_key(text), _names(), n=3, cutoff=0.5)
             like = ", ".join(dict.fromkeys(_names()[one].name for one in near))
             like = f"a name such as {like}" if like else "a name of the embedded list"
-            raise InputError.of(
-                "target", text, f"{like}, coordinates such as '290.0 -11.2', or `simbad=True` to ask SIMBAD"
+            raise InputError(
+                f"target {shortened(text)} is not in the embedded list",
+                f"{like}, coordinates such as '290.0 -11.2', or `simbad=True` to ask SIMBAD",
+                key="target",
+                value=text,
             )
         with offline():
             place = parse_position(text).icrs
@@ -117,8 +120,11 @@ def _from_simbad(text: str, name: str | None) -> Target:
     try:
         from astroquery.simbad import Simbad
     except ImportError:
-        raise InputError.of(
-            "target", text, "one of the embedded list, coordinates, or `pip install 'mauvecl[names]'`"
+        raise InputError(
+            f"target {shortened(text)} is not in the embedded list and astroquery is missing",
+            "coordinates, or `pip install 'mauvecl[names]'`",
+            key="target",
+            value=text,
         ) from None
     query = SIMBAD_QUERY.format(text.strip().replace("'", "''"))
     try:

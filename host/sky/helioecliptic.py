@@ -53,8 +53,11 @@ def helioecliptic(target: SkyCoord | str, time: Time | str) -> HelioEcliptic:
         try:
             star = position.transform_to(frame)
         except Exception:  # frames that cannot be transformed (AltAz without a location) raise many kinds
-            raise InputError.of(
-                "target", position.frame.name, "a frame that can be turned to the ecliptic, such as ICRS"
+            raise InputError(
+                f"target in the frame {position.frame.name!r} cannot be turned to the ecliptic",
+                "ICRS",
+                key="target",
+                value=position.frame.name,
             ) from None
         difference = float((star.lon - sun.lon).wrap_at("180d").deg)
         longitude, latitude = abs(difference), float(star.lat.deg)

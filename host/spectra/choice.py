@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
 
 from .roles import Role
 
@@ -61,7 +62,12 @@ def _named(name: str, names: Sequence[str]) -> int:
     places = [i for i, one in enumerate(names) if one.strip() == name]
     places = places or [i for i, one in enumerate(names) if plain(one) == plain(name)]
     if len(places) != 1:
-        raise InputError.of("columns", name, f"one of {listed(names)}" + ", named once" * bool(places))
+        raise InputError(
+            f"{'several columns are' if places else 'no column is'} named {shortened(name)}",
+            f"one of {listed(names)}",
+            key="columns",
+            value=name,
+        )
     return places[0]
 
 
@@ -71,7 +77,12 @@ def _wavelength(names: Sequence[str], roles: Sequence[Role]) -> tuple[int, ...]:
     low, high = ([i for i, role in enumerate(roles) if role.kind == f"{side} edge"] for side in ("lower", "upper"))
     if low or high:
         return _only("lower edge of the bins", names, low), _only("upper edge of the bins", names, high)
-    raise InputError.of("columns", names, "one named wavelength: name two columns as in FILE[wavelength,flux]")
+    raise InputError(
+        f"no column is recognised as the wavelength among {listed(names)}",
+        "one named wavelength: name two columns as in FILE[wavelength,flux]",
+        key="columns",
+        value=names,
+    )
 
 
 def _flux(names: Sequence[str], roles: Sequence[Role], wavelength: tuple[int, ...]) -> int:
@@ -100,6 +111,16 @@ def _only(what: str, names: Sequence[str], places: Sequence[int]) -> int:
     if len(places) == 1:
         return places[0]
     if not places:
-        raise InputError.of("columns", names, f"both edges or the wavelength itself: no column is the {what}")
+        raise InputError(
+            f"no column is the {what} among {listed(names)}",
+            "both edges or the wavelength itself",
+            key="columns",
+            value=names,
+        )
     several = [names[i].strip() for i in places]
-    raise InputError.of("columns", several, f"one {what}: name it as in FILE[{several[-1][:40]}]")
+    raise InputError(
+        f"{len(several)} columns may be the {what}: {listed(several)}",
+        f"one: name it as in FILE[{several[-1][:40]}]",
+        key="columns",
+        value=several,
+    )

@@ -186,7 +186,12 @@ def _check_flux_unit(unit: Any, role: Role) -> None:
             value=unit,
         )
     if kind == "surface brightness":
-        raise InputError.of("flux_unit", str(unit), "the flux of the whole star, such as erg / (s cm2 Angstrom)")
+        raise InputError(
+            f"the unit {unit} is per solid angle",
+            "the flux of the whole star, such as erg / (s cm2 Angstrom)",
+            key="flux_unit",
+            value=unit,
+        )
     if kind == "other":
         raise InputError.of("flux_unit", str(unit), "one such as erg / (s cm2 Angstrom)")
 

@@ -100,7 +100,10 @@ def without_undefined_ends(name: str, wavelength: Float, flux: Float) -> tuple[F
     kept = wavelength[start:stop]
     if kept.size < 2:
         raise InputError(
-            f"spectrum {name}: no flux is defined at {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm", "some", key="flux"
+            f"spectrum {name} has no defined flux in {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm",
+            "some",
+            key="flux",
+            value=name,
         )
     note = f"cut to {kept[0]:.1f}-{kept[-1]:.1f} nm: undefined flux beyond"
     return kept, flux[start:stop], (note,)

@@ -47,7 +47,12 @@ def rows_of(hdu: Any, telescope: str) -> tuple[Any, tuple[str, ...], tuple[str, 
     header = hdu.header
     shape = [int(header.get(f"NAXIS{k + 1}", 0)) for k in range(int(header["NAXIS"]))]
     if sum(n > 1 for n in shape) > 2 or shape[0] < 2:
-        raise InputError.of("image.shape", shape, "a spectrum of one dimension, rows of spectra, or a table")
+        raise InputError(
+            f"holds an image of {' x '.join(map(str, shape))} pixels",
+            "a spectrum of one dimension, rows of spectra, or a table",
+            key="table",
+            value=shape,
+        )
     flux = np.asanyarray(hdu.data).reshape(-1, shape[0])
     if len(flux) == 1:
         return flux[0], (), ()

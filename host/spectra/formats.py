@@ -85,7 +85,12 @@ def _tables(
     if re.match(rb"<(\?xml|votable|vot:)", start, re.IGNORECASE) and b"VOTABLE" in content[:4096].upper():
         return votable_tables(content, name, origin)
     if start[:1] == b"<":
-        raise InputError.of("file", start[:20].decode("ascii", "replace"), "a spectrum, no page or XML")
+        raise InputError(
+            f"is a page or XML that begins with {shortened(start[:20].decode('ascii', 'replace'))}",
+            "a spectrum",
+            key="file",
+            value=start[:20],
+        )
     text = text_of(content)
     if re.match(r"#\s*%ECSV", text):
         return ecsv_tables(text, name, origin)

@@ -66,7 +66,12 @@ def spectrum_in(tables: Sequence[FileTable], asked: Sequence[str]) -> RawSpectru
         return replace(found[0], segments=segments, messages=(*found[0].messages, f"its parts {parts} are joined"))
     if len(found) > 1:
         held = [one.table.label for one in found]
-        raise InputError.of("table", held, f"one table with a spectrum: name it as in FILE[{held[0].strip()}]")
+        raise InputError(
+            f"{len(held)} tables hold a spectrum: {listed(held)}",
+            f"one: name it as in FILE[{held[0].strip()}]",
+            key="table",
+            value=held,
+        )
     return found[0]
 
 
@@ -106,7 +111,12 @@ def _spectrum_of(table: FileTable, asked: Sequence[str]) -> RawSpectrum:
         segments.append((sum(axes[1:], axes[0]) / len(axes), flux))
         for array, column in zip((axes[0], flux), (chosen[0], chosen[-1]), strict=True):
             if array.ndim != 1:
-                raise InputError.of(f"{column.name.strip()}.shape", array.shape, "one spectrum")
+                raise InputError(
+                    f"column {column.name.strip()} has the shape {array.shape}",
+                    "one spectrum",
+                    key=column.name.strip(),
+                    value=array.shape,
+                )
         if axes[0].size != flux.size:
             raise InputError(
                 f"{axes[0].size} wavelengths for {flux.size} fluxes", "as many", key="flux", value=flux.size

@@ -175,12 +175,22 @@ def _splitter(lines: list[str]) -> tuple[Split, list[str]]:
     blanks = [line.split() for line in sample]
     if all(len(cells) > 1 for cells in blanks) and not any(c.endswith(",") for cells in blanks for c in cells[:-1]):
         if points or not all(_DECIMAL_COMMA.fullmatch(c) or "," not in c for cells in blanks for c in cells):
-            raise InputError.of("line", sample[0], "decimal points and one kind of mark between columns")
+            raise InputError(
+                f"line {shortened(sample[0], 60)} mixes commas, points and blanks",
+                "decimal points and one kind of mark between columns",
+                key="columns",
+                value=sample[0],
+            )
         messages.append("its decimal commas are read as points")
         return partial(_cells, mark=None, decimal=True), messages
     cells = [line.split(",") for line in sample]
     if not points and all(len(row) > 1 and re.fullmatch(r"\s*\d+\s*", row[1]) for row in cells) and len(cells) > 1:
-        raise InputError.of("line", sample[0], "decimal points: these may be decimal commas or columns")
+        raise InputError(
+            f"line {shortened(sample[0], 60)} may hold decimal commas or columns",
+            "decimal points",
+            key="columns",
+            value=sample[0],
+        )
     return (
         lambda line: line.replace(",", " , ").split(" , ") if ",," in line else re.split(r"\s*,\s*|\s+", line)
     ), messages

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from mauvecl.schema.errors import InputError
 
 from ..files.units import flux_kind, is_spectral, is_stated, unit_of
-from .choice import AXES
+from .choice import AXES, listed
 from .roles import divided, role_of, words_of
 
 #: Lines of a header, and whether each was a remark.
@@ -139,5 +139,10 @@ def _of_another_length(header: Header, n: int) -> list[str]:
         if is_remark and len(cells) < n:
             return [*cells, *(str(k + 1) for k in range(len(cells), n))]
         if not is_remark or not in_order:
-            raise InputError.of("columns", cells, f"a name for each of {n} columns")
+            raise InputError(
+                f"its line of names has {len(cells)} ({listed(cells)}) for {n} columns",
+                "one for each",
+                key="columns",
+                value=cells,
+            )
     return []

@@ -18,6 +18,7 @@ from astropy.constants import c, h
 from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
 
 from ..array_cache import array_cache
 from .band_names import known_band
@@ -85,7 +86,12 @@ def scale(name: str, system: System = "catalogue") -> str:
 
 def _check_system(system: str) -> None:
     if system not in SYSTEMS:
-        raise InputError.of("system", system, f"one of {', '.join(SYSTEMS)}")
+        raise InputError(
+            f"magnitude system {shortened(str(system))} is unknown",
+            f"one of {', '.join(SYSTEMS)}",
+            key="system",
+            value=system,
+        )
 
 
 @array_cache(256)

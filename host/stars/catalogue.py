@@ -86,8 +86,12 @@ def find(name: str) -> dict[str, str]:
     known |= {star.name.casefold(): star.name for star in own_stars.kept()}
     near = difflib.get_close_matches(name.strip().casefold(), known, n=4, cutoff=0.3)
     names = [known[one] for one in near] or [entry["name"] for entry in _index().values()]
-    near_names = f"a name such as {', '.join(dict.fromkeys(names))}"
-    raise InputError(f"library spectrum {name!r} is unknown", near_names, key="name", value=name)
+    raise InputError(
+        f"library spectrum {name!r} is unknown",
+        f"a name such as {', '.join(dict.fromkeys(names))}",
+        key="name",
+        value=name,
+    )
 
 
 @lru_cache(8)

@@ -404,7 +404,12 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         if self.measured_nm == (0.0, 0.0):
             object.__setattr__(self, "measured_nm", ends)
         if not self.bolometric_flux() > 0.0:
-            raise InputError.of("flux", self.bolometric_flux(), "a total above 0", where=f"flare spectrum {self.name}")
+            raise InputError(
+                f"the flare spectrum {self.name} has a total flux of {self.bolometric_flux():g}",
+                "> 0",
+                key="flux",
+                value=self.bolometric_flux(),
+            )
 
     @classmethod
     def from_arrays(
@@ -477,7 +482,12 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
             star = read_spectrum(Path(quiescent), **units)
             inside = (nm >= star.wavelength_nm[0]) & (nm <= star.wavelength_nm[-1])
             if inside.sum() < 2:
-                raise InputError.of("quiescent", star.name, f"the star of {read.name}, whose wavelengths overlap")
+                raise InputError(
+                    f"the spectra {read.name} and {star.name} do not overlap",
+                    "the same star",
+                    key="quiescent",
+                    value=star.name,
+                )
             nm, messages = nm[inside], (*messages, *star.messages)
             flux = flux[inside] - np.interp(nm, star.wavelength_nm, star.flux_flam)
         return cls.from_arrays(

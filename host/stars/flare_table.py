@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
+from mauvecl.schema.text import shortened, shown
 
 from ..files.bounded import read_bytes, unpacked
 from ..files.parsed import LARGEST, SMALLEST, as_text, parsing
@@ -93,7 +93,12 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
 
     amplitudes = column(AMPLITUDES, "")
     if amplitudes is None:
-        raise InputError.of("columns", list(lower), f"one named {', '.join(AMPLITUDES)}", where=name)
+        raise InputError(
+            f"{name} has the columns {shown(', '.join(lower), 300)}",
+            f"one named {', '.join(AMPLITUDES)}",
+            key="amplitude",
+            value=lower,
+        )
     if not 0 < amplitudes.size <= MAX_FLARES:
         raise InputError(
             f"{name} holds {amplitudes.size} flares", f"1 to {MAX_FLARES}", key="amplitude", value=amplitudes.size

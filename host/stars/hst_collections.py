@@ -153,7 +153,12 @@ def fetch(
         finally:
             local.unlink(missing_ok=True)
     where = " or ".join(c.title for c in chosen)
-    raise InputError.of("name", star, f"its name in {where}, such as HD 37202; or bring the file: mauvecl library add")
+    raise InputError(
+        f"no star {star!r} in {where}",
+        "its name there, such as HD 37202; or bring the file: mauvecl library add",
+        key="name",
+        value=name,
+    )
 
 
 def _folder(address: str) -> str:
@@ -224,9 +229,19 @@ def _receive(url: str, file: IO[bytes], max_bytes: int, show_progress: bool) -> 
                 if got > max_bytes:
                     size = got
                 if time.monotonic() > latest:
-                    raise InputError.of("base", url, f"a file within {MAX_DOWNLOAD_S:.0f} s: try again later")
+                    raise InputError(
+                        f"{url} takes more than {MAX_DOWNLOAD_S:.0f} s to come",
+                        "less: try again later",
+                        key="base",
+                        value=url,
+                    )
     if size is not None and size > max_bytes:
-        raise InputError.of("MAUVECL_LARGEST_FILE_MIB", max_bytes >> 20, f"more for {url}, whose file is larger")
+        raise InputError(
+            f"{url} has more than {max_bytes >> 20} MiB",
+            "less; MAUVECL_LARGEST_FILE_MIB sets the limit of files",
+            key="MAUVECL_LARGEST_FILE_MIB",
+            value=max_bytes >> 20,
+        )
     if size is not None and got < size:
         raise InputError(
             f"{url} broke off ({got} of {size} bytes came)", "the whole file: try again", key="base", value=url

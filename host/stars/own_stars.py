@@ -86,7 +86,12 @@ def spectrum(star: OwnStar) -> tuple[np.ndarray, np.ndarray]:
     table = _read(star.path)
     wavelength, flux = (np.asarray(table[name], float) for name in ("wavelength", "flux"))
     if _digest(wavelength, flux) != table.meta["spectrum_sha256"]:
-        raise InputError.of("name", star.name, "the kept star unchanged (its digest differs): add or fetch it again")
+        raise InputError(
+            f"kept star {star.name!r} is not as it was kept (its digest differs)",
+            "it unchanged: add or fetch it again",
+            key="name",
+            value=star.name,
+        )
     return wavelength, flux
 
 
@@ -139,7 +144,12 @@ def add(
     if not re.fullmatch(r"[\w][\w .+\-*'()]{0,63}", name):
         raise InputError.of("name", name, "up to 64 letters, digits, spaces and . + - * ' ( )")
     if catalogue.embedded(name) is not None:
-        raise InputError.of("name", name, "another than the embedded library's: give one with `name`")
+        raise InputError(
+            f"star name {name!r} is one of the embedded library's",
+            "another: give one with `name`",
+            key="name",
+            value=name,
+        )
     there = find(name)
     if there is not None and not replace:
         raise InputError(f"star {name!r} is kept already", "another name, or `replace=True`", key="name", value=name)

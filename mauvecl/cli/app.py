@@ -83,13 +83,11 @@ def _options(
 
 def main() -> None:
     """Run the command line; a failure is one sentence and an exit code, never a traceback."""
-    # Modules and tables are a million objects, hardly one of them in a circle: looked for less often, and not at the
-    # end, when everything goes with the process. Both took a tenth of a command's time.
-    gc.set_threshold(10_000)
     # Threads of linear algebra wait for each other in a loop where kernels, or visitors of the page, have the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Pictures are files: whatever a notebook's kernel wants figures to be shown by is not for this process, and
     # matplotlib fails at its import where it lacks that.
     os.environ.pop("MPLBACKEND", None)
+    # Everything goes with the process: no look for cycles at its end.
     atexit.register(gc.freeze)
     sys.exit(guarded(app))

@@ -22,16 +22,11 @@ _OTHERWISE = {"setting": "--set"}
 @cache
 def _keys() -> Mapping[str, str]:
     """Return the parameter behind every key of a study that a flag sets, as in ``run.fap``."""
-    from mauvecl.cli import flags
-    from mauvecl.cli.verbs import injections, orbits
     from mauvecl.schema.fields import Flag, found
     from mauvecl.schema.section import fields_of
     from mauvecl.study.study import Study
 
-    groups = [group for module in (flags, injections, orbits) for group in vars(module).values()]
-    known = [one for group in groups if isinstance(group, dict) for one in group.values()]
-    rows = {f"{one.section or 'star'}.{one.key}": one.name for one in known if isinstance(one, flags.Flag) and one.key}
-    return rows | {".".join(path): flag.parameter for path, field in fields_of(Study) for flag in found(field, Flag)}
+    return {".".join(path): flag.parameter for path, field in fields_of(Study) for flag in found(field, Flag)}
 
 
 def _commands() -> Iterator[Any]:

@@ -6,17 +6,15 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mauvecl.cli.flags import SIZE
-
 if TYPE_CHECKING:
-    from mauvecl.cli.flags import Flag
+    from mauvecl.cli.flags import StudyFlag
     from mauvecl.study.study import Study
 
 
 def study_of(
     file: Path | None,
     given: dict[str, Any],
-    flags: Mapping[str, Flag],
+    flags: Mapping[str, StudyFlag],
     default: Callable[[dict[str, Any]], Study] | None,
 ) -> Study:
     """A study file, or the default, with the flags on top, and ``--set`` on top of those."""
@@ -27,7 +25,7 @@ def study_of(
     changes: dict[str, dict[str, Any]] = {"sky": sky_of(given)}
     setting: dict[tuple[str, str], str] = {}
     for name, one in flags.items():
-        if one.section:
+        if one.section not in ("star", "sky") and name != "nuisance":
             value = given[name]
             if value is not None:
                 other = setting.setdefault((one.section, one.key), name)
@@ -35,10 +33,10 @@ def study_of(
                     raise InputError(
                         f"--{other} and --{name} are both given, expected one of them: both set {one.section}.{one.key}"
                     )
-                changes.setdefault(one.section, {})[one.key] = one.convert(value) if one.convert else value
+                changes.setdefault(one.section, {})[one.key] = one.value(value)
     if given.get("nuisance"):
         changes.setdefault("nuisances", {}).update(nuisances_of(study, given["nuisance"]))
-    changed = study.with_changes(changes, stars_of(study, given), "command line")
+    changed = study.with_changes(changes, stars_of(study, given, flags), "command line")
     return changed.with_settings(given["set"], "--set") if given["set"] else changed
 
 
@@ -118,15 +116,20 @@ def nuisances_of(study: Study, texts: list[str]) -> dict[str, Any]:
     return nuisances | ({"own": own} if own else {})
 
 
-def stars_of(study: Study, given: dict[str, Any]) -> list[dict[str, Any]] | None:
+def stars_of(study: Study, given: dict[str, Any], flags: Mapping[str, StudyFlag]) -> list[dict[str, Any]] | None:
+    """Return the data of the stars that flags name or change, or None."""
     from mauvecl.schema.errors import InputError
+    from mauvecl.study.sections import FILE_KEYS
 
     if "star" not in given:
         return None
     names, magnitudes = given["star"], given["magnitude"]
-    same = {key: given[key] for key in ("band", "magnitude_system", "ebv", "bin_nm") if given[key] is not None}
-    same |= {one.key: given[name] for name, one in SIZE.items() if given.get(name) is not None}
-    of_files = {key: given[key] for key in ("wavelength_unit", "flux_unit", "extend") if given[key] is not None}
+    of_stars = {one.key: given[name] for name, one in flags.items() if one.section == "star"}
+    changed = {
+        key: value for key, value in of_stars.items() if value is not None and key not in ("library", "magnitude")
+    }
+    of_files = {key: value for key, value in changed.items() if key in FILE_KEYS}
+    same = {key: value for key, value in changed.items() if key not in FILE_KEYS}
     if not (names or magnitudes or same or of_files):
         return None
     if names:
@@ -142,8 +145,8 @@ def stars_of(study: Study, given: dict[str, Any]) -> list[dict[str, Any]] | None
         for entry, value in zip(stars, magnitudes * (len(stars) if len(magnitudes) == 1 else 1), strict=True):
             entry["magnitude"] = value
     if of_files and not any("file" in entry for entry in stars):
-        flags = " and ".join("--" + key.replace("_", "-") for key in of_files)
-        raise InputError(f"{flags} without a spectrum file among the stars, expected --star FILE")
+        named = " and ".join("--" + key.replace("_", "-") for key in of_files)
+        raise InputError(f"{named} without a spectrum file among the stars, expected --star FILE")
     return [entry | same | (of_files if "file" in entry else {}) for entry in stars]
 
 

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, get_type_hints
 
 from mauvecl.cli.flags import (
-    FEWER,
-    FEWER_DRAWS,
     OBSERVATION,
     PICTURES,
     RESUMING,
-    SETTINGS,
     TELLING,
     WORKERS,
-    Flag,
+    SetFlag,
     StudyFile,
     output_flag,
+    study_flags,
 )
 from mauvecl.cli.question import holds_study, is_star, study_of
 from mauvecl.cli.values import as_text
@@ -31,29 +30,29 @@ COMMANDS: dict[str, Callable[..., None]] = {}
 
 
 def takes_study(
-    *groups: Mapping[str, Flag],
+    *keys: str,
     name: str = "",
     without: str = "",
-    fewer: bool = False,
+    defaults: Mapping[str, Any] = MappingProxyType({}),
     writes: str = "",
     default: Callable[[dict[str, Any]], Study] | None = None,
     draws: bool = True,
     resumes: bool = False,
     pictures: bool = True,
-    observation: Mapping[str, Flag] = OBSERVATION,
+    observation: Sequence[str] = OBSERVATION,
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Let a verb take a study file and flags, and hand it the study and the session that they make.
 
     Parameters
     ----------
-    *groups : mapping of Flag
-        Flags beside those of the observation.
+    *keys : str
+        Keys and sections of the study whose flags the verb takes, in addition to those of the observation.
     name : str
         The verb's, where it is not the function's.
     without : str
-        A flag of the observation that the verb does not take.
-    fewer : bool
-        Whether `FEWER` realisations are the default.
+        A key of the observation that the verb does not take.
+    defaults : mapping
+        Values of keys where neither a study file nor a flag is given, if they differ from the study's.
     writes : str
         Where it writes unless told, where that is no folder of tables.
     default : callable, optional
@@ -62,8 +61,8 @@ def takes_study(
         Whether the verb draws realisations, and pictures.
     resumes : bool
         Whether a verb that draws no realisations can be resumed.
-    observation : mapping of Flag
-        In place of the flags of an observation. Where one is called `targets`, a table may stand for the study file.
+    observation : sequence of str
+        Keys instead of those of an observation. With a flag `targets`, a table may replace the study file.
 
     Returns
     -------
@@ -71,8 +70,7 @@ def takes_study(
         A decorator for functions whose first parameters are the study and the session. One named `given` receives the
         flags; others are options of its own.
     """
-    every = (observation, *groups, FEWER_DRAWS if fewer else {}, SETTINGS)
-    flags = {key: one for group in every for key, one in group.items() if key != without}
+    flags = study_flags(*(key for key in (*observation, *keys) if key != without), defaults=defaults)
 
     def decorate(verb: Callable[..., None]) -> Callable[..., None]:
         called = name or verb.__name__
@@ -94,15 +92,17 @@ def takes_study(
             for key, (shown, read) in readers.items():
                 if values.get(key) is not None and not isinstance(values[key], int | float):
                     values[key] = read(values[key], shown)
-            given = {key: values.pop(key, None) for key in flags}
+            given = {key: values.pop(key, None) for key in (*flags, "set")}
             if "targets" in flags and study_file is not None and not holds_study(study_file):
                 given["targets"], study_file = study_file, None
             if "star" in flags and study_file is not None and is_star(study_file):
                 if given["star"]:
                     raise InputError(f"{str(study_file)!r} and --star are both stars, expected one of them")
                 given["star"], study_file = [str(study_file)], None
-            if fewer and study_file is None and given["realisations"] is None:
-                given["realisations"] = FEWER
+            if study_file is None:
+                for one in flags.values():
+                    if given[one.name] is None:
+                        given[one.name] = defaults.get(f"{one.section}.{one.key}")
             how = {key: values.pop(key, usual) for key, (_, usual) in around.items()}
             if "given" in kinds:
                 values["given"] = given
@@ -117,6 +117,7 @@ def takes_study(
         parameters = [
             inspect.Parameter("study_file", named, default=None, annotation=StudyFile),
             *(inspect.Parameter(key, named, default=None, annotation=one.kind) for key, one in flags.items()),
+            inspect.Parameter("set", named, default=None, annotation=SetFlag),
             *(p.replace(kind=named, annotation=kinds[p.name]) for p in own if p.name != "given"),
             *(inspect.Parameter(key, named, default=usual, annotation=kind) for key, (kind, usual) in around.items()),
         ]

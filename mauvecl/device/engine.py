@@ -177,7 +177,12 @@ class Engine:
         if out is None:
             out = np.empty(shape, dtype)
         elif out.shape != shape or out.dtype != dtype or not out.flags.c_contiguous or not out.flags.writeable:
-            raise InputError.of("out", f"{out.dtype} of shape {out.shape}", f"writable contiguous {dtype} of {shape}")
+            raise InputError(
+                f"out is {out.dtype} of shape {out.shape}",
+                f"writable contiguous {dtype} of {shape}",
+                key="out",
+                value=out.shape,
+            )
         clipped = np.empty(count, np.uint32)
         rows = out
         with scene_launches(self.open_device, scene, seed, row_type="ushort" if narrow else "int") as launches:
@@ -359,7 +364,12 @@ class Engine:
         flares, statistics = request.flares, request.statistics
         scene = prepare([quiet, *flares], comparison=comparison, **drawing)
         if len(flares) >= BATCH[scene.frames]:
-            raise InputError.of("flares", len(flares), f"at most {BATCH[scene.frames] - 1} in one launch")
+            raise InputError(
+                f"{len(flares)} flares",
+                f"at most {BATCH[scene.frames] - 1} in one launch",
+                key="flares",
+                value=len(flares),
+            )
         hypotheses = Hypotheses(quiet, flares, statistics, scene, nuisances=as_nuisances(nuisances, quiet))
         plan = plan_channels(hypotheses, range(len(flares)), first=True)
         out = np.empty((plan.n_rows, count), np.float32)

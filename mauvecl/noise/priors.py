@@ -66,8 +66,11 @@ class Normal:
     def __post_init__(self) -> None:
         _make_plain(self, "mean", "sd", "low", "high")
         if not (self.sd > 0 and self.low < self.high):
-            raise InputError.of(
-                "sd", self.sd, f"sd > 0 and low < high, not {self.low:g} and {self.high:g}", where="a normal prior"
+            raise InputError(
+                f"a normal prior of mean {self.mean:g}, sd {self.sd:g}, cut at {self.low:g} and {self.high:g}",
+                "sd > 0 and low < high",
+                key="sd",
+                value=self.sd,
             )
         away = max(self.low - self.mean, self.mean - self.high) / self.sd
         if away > MAX_CUT_SD:

@@ -58,18 +58,23 @@ class CosmicRays:
         object.__setattr__(self, "pixels", count("pixels", self.pixels, low=1))
         low, high = self.electrons
         if not (0 <= self.rate_per_cm2_s <= 1e6 and 0 < self.area_cm2 < 1e4 and self.pixels > 0):
-            raise InputError.of(
-                "rate_per_cm2_s",
-                self.rate_per_cm2_s,
+            raise InputError(
+                f"cosmic rays of {self.rate_per_cm2_s:g} per cm^2 s on {self.area_cm2:g} cm^2 and {self.pixels} pixels",
                 "a rate of 0 to 1e6, an area and pixels above 0",
-                where="cosmic rays",
+                key="rate_per_cm2_s",
+                value=self.rate_per_cm2_s,
             )
         if not 1 <= low <= high <= 100_000:
             raise InputError.of("electrons", (low, high), "1 to 100000, ascending", where="cosmic rays")
         if self.weights is not None:
             wanted = int(high) - int(low) + 1
             if len(self.weights) != wanted or min(self.weights) < 0 or not 0 < sum(self.weights) < np.inf:
-                raise InputError.of("weights", self.weights, f"{wanted} of 0 and above", where="cosmic rays")
+                raise InputError(
+                    f"{len(self.weights)} weights of the cosmic rays' electrons",
+                    f"{wanted} of 0 and above",
+                    key="weights",
+                    value=self.weights,
+                )
 
     def charge(self, seconds: float) -> Float:
         """Compute the distribution of the charge that a pixel collects in a time, a compound Poisson distribution.
@@ -162,8 +167,11 @@ class Processes:
             change = partial(varied.change, conditions)
             first, last = prior.quantile(np.array([0.0, 1.0]))
             if not (varied.low <= first and last <= varied.high):
-                raise InputError.of(
-                    name, [float(first), float(last)], f"a prior within {varied.low:g} to {varied.high:g}"
+                raise InputError(
+                    f"the prior of {name} runs from {first:g} to {last:g}",
+                    f"{varied.low:g} to {varied.high:g}",
+                    key=name,
+                    value=(first, last),
                 )
             tables[row], middle = table_of(prior, change)
             centre[factor] *= 1.0 + middle

@@ -234,7 +234,12 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
             scheduler = json_data(read_text(Path(where), "scheduler file"), f"scheduler file {shortened(where)}")
             address = scheduler.get("address") if isinstance(scheduler, dict) else None
             if not (isinstance(address, str) and _is_address(address)):
-                raise InputError.of("cluster", where, "a scheduler file with an address, as Dask writes it")
+                raise InputError(
+                    f"scheduler file {shortened(where)} names no address",
+                    "one that Dask wrote",
+                    key="cluster",
+                    value=where,
+                )
             how = {"scheduler_file": where}
         else:
             raise InputError.of("cluster", where, "local:N, an address such as tcp://host:8786, or a scheduler file")

@@ -39,3 +39,10 @@ Probability = Annotated[float, Range(0, 1, open_low=True, open_high=True)]
 Distance = Annotated[float, Unit("pc"), Range(1e-7, 1e6)]
 #: From far below white dwarfs (0.01) to above the largest supergiants (some 1500).
 Radius = Annotated[float, Unit("solRad"), Range(1e-4, 1e4)]
+#: Length of time.
+Duration = Annotated[float, Unit("s"), Range(0, open_low=True)]
+#: Energy of a flare.
+Energy = Annotated[float, Unit("erg"), Range(0, open_low=True)]
+#: Wavelengths in vacuum.
+Wavelength = Annotated[float, Unit("nm")]
+Positive = Annotated[float, Range(0, open_low=True)]

@@ -100,7 +100,12 @@ class Linear(ContentEquality, LinearStatistic):
     def check(self, setting: Setting) -> None:
         super().check(setting)
         if self.weights.size != setting.used.size:
-            raise InputError.of("weights", self.weights.size, f"one for each of the {setting.used.size} pixels")
+            raise InputError(
+                f"statistic {self.name!r} has {self.weights.size} weights",
+                f"one for each of the {setting.used.size} pixels",
+                key="weights",
+                value=self.weights.size,
+            )
         if not (self.weights * setting.used).any():
             raise InputError(f"statistic {self.name!r} weighs only saturated pixels", "others", key="weights")
 

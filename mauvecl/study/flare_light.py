@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
+from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Quantity, Range, Unit
-from mauvecl.schema.parsing import line_fluxes
 from mauvecl.schema.physical import AreaRatio, BalmerJump, LineFraction, LineScale, Temperature
 from mauvecl.schema.section import Section
 
@@ -55,12 +55,12 @@ class FlareLight(Section):
             "Emission line as a fraction of the continuum in 200-700 nm, by name or wavelength in nm",
             "as in 'Mg II=0.05'",
         ),
-        Flag("--line", kind=list[str], read=line_fluxes),
+        Flag("--line", kind=list[str], read=parsing.line_fluxes),
     ] = Field(default_factory=dict)
     line_fluxes: Annotated[
         dict[str, Annotated[float, Unit("erg / (s cm2)"), Range(0)]],
         Help("Emission line at the telescope, by name or wavelength in nm", "as in '280=1e-12'"),
-        Flag("--line-flux", kind=list[str], read=line_fluxes),
+        Flag("--line-flux", kind=list[str], read=parsing.line_fluxes),
     ] = Field(default_factory=dict)
     line_scale: Annotated[
         LineScale,

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
+from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Flag, Help, Range
+from mauvecl.schema.physical import Positive, Wavelength
 from mauvecl.schema.section import Section
 
 if TYPE_CHECKING:
@@ -16,28 +19,27 @@ FittedModel = Literal["blackbody", "balmer", "lines"]
 
 
 class MeasureQuestion(Section):
-    """Models that are fitted to simulated exposures.
+    """Models that are fitted to simulated exposures."""
 
-    Attributes
-    ----------
-    models : tuple of str
-        Fitted models, simplest first: a blackbody, with a Balmer continuum, and with lines; by default the model of the
-        flare's spectrum and all simpler ones.
-    lines : tuple of str
-        Fitted lines; by default those of the flare's spectrum.
-    fits : int
-        Number of simulated exposures per flare.
-    bands_nm : tuple of tuple
-        Wavelength ranges for which the flux is reported.
-    snr_per_bin : float, optional
-        S/N of the bins of frames in which the flares of the study's stare are measured against time.
-    """
-
-    models: tuple[FittedModel, ...] = ()
-    lines: tuple[str, ...] = ()
-    fits: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
-    bands_nm: tuple[tuple[float, float], ...] = ((200.0, 320.0), (200.0, 700.0))
-    snr_per_bin: Annotated[float, Field(gt=0)] | None = None
+    models: Annotated[
+        tuple[FittedModel, ...],
+        Help("Fitted model", default="the flare's, and simpler ones"),
+        Flag("--model", read=parsing.words),
+    ] = ()
+    lines: Annotated[
+        tuple[str, ...],
+        Help("Line that the model 'lines' fits", default="the flare's"),
+        Flag("--fit-line", read=parsing.words),
+    ] = ()
+    fits: Annotated[int, Range(1, 1_000_000), Help("Simulated exposures of each flare"), Flag("--fits")] = 1000
+    bands_nm: Annotated[
+        tuple[tuple[Wavelength, Wavelength], ...], Help("Wavelength ranges for which the flux is reported")
+    ] = ((200.0, 320.0), (200.0, 700.0))
+    snr_per_bin: Annotated[
+        Positive | None,
+        Help("S/N of bins of frames in which the flares of the study's stare are measured against time"),
+        Flag("--snr-per-bin"),
+    ] = None
 
     @model_validator(mode="after")
     def _possible(self) -> Self:

@@ -10,6 +10,7 @@ from pydantic import BeforeValidator, Field, create_model, model_validator
 
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, Amplitude, default_processes
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Flag, Help
 from mauvecl.schema.text import shortened
 from mauvecl.study.sections import Section
 
@@ -45,9 +46,9 @@ Spread = Annotated[float | Literal["free"], BeforeValidator(_spread)]
 class OwnNuisance(Section):
     """User-defined nuisance spectrum: wavelength in nm and DN per exposure at unit amplitude, as a file or points."""
 
-    file: Path | None = None
-    points: tuple[tuple[float, float], ...] | None = None
-    sd: Spread = "free"
+    file: Annotated[Path | None, Help("File with two columns, wavelength in nm and DN per exposure")] = None
+    points: Annotated[tuple[tuple[float, float], ...] | None, Help("Wavelengths in nm, and DN per exposure")] = None
+    sd: Annotated[Spread, Help("Standard deviation of the amplitude, or free")] = "free"
 
     @model_validator(mode="after")
     def _one_spectrum(self) -> Self:
@@ -71,10 +72,30 @@ class OwnNuisance(Section):
         return at_pixels(f"points of {shortened(name)}", "DN", np.array(self.points), wavelength_nm)
 
 
+Usual = Annotated[
+    bool,
+    Help("Draw the documented unknowns of this question, and marginalise over them"),
+    Flag("--with-unknowns"),
+]
+Own = Annotated[
+    dict[str, OwnNuisance],
+    Help("Your own nuisance spectra, by name"),
+    Flag(
+        "--nuisance",
+        kind=list[str],
+        help=Help(
+            "Marginalise over dark, light, sky, tilt or a file's spectrum, with a standard deviation or free",
+            "as in dark=0.1 or stray.txt=free",
+        ),
+    ),
+]
 _keys: Any = (
-    {"usual": (bool, False)}
-    | dict.fromkeys(NUISANCES, (Spread | None, None))
-    | {"own": (dict[str, OwnNuisance], Field(default_factory=dict))}
+    {"usual": (Usual, False)}
+    | {
+        name: (Annotated[Spread | None, Help(f"Standard deviation of {row.label}, or free")], None)
+        for name, row in NUISANCES.items()
+    }
+    | {"own": (Own, Field(default_factory=dict))}
 )
 
 

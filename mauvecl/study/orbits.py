@@ -6,11 +6,13 @@ import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic import ValidationError, ValidationInfo, field_validator, model_validator
 
 from mauvecl.host.files.text_table import read_text_table
+from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Range, Unit
+from mauvecl.schema.fields import Flag, Help, Range, Unit
+from mauvecl.schema.physical import Distance, Duration, Energy, Magnitude
 from mauvecl.schema.records import holds_truth, input_error
 from mauvecl.schema.text import shortened, shown
 from mauvecl.study.sections import Section
@@ -33,16 +35,35 @@ MAX_TARGETS = 500
 class LimitsText(Section):
     """Conditions for a target to be visible; see `host.orbit.limits.Limits`."""
 
-    earth_limb_deg: Limit = 25.0
-    sun_deg: Limit = 46.0
-    moon_deg: Limit = 25.0
-    declination_deg: tuple[float, float] | Literal["none"] = (-46.4, 31.8)
-    normal_cone_deg: Limit = "none"
-    eclipse: Literal["any", "only", "never"] = "any"
-    proton_flux: Limit = 10.0
-    anomaly: tuple[tuple[float, float], ...] = ()
-    shortest_s: Annotated[float, Field(ge=0)] = 0.0
-    duty_cycle: Annotated[float, Field(gt=0, le=1)] = 1.0
+    earth_limb_deg: Annotated[
+        Limit, Help("Smallest angle from the Earth's limb, deg", "or none"), Flag("--earth-limb")
+    ] = 25.0
+    sun_deg: Annotated[Limit, Help("Smallest angle from the Sun, deg", "or none"), Flag("--sun")] = 46.0
+    moon_deg: Annotated[Limit, Help("Smallest angle from the Moon, deg", "or none"), Flag("--moon")] = 25.0
+    declination_deg: Annotated[
+        tuple[float, float] | Literal["none"],
+        Help("Field of regard, low:high in deg", "or none", default="-46.4:31.8"),
+        Flag("--declination", kind=str, read=parsing.declinations),
+    ] = (-46.4, 31.8)
+    normal_cone_deg: Annotated[
+        Limit, Help("Field of regard as a double cone about the orbit's normal, deg, or none")
+    ] = "none"
+    eclipse: Annotated[
+        Literal["any", "only", "never"],
+        Help("Observing in the Earth's shadow", choices="any, only (in the shadow) or never"),
+        Flag("--eclipse"),
+    ] = "any"
+    proton_flux: Annotated[
+        Limit, Help("Largest flux of protons above 10 MeV, cm^-2 s^-1", "or none"), Flag("--protons")
+    ] = 10.0
+    anomaly: Annotated[
+        tuple[tuple[float, float], ...],
+        Help("Polygon of longitude and latitude in deg that replaces the map of protons"),
+    ] = ()
+    shortest_s: Annotated[float, Unit("s"), Range(0), Help("Length below which windows are dropped")] = 0.0
+    duty_cycle: Annotated[
+        float, Range(0, 1, open_low=True), Help("Fraction of a window in which the star is exposed")
+    ] = 1.0
 
     @field_validator("earth_limb_deg", "sun_deg", "moon_deg", "normal_cone_deg", "proton_flux", mode="before")
     @classmethod
@@ -74,13 +95,21 @@ class LimitsText(Section):
 class OrbitQuestion(Section):
     """Orbit, time grid, targets and visibility limits."""
 
-    tle: Path | None = None  # two-line elements that replace the embedded ones
-    kind: Literal["auto", "tle", "mean"] = "auto"  # see `host.orbit.orbit.Orbit`
-    start: str = "2027-01-01"  # UTC
-    days: Annotated[float, Field(gt=0)] = 365.0
-    step_s: Annotated[float, Field(gt=0)] = 60.0
-    targets: tuple[str, ...] = ()  # names or coordinates; those of `plan` if empty
-    simbad: bool = False  # query SIMBAD for names that are not embedded
+    start: Annotated[str, Help("First day or time, UTC"), Flag("--start")] = "2027-01-01"
+    days: Annotated[float, Unit("d"), Range(0, open_low=True), Help("Length of time"), Flag("--days")] = 365.0
+    step_s: Annotated[Duration, Help("Time between the computed positions"), Flag("--step")] = 60.0
+    tle: Annotated[Path | None, Help("File of two-line elements, newer than the embedded ones"), Flag("--tle")] = None
+    kind: Annotated[
+        Literal["auto", "tle", "mean"],
+        Help("Model of the orbit", choices="tle, mean, or auto (mean far from the elements' epoch)"),
+        Flag("--orbit"),
+    ] = "auto"
+    targets: Annotated[
+        tuple[str, ...], Help("Name of a target, or coordinates such as '290.0 -11.2'"), Flag("--look-at")
+    ] = ()
+    simbad: Annotated[
+        bool, Help("Ask SIMBAD for names that are not embedded", "needs mauvecl[names]"), Flag("--simbad")
+    ] = False
     limits: LimitsText = LimitsText()
 
     @field_validator("start", mode="before")
@@ -110,19 +139,31 @@ class PlanTarget(Section):
     Missing values are looked up by name in the embedded list of stars, or follow from the spectral type.
     """
 
-    name: str
-    coordinates: str | None = None  # replace those of the name
-    spectral_type: str | None = None  # such as "M3V"; the nearest spectrum of the library is used
-    magnitude: float | None = None  # V
-    distance_pc: Annotated[float, Field(gt=0)] | None = None
-    rates: Literal["G", "K", "M", "sunlike"] | None = None  # published rates; those of the spectral type by default
-    mass_msun: Annotated[float, Field(gt=0)] | None = None  # with `age_myr`: rates of Davenport et al. 2019
-    age_myr: Annotated[float, Field(gt=0)] | None = None
-    alpha: Annotated[float, Field(gt=1)] | None = None  # exponent of a power law of bolometric energies, for which
-    rate_per_day: Annotated[float, Field(gt=0)] | None = None  # is the rate of flares
-    at_erg: Annotated[float, Field(gt=0)] | None = None  # above this energy
-    rates_file: Path | None = None  # cumulative distribution of energies in `rates_band`
-    rates_band: str = "bolometric"
+    name: Annotated[str, Help("Name of the target")]
+    coordinates: Annotated[str | None, Help("Coordinates, which replace those of the name")] = None
+    spectral_type: Annotated[
+        str | None, Help("Spectral type, such as M3V", "the nearest spectrum of the library is used")
+    ] = None
+    magnitude: Annotated[Magnitude | None, Help("V magnitude")] = None
+    distance_pc: Annotated[Distance | None, Help("Distance")] = None
+    rates: Annotated[
+        Literal["G", "K", "M", "sunlike"] | None, Help("Published flare rates", default="the spectral type's")
+    ] = None
+    mass_msun: Annotated[
+        Annotated[float, Unit("solMass"), Range(0, open_low=True)] | None,
+        Help("Mass, for the rates of Davenport et al. 2019", "needs the age"),
+    ] = None
+    age_myr: Annotated[Annotated[float, Unit("Myr"), Range(0, open_low=True)] | None, Help("Age")] = None
+    alpha: Annotated[
+        Annotated[float, Range(1, open_low=True)] | None, Help("Exponent of a power law of bolometric energies")
+    ] = None
+    rate_per_day: Annotated[
+        Annotated[float, Unit("1 / d"), Range(0, open_low=True)] | None,
+        Help("Rate of flares above an energy, for the power law"),
+    ] = None
+    at_erg: Annotated[Energy | None, Help("That energy")] = None
+    rates_file: Annotated[Path | None, Help("File with a cumulative distribution of energies")] = None
+    rates_band: Annotated[str, Help("Band of the energies in that file")] = "bolometric"
 
     @model_validator(mode="after")
     def _one_distribution(self) -> Self:
@@ -188,21 +229,38 @@ class PlanTarget(Section):
 class PlanQuestion(Section):
     """Campaign: targets, exposure time per target, durations of flares, and how completeness is computed."""
 
-    targets: tuple[PlanTarget, ...] = ()
-    # Exposure per target; all visible time by default.
-    hours: Annotated[float, Unit("h"), Range(0, open_low=True)] | None = None
-    # Durations; see `lightcurve.search.completeness.DurationLaw`.
-    half_width_s: Annotated[float, Field(gt=0)] = 100.0
-    at_erg: Annotated[float, Field(gt=0)] = 1e33
-    exponent: Annotated[float, Field(ge=0, lt=1)] = 0.39
-    scatter_dex: Annotated[float, Field(ge=0, le=2)] = 0.3
-    # Completeness from flares injected into simulated noise, or from the closed form for white noise.
-    completeness: Literal["injections", "closed form"] = "injections"
-    # Frames have the detector temperature and particle flux along the orbit, instead of the study's constant ones.
-    along_orbit: bool = True
-    injections: Annotated[int, Field(ge=20, le=1_000_000)] = 100  # per half-width
-    best_months: Annotated[int, Field(ge=1, le=12)] = 3
-    report: Literal["pdf", "html"] = "pdf"
+    targets: Annotated[
+        tuple[PlanTarget, ...],
+        Help("Targets of the campaign"),
+        Flag(
+            "--targets",
+            kind=Path,
+            read=lambda path, _: read_targets(path),
+            help=Help("Table of targets (CSV, ECSV)", "name, and what is known of each"),
+        ),
+    ] = ()
+    hours: Annotated[
+        Annotated[float, Unit("h"), Range(0, open_low=True)] | None,
+        Help("Exposure of each target at most", default="all"),
+        Flag("--hours"),
+    ] = None
+    half_width_s: Annotated[Duration, Help("Half-width of flares of the energy at_erg")] = 100.0
+    at_erg: Annotated[Energy, Help("That energy")] = 1e33
+    exponent: Annotated[
+        float, Range(0, 1, open_high=True), Help("Exponent with which half-widths grow with energy")
+    ] = 0.39
+    scatter_dex: Annotated[float, Range(0, 2), Help("Scatter of half-widths about that law, dex")] = 0.3
+    completeness: Annotated[
+        Literal["injections", "closed form"],
+        Help("Completeness", choices="injections (into simulated noise) or 'closed form' (at once)"),
+        Flag("--completeness"),
+    ] = "injections"
+    along_orbit: Annotated[
+        bool, Help("Whether frames have the detector temperature and particle flux along the orbit")
+    ] = True
+    injections: Annotated[int, Range(20, 1_000_000), Help("Injections of each half-width")] = 100
+    best_months: Annotated[int, Range(1, 12), Help("Number of best months in the report")] = 3
+    report: Annotated[Literal["pdf", "html"], Help("Form of the report"), Flag("--report")] = "pdf"
 
     @model_validator(mode="after")
     def _different_targets(self) -> Self:

@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Flag, Help, Range
+from mauvecl.schema.physical import Positive, Probability, Wavelength
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Section
 
@@ -24,10 +27,26 @@ MAX_CELLS = 100_000
 class CampaignQuestion(Section):
     """Number of tests of a search, and the false alarms that the whole search may have."""
 
-    frames: Annotated[int, Field(ge=1)] | None = None  # in total
-    step: Annotated[int, Field(ge=1)] | None = None  # frames between the starts of consecutive stacks
-    fap: Annotated[float, Field(gt=0, lt=1)] | None = None  # probability of at least one false alarm
-    alarms: Annotated[float, Field(gt=0)] | None = None  # expected number of false alarms
+    frames: Annotated[
+        Annotated[int, Range(1)] | None,
+        Help("Frames of a whole search", "shows what one test means for all of it"),
+        Flag("--campaign"),
+    ] = None
+    step: Annotated[
+        Annotated[int, Range(1)] | None,
+        Help("Frames from one stack of the search to the next", default="a stack"),
+        Flag("--campaign-step"),
+    ] = None
+    fap: Annotated[
+        Probability | None,
+        Help("Wanted probability of any false alarm in the search", "shows what a test may have"),
+        Flag("--campaign-fap"),
+    ] = None
+    alarms: Annotated[
+        Positive | None,
+        Help("Wanted number of false alarms in the search", "shows what a test may have"),
+        Flag("--campaign-alarms"),
+    ] = None
 
     @model_validator(mode="after")
     def _requires_frames(self) -> Self:
@@ -45,16 +64,24 @@ class CampaignQuestion(Section):
 class SignalQuestion(Section):
     """S/N that an exposure must reach."""
 
-    snr: Annotated[float, Field(gt=0)] | None = None
-    wavelength_nm: float | None = None
-    per: Literal["element", "pixel"] = "element"
+    snr: Annotated[Positive | None, Help("Wanted signal-to-noise ratio"), Flag("--snr")] = None
+    wavelength_nm: Annotated[Wavelength | None, Help("Wavelength"), Flag("--at")] = None
+    per: Annotated[
+        Literal["element", "pixel"], Help("Bin of the S/N", choices="element (10.5 nm) or pixel"), Flag("--per")
+    ] = "element"
 
 
 class BulkQuestion(Section):
     """Data stored per realisation: the summed exposure or single frames, and optionally the mean components."""
 
-    frames: Literal["stack", "all"] | Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = "stack"
-    components: bool = False
+    frames: Annotated[
+        Literal["stack", "all"] | Annotated[tuple[Annotated[int, Range(0)], ...], Field(min_length=1)],
+        Help("Stored frames", choices="stack (the sum of an exposure), all, or numbers of frames such as 0,4,9"),
+        Flag("--frames", kind=str, read=parsing.frames),
+    ] = "stack"
+    components: Annotated[
+        bool, Help("Also store the mean of star, sky and noise of each pixel"), Flag("--components")
+    ] = False
 
     @model_validator(mode="after")
     def _ascending(self) -> Self:
@@ -76,19 +103,21 @@ class BulkQuestion(Section):
 class LimitQuestion(Section):
     """Quantity whose limit is computed, and the detection probability at the limit."""
 
-    of: Literal["magnitude", "amplitude", "exposure"] = "magnitude"
-    power: Annotated[float, Field(gt=0, lt=1)] = 0.9
+    of: Annotated[
+        Literal["magnitude", "amplitude", "exposure"], Help("Quantity whose limit is computed"), Flag("--of")
+    ] = "magnitude"
+    power: Annotated[Probability, Help("Wanted detection probability"), Flag("--power")] = 0.9
 
 
 class Axis(Section):
     """Axis of a map or sweep: explicit values, or `steps` values from `start` to `stop`."""
 
-    quantity: QuantityName
-    values: tuple[float | str, ...] | None = None
-    start: float | None = None
-    stop: float | None = None
-    steps: Annotated[int, Field(ge=2, le=1000)] | None = None
-    log: bool = False
+    quantity: Annotated[QuantityName, Help("Quantity that varies")]
+    values: Annotated[tuple[float | str, ...] | None, Help("Values")] = None
+    start: Annotated[float | None, Help("First of evenly spaced values")] = None
+    stop: Annotated[float | None, Help("Last of evenly spaced values")] = None
+    steps: Annotated[Annotated[int, Range(2, 1000)] | None, Help("Number of evenly spaced values")] = None
+    log: Annotated[bool, Help("Whether values are evenly spaced in the logarithm")] = False
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
@@ -141,9 +170,17 @@ class Axis(Section):
 class MapQuestion(Section):
     """Axes and contour levels of a map of the detection probability."""
 
-    x: Axis = Axis(quantity="magnitude", start=4.0, stop=10.0, steps=16)
-    y: Axis = Axis(quantity="amplitude", start=0.01, stop=1.0, steps=16, log=True)
-    contours: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = (0.1, 0.5, 0.9)
+    x: Annotated[
+        Axis,
+        Help("Horizontal axis of the map", "such as magnitude:4:10:16, or exposure=5,50,600"),
+        Flag("--x", kind=str, read=parsing.axis),
+    ] = Axis(quantity="magnitude", start=4.0, stop=10.0, steps=16)
+    y: Annotated[
+        Axis,
+        Help("Vertical axis of the map", "such as amplitude:0.01:1:16:log"),
+        Flag("--y", kind=str, read=parsing.axis),
+    ] = Axis(quantity="amplitude", start=0.01, stop=1.0, steps=16, log=True)
+    contours: Annotated[tuple[Probability, ...], Help("Detection probabilities of contours")] = (0.1, 0.5, 0.9)
 
     @model_validator(mode="after")
     def _different_axes(self) -> Self:
@@ -157,8 +194,24 @@ class MapQuestion(Section):
 class Sweep(Section):
     """Quantities that take several values, in all combinations ("product") or in parallel ("list")."""
 
-    how: Literal["product", "list"] = "product"
-    axes: tuple[Axis, ...] = ()
+    how: Annotated[
+        Literal["product", "list"],
+        Help("Every combination of the values, or one after the other"),
+        Flag(
+            "--as-list",
+            kind=bool,
+            read=lambda wanted, _: "list" if wanted else None,
+            help=Help("Vary the quantities of a sweep together instead of in every combination"),
+        ),
+    ] = "product"
+    axes: Annotated[
+        tuple[Axis, ...],
+        Help(
+            "Values of a quantity",
+            "as in exposure=5,50,600 or magnitude:4:10:7; several give every combination",
+        ),
+        Flag("--sweep", kind=list[str], read=parsing.axes),
+    ] = ()
 
     @model_validator(mode="after")
     def _possible(self) -> Self:

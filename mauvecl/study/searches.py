@@ -8,8 +8,11 @@ from pydantic import Field, model_validator
 
 from mauvecl.lightcurve.defaults import HALF_WIDTHS_S, RANK, WINDOW_S, Per, check_shape, per_day
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Flag, Help, Range, Unit
+from mauvecl.schema.physical import Duration, Positive
 from mauvecl.study.nuisances import Spread
 from mauvecl.study.sections import Section
+from mauvecl.study.stare_section import ShapeName
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.search.bank import Bank, Level
@@ -19,29 +22,40 @@ if TYPE_CHECKING:
 #: Window, in orbits, of a baseline with the orbital cycle. Shorter ones cannot separate the cycle from a flare.
 CYCLE_ORBITS = 3.0
 
-Positive = Annotated[float, Field(gt=0)]
-
 
 class SearchChoice(Section):
     """Search of a stare for flares, and its rate of false alarms."""
 
-    shape: str = "davenport2014"
-    half_widths_s: Annotated[tuple[Positive, ...], Field(min_length=1)] = HALF_WIDTHS_S  # of the template bank
-    sums: Annotated[int, Field(ge=1, le=8)] = RANK  # largest number of weighted sums per frame
-    offset: bool = True  # marginalise over the offset of the baseline
-    slope: bool = True  # marginalise over the slope of the baseline
-    cycle: bool | None = None  # marginalise over the orbital cycle; by default if the stare has an unknown cycle
-    window_s: Annotated[float, Field(ge=0)] | None = None  # baseline window; 1800 s, or three orbits with a cycle
-    # Nuisance parameters that are independent in each frame, in addition to the stare's jitters.
-    frame: dict[Literal["dark", "light", "sky", "tilt"], Spread] = Field(default_factory=dict)
-    false_alarms: Positive = 1.0
-    per: Per = "month"  # star-time of frames
-    # Threshold from importance sampling of normal noise, or counted in simulated stares.
-    null: Literal["sampled", "counted"] = "sampled"
-    nulls: Annotated[int, Field(ge=0, le=1_000_000)] = 100  # simulated stares without a flare
-    # Conventional rule for comparison: `points` consecutive frames above `sigma` standard deviations.
-    points: Annotated[int, Field(ge=1, le=100)] = 3
-    sigma: Positive = 3.0
+    shape: ShapeName = "davenport2014"
+    half_widths_s: Annotated[tuple[Duration, ...], Field(min_length=1), Help("Half-widths of the template bank")] = (
+        HALF_WIDTHS_S
+    )
+    sums: Annotated[int, Range(1, 8), Help("Largest number of weighted sums per frame")] = RANK
+    offset: Annotated[bool, Help("Whether to marginalise over the offset of the baseline")] = True
+    slope: Annotated[bool, Help("Whether to marginalise over the slope of the baseline")] = True
+    cycle: Annotated[
+        bool | None,
+        Help("Whether to marginalise over the orbital cycle", default="if the stare has an unknown cycle"),
+    ] = None
+    window_s: Annotated[
+        Annotated[float, Unit("s"), Range(0)] | None,
+        Help("Window of the baseline", default="1800, or three orbits with a cycle"),
+    ] = None
+    frame: Annotated[
+        dict[Literal["dark", "light", "sky", "tilt"], Spread],
+        Help("Standard deviations of nuisance parameters of each frame, in addition to the stare's jitters"),
+    ] = Field(default_factory=dict)
+    false_alarms: Annotated[
+        Positive, Help("False alarms of the search per star-day, star-month or star-year"), Flag("--false-alarms")
+    ] = 1.0
+    per: Annotated[Per, Help("Star-time of frames for the false alarms"), Flag("--alarms-per")] = "month"
+    null: Annotated[
+        Literal["sampled", "counted"],
+        Help("Threshold from importance sampling of normal noise, or counted in simulated stares"),
+    ] = "sampled"
+    nulls: Annotated[int, Range(0, 1_000_000), Help("Simulated stares without a flare")] = 100
+    points: Annotated[int, Range(1, 100), Help("Consecutive frames of the conventional rule, for comparison")] = 3
+    sigma: Annotated[Positive, Help("Threshold of the conventional rule, in standard deviations")] = 3.0
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
@@ -89,18 +103,28 @@ Size = Literal["amplitude", "duration", "energy", "band_energy"]
 class InjectionQuestion(Section):
     """Grid of sizes and half-widths of injected flares, which have the study's flare temperature and band."""
 
-    # Amplitudes, equivalent durations (s), bolometric energies, or energies in the flare's band (erg). By default
-    # energies if the star's distance or radius is known, and amplitudes otherwise.
-    of: Size | None = None
-    low: Positive | None = None  # smallest size; by default from the sensitivity of the search
-    high: Positive | None = None  # largest size, likewise
-    sizes: Annotated[int, Field(ge=2, le=256)] = 16  # evenly spaced in the logarithm
-    widths: Annotated[int, Field(ge=1, le=256)] = 16  # evenly spaced in the logarithm
-    half_width_low_s: Positive = 10.0
-    half_width_high_s: Positive = 1800.0
-    count: Annotated[int, Field(ge=10, le=10**8)] = 2_000  # injections per cell
-    positions: Annotated[int, Field(ge=2, le=100_000)] = 40  # peak times in the stare
-    fitted: Annotated[int, Field(ge=0, le=100_000)] = 40  # injections per cell that are fitted if detected
+    of: Annotated[
+        Size | None,
+        Help(
+            "Measure of the size of injected flares",
+            "durations in s, energies in erg",
+            default="energy if the star's size is known, else amplitude",
+        ),
+        Flag("--size"),
+    ] = None
+    low: Annotated[Positive | None, Help("Smallest size", default="0.3 of what is found"), Flag("--smallest")] = None
+    high: Annotated[Positive | None, Help("Largest size", default="3 times what is found"), Flag("--largest")] = None
+    sizes: Annotated[int, Range(2, 256), Help("Number of sizes, evenly spaced in the logarithm")] = 16
+    widths: Annotated[int, Range(1, 256), Help("Number of half-widths, evenly spaced in the logarithm")] = 16
+    half_width_low_s: Annotated[Duration, Help("Smallest half-width")] = 10.0
+    half_width_high_s: Annotated[Duration, Help("Largest half-width")] = 1800.0
+    count: Annotated[
+        int, Range(10, 10**8), Help("Injections of each size and half-width"), Flag("--injections", "-n")
+    ] = 2_000
+    positions: Annotated[int, Range(2, 100_000), Help("Peak times in the stare")] = 40
+    fitted: Annotated[
+        int, Range(0, 100_000), Help("Injections of each size and half-width that are fitted if they are detected")
+    ] = 40
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

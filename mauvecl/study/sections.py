@@ -12,9 +12,9 @@ from mauvecl.host.sky import DEFAULT_SKY
 from mauvecl.host.stars.band_names import ALIASES
 from mauvecl.noise.priors import Normal, Uniform
 from mauvecl.noise.unknowns import INSTRUMENT_VALUES, PROCESSES
+from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Quantity, Range
-from mauvecl.schema.parsing import words
 from mauvecl.schema.physical import (
     Amplitude,
     BinWidth,
@@ -362,12 +362,12 @@ class Run(Section):
     """Number of realisations, seed, statistics and false-alarm probability."""
 
     realisations: Annotated[int, Range(1), Help("Noise realisations"), Flag("--realisations", "-n")] = 1_000_000
-    seed: Annotated[int, Range(0, 2**64 - 1), Help("Seed", "the same seed gives the same noise"), Flag("--seed")] = 1
+    seed: Annotated[int, Range(0, 2**64 - 1), Help("Seed"), Flag("--seed")] = 1
     statistics: Annotated[
         tuple[str, ...],
         Field(min_length=1),
         Help("Detection statistic", choices=f"{', '.join(STATISTIC_NAMES)}, or all"),
-        Flag("--statistic", read=words),
+        Flag("--statistic", read=parsing.words),
     ] = DEFAULT_STATISTICS
     fap: Annotated[Probability, Help("False-alarm probability per test"), Flag("--fap")] = 1e-3
     tails: Annotated[
@@ -423,7 +423,7 @@ Draws = Annotated[
 Known = Annotated[
     tuple[str, ...],
     Help("Instrument value that is known", "as in temperature_c,light_loss"),
-    Flag("--known", read=words),
+    Flag("--known", read=parsing.words),
 ]
 #: Number of draws, priors by name, and names of known values.
 _unknown_keys: Any = (

@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from mauvecl.lightcurve.defaults import ORBIT_S, check_shape
+from mauvecl.lightcurve.defaults import ORBIT_S, SHAPE_NAMES, check_shape
 from mauvecl.noise.unknowns import COURSES, Changing
+from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Flag, Help, Range, Unit
+from mauvecl.schema.physical import Amplitude, Duration, Energy, Positive, Temperature, Wavelength
 from mauvecl.study.sections import Section
 
 if TYPE_CHECKING:
@@ -25,11 +28,11 @@ ORBIT_FRAMES_S = 5680.0
 class CurveText(Section):
     """Slow change with time: a sinusoid, points, or a file with two columns, time in s and value."""
 
-    amplitude: float | None = None
-    period_s: float | None = None
-    phase: float = 0.0
-    points: tuple[tuple[float, float], ...] | None = None
-    file: Path | None = None
+    amplitude: Annotated[float | None, Help("Half the range of a sinusoid")] = None
+    period_s: Annotated[Duration | None, Help("Period of the sinusoid", default="the orbit's")] = None
+    phase: Annotated[float, Help("Phase of the sinusoid at the start, as a fraction of the period")] = 0.0
+    points: Annotated[tuple[tuple[float, float], ...] | None, Help("Times in s, and values")] = None
+    file: Annotated[Path | None, Help("File with two columns, time in s and value")] = None
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
@@ -61,31 +64,60 @@ class CurveText(Section):
         return Table(columns[:, 0], columns[:, 1])
 
 
-Spreads = dict[Changing, Annotated[float, Field(gt=0)]]
+Spreads = dict[Changing, Positive]
+#: Shape of flares in stares and searches.
+ShapeName = Annotated[str, Help("Shape of flares", choices=", ".join(SHAPE_NAMES)), Flag("--shape")]
 
 
 class StareQuestion(Section):
     """Duration and gaps of a stare, known and unknown changes during it, and its flares unless `events` are given."""
 
-    duration_s: Annotated[float, Field(gt=0)] = ORBIT_FRAMES_S
-    gaps: tuple[tuple[float, float], ...] = ()
-    orbit_s: Annotated[float, Field(gt=0)] = ORBIT_S
-    orbit_gap_s: Annotated[float, Field(ge=0)] = 0.0
-    along_orbit: bool = False
-    thermal: CurveText | None = None
-    variability: CurveText | None = None
-    throughput: CurveText | None = None
-    sky: CurveText | None = None
-    jitters: Spreads = Field(default_factory=dict)
-    offsets: Spreads = Field(default_factory=dict)
-    drifts: Spreads = Field(default_factory=dict)
-    cycles: Spreads = Field(default_factory=dict)
-    number: Annotated[int, Field(ge=0, lt=2**32)] = 0
-    half_width_s: Annotated[float, Field(gt=0)] = 60.0
-    shape: str = "davenport2014"
-    energies_erg: tuple[Annotated[float, Field(gt=0)], ...] = ()
-    search: bool = True
-    bands_nm: tuple[tuple[float, float], ...] = ((200.0, 300.0), (300.0, 400.0), (400.0, 550.0), (550.0, 700.0))
+    duration_s: Annotated[Duration, Help("Duration of the stare"), Flag("--duration")] = ORBIT_FRAMES_S
+    gaps: Annotated[
+        tuple[tuple[float, float], ...],
+        Unit("s"),
+        Help("Gap without recorded frames, from:to", "as in 1000:2000"),
+        Flag("--gap", kind=list[str], read=parsing.gaps),
+    ] = ()
+    orbit_s: Annotated[Duration, Help("Orbital period")] = ORBIT_S
+    orbit_gap_s: Annotated[float, Unit("s"), Range(0), Help("Gap at the end of every orbit"), Flag("--orbit-gap")] = 0.0
+    along_orbit: Annotated[bool, Help("Whether detector temperature and sky follow the orbit of the section orbit")] = (
+        False
+    )
+    thermal: Annotated[
+        CurveText | None,
+        Help("Known change of the detector temperature, deg C"),
+        Flag(
+            "--thermal",
+            kind=float,
+            read=lambda half, _: {"amplitude": half},
+            help=Help("Half the range of the known thermal cycle of the orbit, deg C", default="0"),
+        ),
+    ] = None
+    variability: Annotated[CurveText | None, Help("Known relative change of the star's light")] = None
+    throughput: Annotated[CurveText | None, Help("Known relative change of the throughput")] = None
+    sky: Annotated[CurveText | None, Help("Known relative change of the sky")] = None
+    jitters: Annotated[Spreads, Help("Standard deviations of unknown changes that differ in each frame")] = Field(
+        default_factory=dict
+    )
+    offsets: Annotated[Spreads, Help("Standard deviations of unknown constant changes")] = Field(default_factory=dict)
+    drifts: Annotated[Spreads, Help("Standard deviations of unknown drifts per hour")] = Field(default_factory=dict)
+    cycles: Annotated[Spreads, Help("Standard deviations of unknown cycles of the orbit")] = Field(default_factory=dict)
+    number: Annotated[int, Range(0, 2**32 - 1), Help("Number of the drawn stare")] = 0
+    half_width_s: Annotated[Duration, Help("Half-width of the flares"), Flag("--half-width")] = 60.0
+    shape: ShapeName = "davenport2014"
+    energies_erg: Annotated[
+        tuple[Energy, ...], Help("Bolometric energy of a flare", "instead of amplitudes"), Flag("--energy")
+    ] = ()
+    search: Annotated[
+        bool, Help("Search the stare for flares, as the section search says"), Flag("--search/--no-search")
+    ] = True
+    bands_nm: Annotated[tuple[tuple[Wavelength, Wavelength], ...], Help("Wavelength ranges of light curves")] = (
+        (200.0, 300.0),
+        (300.0, 400.0),
+        (400.0, 550.0),
+        (550.0, 700.0),
+    )
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
@@ -119,8 +151,8 @@ class StareQuestion(Section):
 class CoolingText(Section):
     """Exponential cooling of a flare from its initial temperature."""
 
-    end_k: float
-    fold_s: float
+    end_k: Annotated[Temperature, Help("Final temperature")]
+    fold_s: Annotated[Duration, Help("Time in which the temperature excess falls by a factor of e")]
 
 
 class EventText(Section):
@@ -129,17 +161,17 @@ class EventText(Section):
     At most one of `amplitude`, `peak`, `equivalent_duration_s` and `energy_erg` is given.
     """
 
-    peak_s: float
-    half_width_s: Annotated[float, Field(gt=0)] | None = None
-    amplitude: Annotated[float, Field(ge=0)] | None = None  # amplitude of the shape
-    peak: Annotated[float, Field(ge=0)] | None = None  # maximum of the shape
-    equivalent_duration_s: Annotated[float, Field(gt=0)] | None = None
-    energy_erg: Annotated[float, Field(gt=0)] | None = None
-    energy: Literal["bolometric", "band"] = "bolometric"  # meaning of `energy_erg`
-    temperature_k: float | None = None
-    cooling: CoolingText | None = None
-    shape: str | None = None
-    shape_file: Path | None = None  # two columns, time in half-widths and value, instead of a published shape
+    peak_s: Annotated[float, Unit("s"), Help("Time of the peak after the start of the stare")]
+    half_width_s: Annotated[Duration | None, Help("Half-width of the shape", default="the stare's")] = None
+    amplitude: Annotated[Amplitude | None, Help("Amplitude of the shape", default="the flare's")] = None
+    peak: Annotated[Amplitude | None, Help("Maximum of the shape, instead of its amplitude")] = None
+    equivalent_duration_s: Annotated[Duration | None, Help("Equivalent duration, instead of an amplitude")] = None
+    energy_erg: Annotated[Energy | None, Help("Energy, instead of an amplitude")] = None
+    energy: Annotated[Literal["bolometric", "band"], Help("Meaning of the energy")] = "bolometric"
+    temperature_k: Annotated[Temperature | None, Help("Temperature", default="the flare's")] = None
+    cooling: Annotated[CoolingText | None, Help("Exponential cooling from that temperature")] = None
+    shape: Annotated[str | None, Help("Shape", default="the stare's", choices=", ".join(SHAPE_NAMES))] = None
+    shape_file: Annotated[Path | None, Help("File of a shape with two columns, time in half-widths and value")] = None
 
     @model_validator(mode="after")
     def _one_size(self) -> Self:

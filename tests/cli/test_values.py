@@ -10,9 +10,9 @@ from commands import ended
 from typer.main import get_command
 
 from mauvecl.cli.app import app
-from mauvecl.cli.values import count, several
-from mauvecl.cli.values import number as number_of
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.parsing import count, several
+from mauvecl.schema.parsing import number as number_of
 
 
 @pytest.mark.parametrize(

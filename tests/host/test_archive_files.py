@@ -69,7 +69,7 @@ REFUSED = [
     ),
     ("wasp-96_estimate_sed.txt", {}, ("wavelength_unit", "1980.05", "6067.15", "`wavelength_unit='Angstrom'`")),
     ("wasp-96_estimate_sed.txt", {"extend": "G8V"}, ("wavelength_unit", "`wavelength_unit='Angstrom'`")),
-    ("ckp00_5750.fits", {}, ("columns", "g00", "g05", "FILE[g50]")),
+    ("ckp00_5750.fits", {}, ("columns", "11", "g00", "g05")),
     ("ckp00_5750.fits[g55]", {}, ("columns", "'g55'", "WAVELENGTH", "g00")),
     ("XP_SAMPLED_RAW_dr3int6.csv", {}, ("rows", "2", "6", "4")),
 ]

@@ -152,7 +152,7 @@ ORBITS: list[Row] = [
     (lambda: Limits(declination_deg=(10.0, -10.0)), "declination_deg", "-90 to 90"),
     (lambda: Limits(eclipse="sometimes"), "eclipse", "'sometimes'"),  # type: ignore[arg-type]
     (lambda: Limits(proton_flux=0.0), "proton_flux"),
-    (lambda: Limits(anomaly=((0.0, 0.0), (1.0, 1.0))), "anomaly", "at least 3"),
+    (lambda: Limits(anomaly=((0.0, 0.0), (1.0, 1.0))), "anomaly", "2 corners"),
     (lambda: Limits(duty_cycle=0.0), "duty_cycle"),
     (lambda: Limits(shortest_s=-1.0), "shortest_s", "-1"),
 ]

@@ -197,7 +197,7 @@ ONE, TWO = FLUX, 2 * FLUX
 REFUSED = {
     "model and observed": (
         text({"wavelength": NM, "model_flux": ONE, "observed_flux": TWO}),
-        ("columns", "model_flux", "FILE[observed_flux]"),
+        ("columns", "2", "model_flux", "observed_flux"),
     ),
     "two fluxes": (text({"nm": NM, "flux_1": ONE, "flux_2": TWO}), ("columns", "flux_1", "flux_2")),
     "flam and fnu": (text({"nm": NM, "f_lambda": ONE, "f_nu": TWO}), ("columns", "f_lambda", "f_nu")),
@@ -212,8 +212,8 @@ REFUSED = {
     "one edge": (text({"wave_lo": LOW, "flux": ONE}), ("columns",)),
     "edges in two units": (text({"wave_lo_nm": LOW, "wave_hi_A": 10 * HIGH, "flux": ONE}), ("wavelength_unit",)),
     "unknown names": (text({"a": NM, "b": ONE, "c": TWO}), ("columns",)),
-    "names for other columns": (text({"i": NM, "w": NM, "f": ONE}, " ", "wavelength flux"), ("columns", "3")),
-    "more names than columns": (text({"f": ONE, "w": NM}, " ", "# Total flux Rest wavelength"), ("columns", "2")),
+    "names for other columns": (text({"i": NM, "w": NM, "f": ONE}, " ", "wavelength flux"), ("columns", "2")),
+    "more names than columns": (text({"f": ONE, "w": NM}, " ", "# Total flux Rest wavelength"), ("columns", "4")),
     "log of nothing": (text({"nm": NM, "log_flux": ONE}), ("log_flux",)),
     "log wavelengths that are none": (text({"loglam": ANGSTROM, "flux": ONE}), ("loglam", "1700")),
     "energy per area": (text({"nm": NM, "flux": ONE}, ",", "nm,flux\nnm,W/m2"), ("flux_unit",)),

@@ -307,8 +307,8 @@ BAD_TEXT = {
     "two fluxes": (
         lines(NM, FLUX, FLUX, head="wave flux_1 flux_2\n"), ("columns", "2", "flux_1", "flux_2"),
     ),
-    "mixed commas": (lines(NM, FLUX).replace("1.", "1,"), ("line",)),
-    "commas or columns": ("\n".join(f"{n},5,1,2e-14" for n in range(200, 800)), ("line",)),
+    "mixed commas": (lines(NM, FLUX).replace("1.", "1,"), ("columns",)),
+    "commas or columns": ("\n".join(f"{n},5,1,2e-14" for n in range(200, 800)), ("columns",)),
     "words": (lines(NM, FLUX) + "end of file\n", ("columns", "416", "'end of file'")),
     "underscores": (lines(NM, FLUX) + "1_000 2\n", ("columns", "416", "'1_000 2'")),
     "not rising": (lines(np.roll(NM, 5), FLUX), ("wavelength",)),
@@ -338,7 +338,7 @@ BAD_FITS = {
     "cut short": (WHOLE[:-2880], ("file",)),
     "many rows": (table(columns=(np.tile(10 * NM, (3, 1)), np.tile(FLUX, (3, 1))), formats=(f"{NM.size}D",) * 2),
                   ("rows", "3")),
-    "cube": (image(np.ones((4, 5, 6)), CRVAL1=1.0, CDELT1=1.0), ("image.shape", "[6, 5, 4]")),
+    "cube": (image(np.ones((4, 5, 6)), CRVAL1=1.0, CDELT1=1.0), ("table", "6", "5", "4")),
     "two arrays": (table(columns=(10 * NM, np.outer(FLUX, [1, 2])), formats=("D", "2D")), ("rows",)),
     "unequal": (table(columns=(short_rows(10 * NM[:-1]), short_rows(FLUX)),
                       formats=(f"{NM.size - 1}D", f"{NM.size}D")), ("flux", "414", "415")),
@@ -392,7 +392,7 @@ def test_one_of_several_tables_or_rows(tmp_path: Path) -> None:
     ]
     path = tmp_path / "two.fits"
     fits.HDUList(hdus).writeto(path)
-    with refused("table", "FILE[ONE]"):
+    with refused("table", "2", "FILE"):
         Source.read(path)
     for word in ("ONE", "one", "1", "ONE,FLUX"):
         alike(f"{path}[{word}]")

@@ -369,15 +369,15 @@ def test_one_frame_is_fitted_alike_in_any_company() -> None:
 @pytest.mark.parametrize(
     ("call", "text"),
     [
-        (lambda: fit(np.zeros((2, 7)), quiet(), model()), ("frames.shape", "(2, 7)")),
-        (lambda: fit(np.zeros((0, quiet().wavelength_nm.size)), quiet(), model()), ("frames.shape", "(0, ")),
+        (lambda: fit(np.zeros((2, 7)), quiet(), model()), ("frames", "2", "7")),
+        (lambda: fit(np.zeros((0, quiet().wavelength_nm.size)), quiet(), model()), ("frames", "0")),
         (lambda: fit(np.full(quiet().wavelength_nm.size, np.nan), quiet(), model()), ("frames",)),
         (lambda: fit(quiet().recorded_dn, quiet(), model(), levels=(95.0,)), ("levels",)),
         (lambda: FlareModel.of(star(), MAUVE, quiet(), lines=("X",)), ("lines", "'X'")),
         (lambda: FlareModel.of(star(), MAUVE, quiet(), distance_pc=-1.0), ("distance_pc", "-1")),
         (lambda: FlareModel.of(star(), MAUVE, quiet(), bands_nm=((300.0, 200.0),)), ("bands_nm",)),
         (lambda: model().counts(100.0, [0.1]), ("temperature_k", "100")),
-        (lambda: model().counts(9000.0, [0.1, 0.2]), ("amplitudes.shape",)),
+        (lambda: model().counts(9000.0, [0.1, 0.2]), ("amplitudes",)),
         (lambda: model().amplitudes(9000.0, 0.1, jump=2.0), ("jump",)),
     ],
 )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mauvecl.cli.flags import BULK, DRAWS, FLARE, SWEEP, DeviceFlag, JsonFlag, QuietFlag
+from mauvecl.cli.flags import DRAWS, FEWER, DeviceFlag, JsonFlag, QuietFlag
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
@@ -26,11 +26,11 @@ RowsFlag = Annotated[
 
 
 @takes_study(
-    FLARE,
-    DRAWS,
-    SWEEP,
-    BULK,
-    fewer=True,
+    "flare",
+    *DRAWS,
+    "sweep",
+    "bulk",
+    defaults=FEWER,
     pictures=False,
     writes="mauvecl-frames.zarr; also NAME.fits, .h5, .hdf5",
 )

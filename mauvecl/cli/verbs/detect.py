@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mauvecl.cli.flags import CAMPAIGN, COUNTED, DETECTION, DRAWS, FLARE, NUISANCES, SWEEP, TEMPLATE
+from mauvecl.cli.flags import DETECTION, DRAWS, FEWER, NUISANCES, SIGNAL
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 
-@takes_study(FLARE, DRAWS, DETECTION, CAMPAIGN, NUISANCES, TEMPLATE, SWEEP)
+@takes_study("flare", *DRAWS, *DETECTION, "campaign", *NUISANCES, "run.template_temperatures_k", "sweep")
 def detect(
     study: Study,
     session: Session,
@@ -27,7 +27,7 @@ def detect(
     session.answer(session.ask(study))
 
 
-@takes_study(DRAWS, DETECTION, COUNTED, SWEEP, fewer=True)
+@takes_study(*DRAWS, *DETECTION, *SIGNAL, "sweep", defaults=FEWER)
 def gaussian(
     study: Study,
     session: Session,

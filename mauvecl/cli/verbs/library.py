@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mauvecl.cli.flags import ExtendFlag, FluxUnitFlag, JsonFlag, QuietFlag, WavelengthUnitFlag
+from mauvecl.cli.flags import JsonFlag, QuietFlag, option_of
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.own_stars import OwnStar
 
+WavelengthUnitFlag = Annotated[str | None, option_of("star.wavelength_unit")]
+FluxUnitFlag = Annotated[str | None, option_of("star.flux_unit")]
+ExtendFlag = Annotated[str | None, option_of("star.extend")]
 app = typer.Typer(invoke_without_command=True, rich_markup_mode=None)
 ReplaceFlag = Annotated[bool, typer.Option("--replace", help="Take the place of what has that name.")]
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, LIMIT, MAP, NUISANCES, SWEEP, UNKNOWN
+from mauvecl.cli.flags import DETECTION, DRAWS, FEWER, NUISANCES, UNKNOWN
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 
-@takes_study(LIMIT, FLARE, DRAWS, DETECTION, NUISANCES, UNKNOWN, SWEEP)
+@takes_study("limit", "flare", *DRAWS, *DETECTION, *NUISANCES, *UNKNOWN, "sweep")
 def limit(
     study: Study,
     session: Session,
@@ -38,7 +38,7 @@ def limit(
     session.answer(answer)
 
 
-@takes_study(MAP, FLARE, DRAWS, DETECTION, NUISANCES, UNKNOWN, name="map", fewer=True)
+@takes_study("map", "flare", *DRAWS, *DETECTION, *NUISANCES, *UNKNOWN, name="map", defaults=FEWER)
 def detection_map(
     study: Study,
     session: Session,

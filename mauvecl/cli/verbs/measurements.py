@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, MEASURE, NUISANCES, SIZE, STARE, SWEEP
+from mauvecl.cli.flags import NUISANCES, SIZE, STARE
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
@@ -12,10 +12,8 @@ if TYPE_CHECKING:
     from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
 
-SELECTED = {"fap": DETECTION["fap"]}
 
-
-@takes_study(FLARE, MEASURE, STARE, NUISANCES, SIZE, SELECTED, {"seed": DRAWS["seed"]}, SWEEP)
+@takes_study("flare", "measure", *STARE, *NUISANCES, *SIZE, "run.fap", "run.seed", "sweep")
 def measure(study: Study, session: Session) -> None:
     """What would be measured of a flare's spectrum, and how well.
 

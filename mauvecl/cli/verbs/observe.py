@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mauvecl.cli.flags import AT, COUNTED, DRAWS, FLARE, SIGNAL, SWEEP
+from mauvecl.cli.flags import DRAWS, FEWER, SIGNAL
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 
-@takes_study(FLARE, COUNTED, {"seed": DRAWS["seed"]}, draws=False)
+@takes_study("flare", *SIGNAL, "run.seed", draws=False)
 def simulate(
     study: Study,
     session: Session,
@@ -41,7 +41,7 @@ def _budgets_or_star(given: dict[str, Any]) -> Study:
     return Study() if named else PAPER_BUDGETS
 
 
-@takes_study(DRAWS, COUNTED, AT, SWEEP, fewer=True, default=_budgets_or_star)
+@takes_study(*DRAWS, *SIGNAL, "signal.wavelength_nm", "sweep", defaults=FEWER, default=_budgets_or_star)
 def snr(
     study: Study,
     session: Session,
@@ -61,7 +61,7 @@ def snr(
     session.answer(session.ask(study))
 
 
-@takes_study(SIGNAL, COUNTED, without="exposure", draws=False)
+@takes_study("signal", *SIGNAL, without="observation.exposure_s", draws=False)
 def exposure(
     study: Study,
     session: Session,

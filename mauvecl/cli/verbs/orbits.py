@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from mauvecl.cli.flags import FLARE, OBSERVATION, SPECTRUM, flag, group
 from mauvecl.cli.verb import takes_study
-from mauvecl.cli.verbs.injections import SEARCH
 
 if TYPE_CHECKING:
     from mauvecl.answers.campaigns.plan import PlanAnswer
@@ -16,76 +13,14 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 
-def _range(text: str) -> Any:
-    """Two declinations, -46.4:31.8, or none."""
-    from mauvecl.schema.errors import InputError
-    from mauvecl.schema.text import shortened
-
-    if text.strip().lower() == "none":
-        return "none"
-    try:
-        low, high = (float(part) for part in text.split(":"))
-    except ValueError as error:
-        raise InputError(f"--declination {shortened(text)}, expected low:high in degrees, or none") from error
-    return (low, high)
-
-
-def _targets_of(path: Path) -> Any:
-    from mauvecl.study.orbits import read_targets
-
-    return read_targets(path)
-
-
-#: Where from, when, and what must hold.
-ORBIT = group(
-    flag(str, "--start", "First day or time, UTC [2027-01-01].", "orbit.start"),
-    flag(float, "--days", "How long, days [365].", "orbit.days"),
-    flag(float, "--step", "Seconds between the times looked at [60].", "orbit.step_s"),
-    flag(Path, "--tle", "File of two-line elements, newer than the embedded ones.", "orbit.tle"),
-    flag(str, "--orbit", "tle, mean, or auto: mean far from the elements' epoch [auto].", "orbit.kind"),
-    flag(bool, "--simbad", "Ask SIMBAD for other names (needs mauvecl[names]).", "orbit.simbad"),
-    flag(str, "--earth-limb", "Least angle from the Earth's limb, deg, or none [25].", "orbit.limits.earth_limb_deg"),
-    flag(str, "--sun", "Least angle from the Sun, deg, or none [46].", "orbit.limits.sun_deg"),
-    flag(str, "--moon", "Least angle from the Moon, deg, or none [25].", "orbit.limits.moon_deg"),
-    flag(
-        str,
-        "--declination",
-        "Field of regard, low:high in deg, or none [-46.4:31.8].",
-        "orbit.limits.declination_deg",
-        _range,
-    ),
-    flag(str, "--eclipse", "any, only (in the Earth's shadow), or never [any].", "orbit.limits.eclipse"),
-    flag(
-        str,
-        "--protons",
-        "Largest flux of protons above 10 MeV, cm^-2 s^-1, or none [10].",
-        "orbit.limits.proton_flux",
-    ),
-)
-LOOKED_AT = group(flag(list[str], "--look-at", "Name, or coordinates '290.0 -11.2'; may be repeated.", "orbit.targets"))
-TABLE = group(
-    flag(
-        Path,
-        "--targets",
-        "Table of targets (CSV, ECSV): name, and what is known of each.",
-        "plan.targets",
-        _targets_of,
-    )
-)
-PLAN = group(
-    flag(float, "--hours", "Of exposure for each target, at most [all].", "plan.hours"),
-    SEARCH["false_alarms"],
-    flag(str, "--completeness", "injections, or 'closed form' at once [injections].", "plan.completeness"),
-    flag(str, "--report", "pdf or html [pdf].", "plan.report"),
-    OBSERVATION["instrument"],
-    OBSERVATION["temperature"],
-    FLARE["flare_temperature"],
-    FLARE["flare_band"],
-    *SPECTRUM.values(),
+#: Keys of the orbit that both verbs take; targets are given in a way of their own.
+ORBIT = (
+    *(f"orbit.{key}" for key in ("start", "days", "step_s", "tle", "kind", "simbad")),
+    "orbit.limits",
 )
 
 
-@takes_study(LOOKED_AT, TABLE, observation=ORBIT, draws=False)
+@takes_study("orbit.targets", "plan.targets", observation=ORBIT, draws=False)
 def visible(study: Study, session: Session) -> None:
     """When targets can be seen from the orbit.
 
@@ -120,7 +55,16 @@ def _show_visible(answer: VisibleAnswer) -> None:
         )
 
 
-@takes_study(TABLE, PLAN, observation=ORBIT)
+@takes_study(
+    "plan",
+    "search.false_alarms",
+    "observation.instrument",
+    "observation.temperature_c",
+    "flare.temperature_k",
+    "flare.band",
+    "flare.spectrum",
+    observation=ORBIT,
+)
 def plan(study: Study, session: Session) -> None:
     """A campaign: hours, flares expected, false alarms; a report.
 

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from mauvecl.cli.values import count, within
+from mauvecl.cli.values import within
+from mauvecl.schema.parsing import count
 
 
 def serve(

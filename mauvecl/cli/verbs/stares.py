@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from mauvecl.cli.flags import DRAWS, FLARE, SIZE, STARE, SWEEP, DeviceFlag
+from mauvecl.cli.flags import SIZE, STARE, DeviceFlag
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 
-@takes_study(FLARE, STARE, SIZE, {"seed": DRAWS["seed"]}, SWEEP, without="exposure", draws=False, resumes=True)
+@takes_study("flare", *STARE, *SIZE, "run.seed", "sweep", without="observation.exposure_s", draws=False, resumes=True)
 def stare(
     study: Study,
     session: Session,

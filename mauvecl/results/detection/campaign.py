@@ -124,7 +124,12 @@ def _check(what: str, value: float) -> None:
 def count_tests(frames: int, stack: int, step: int) -> int:
     """Return the number of stacks in a campaign."""
     if not (1 <= stack <= frames and 1 <= step <= stack):
-        raise InputError.of("step", step, f"1 <= step <= stack = {stack} <= frames = {frames}")
+        raise InputError(
+            f"a campaign of {frames} frames in stacks of {stack}, {step} apart",
+            "1 <= step <= stack <= frames",
+            key="step",
+            value=(frames, stack, step),
+        )
     return (frames - stack) // step + 1
 
 

@@ -195,7 +195,12 @@ def fit(
     """
     raw = np.atleast_2d(np.asarray(frames, np.float64))
     if raw.ndim != 2 or not len(raw) or raw.shape[1] != expectation.wavelength_nm.size:
-        raise InputError.of("frames.shape", raw.shape, f"{expectation.wavelength_nm.size} pixels in each of some")
+        raise InputError(
+            f"frames of the shape {raw.shape}",
+            f"{expectation.wavelength_nm.size} pixels in each of some",
+            key="frames",
+            value=raw.shape,
+        )
     if not np.isfinite(raw).all():
         raise InputError("frames hold undefined values", "finite numbers", key="frames")
     if not levels or not all(0.0 < level < 1.0 for level in levels):

@@ -258,7 +258,12 @@ class FlareModel:
             raise InputError.of("temperature_k", temperature_k, f"{low:g} to {high:g}")
         linear = np.asarray(amplitudes, np.float64)
         if linear.shape != (len(self.linear),) or not np.isfinite(linear).all():
-            raise InputError.of("amplitudes.shape", linear.shape, f"finite ones of {', '.join(self.linear)}")
+            raise InputError(
+                f"amplitudes of the shape {linear.shape}",
+                f"finite ones of {', '.join(self.linear)}",
+                key="amplitudes",
+                value=linear.shape,
+            )
         return linear
 
 
