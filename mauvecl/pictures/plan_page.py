@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
-from mauvecl.answers.campaigns.plan_text import LEGEND, SUMMARY, heading, summary_rows, target_lines
+from mauvecl.answers.campaigns.plan_text import LEGEND, heading, target_lines
 from mauvecl.host.version import VERSION
 from mauvecl.pictures.plan_report import overview_png, target_png
 from mauvecl.pictures.registry import document_of
@@ -32,7 +32,7 @@ def report_html(answer: PlanAnswer) -> bytes:
         f"<!doctype html><html lang=en><meta charset=utf-8><title>Mauve: {escape(heading(answer))}</title>",
         f"<style>{STYLE}</style><h1>Mauve: yields of a campaign</h1>",
         f"<p>{escape(heading(answer))}; mauvecl {VERSION}.</p>",
-        _table(SUMMARY, summary_rows(answer), "numbers", link=True),
+        _table(*answer.views[0].texts(), "numbers", link=True),
         f"<p class=from>{escape(LEGEND)}</p>",
         _image(overview_png, answer, text="flares expected and energies of all targets"),
         *(f"<p>{escape(message)}</p>" for message in answer.messages),

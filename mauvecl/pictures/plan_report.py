@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.campaigns.plan_text import LEGEND, SUMMARY, heading, summary_rows, target_lines
+from mauvecl.answers.campaigns.plan_text import LEGEND, heading, target_lines
 from mauvecl.host.version import VERSION
 from mauvecl.pictures.registry import document_of, picture_of
 from mauvecl.pictures.style import COLOURS, NULL, STYLE, canvas, save_or_return
@@ -166,7 +166,8 @@ def _summary(plt: Any, answer: PlanAnswer) -> list[Any]:
     sheets.line([(0.0, "Mauve: yields of a campaign")], 15)
     sheets.line([(0.0, f"{heading(answer)}; mauvecl {VERSION}")], 9)
     sheets.take(0.1)
-    for number, row in enumerate([SUMMARY, *summary_rows(answer)]):
+    headings, cells = answer.views[0].texts()
+    for number, row in enumerate([headings, *cells]):
         sheets.line(list(zip(SUMMARY_AT, row, strict=True)), 7, weight="normal" if number else "bold")
         sheets.rule()
     sheets.take(0.05)

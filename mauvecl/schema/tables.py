@@ -107,19 +107,28 @@ def table_of(columns: Iterable[Column], rows: Iterable[object], **meta: object) 
 
 
 def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **meta: object) -> QTable:
-    """Return tables as one, each after the `first` columns of its row; keep metadata that all share, and add `meta`."""
+    """Return tables as one, each after the `first` columns of its row; keep metadata that all share, and add `meta`.
+
+    A column that a table does not have is masked there.
+    """
     every = list(parts)
-    (_, one), *_ = every
-    shared = {k: v for k, v in one.meta.items() if all(k in t.meta and t.meta[k] == v for _, t in every)}
+    tables = [table for _, table in every]
+    shared = {k: v for k, v in tables[0].meta.items() if all(k in t.meta and t.meta[k] == v for t in tables)}
+
+    def values(part: tuple[object, Table], name: str) -> Any:
+        return getattr(part[1][name], "value", part[1][name]) if name in part[1].colnames else None
 
     def taken(name: str) -> Column:
-        unit, text = str(one[name].unit or ""), one[name].info.description or ""
-        if any(str(table[name].unit or "") != unit for _, table in every):
+        having = [table[name] for table in tables if name in table.colnames]
+        (unit, *others) = dict.fromkeys(str(one.unit or "") for one in having)
+        if others:
             raise ValueError(f"column {name} has several units")
-        return Column(name, lambda part: getattr(part[1][name], "value", part[1][name]), unit, text)
+        kind = None if len(having) == len(tables) else having[0].dtype.type
+        text = having[0].info.description or ""
+        return Column(name, lambda part: values(part, name), unit, text, kind=kind)
 
-    columns = [each.of(itemgetter(0)) for each in first]
-    return table_of([*columns, *map(taken, one.colnames)], every, **shared | meta)
+    names = dict.fromkeys(name for table in tables for name in table.colnames)
+    return table_of([*(one.of(itemgetter(0)) for one in first), *map(taken, names)], every, **shared | meta)
 
 
 def records(table: Table) -> list[dict[str, Any]]:
@@ -146,25 +155,3 @@ def interval(spec: str, factor: float = 1.0) -> Callable[[float, float], str]:
 def short(value: float | str) -> str:
     """Format a number or a name without its unit."""
     return value if isinstance(value, str) else f"{value:g}"
-
-
-def make_table(columns: Iterable[tuple[Any, ...]], **meta: object) -> QTable:
-    """Make a table of columns given as (name, values), (name, values, description) or (..., description, unit)."""
-    import astropy.units as u
-    import numpy as np
-    from astropy.table import QTable
-
-    table, units = QTable(), cache(u.Unit)
-    for name, values, *more in columns:
-        text, unit = (*more, "", "")[:2]
-        table[name] = np.asarray(values) * units(unit) if unit else values
-        table[name].info.description = text or None
-    table.meta |= meta
-    return table
-
-
-def set_descriptions(table: QTable, texts: Mapping[str, str]) -> QTable:
-    """Set the descriptions of columns in place and return the table."""
-    for name, text in texts.items():
-        table[name].info.description = text
-    return table

@@ -11,7 +11,7 @@ from scipy import stats
 
 from mauvecl import Study, plan
 from mauvecl.answers.campaigns.plan import PlanAnswer
-from mauvecl.answers.campaigns.plan_text import SUMMARY_COLUMNS, summary_rows, target_lines
+from mauvecl.answers.campaigns.plan_text import target_lines
 from mauvecl.answers.campaigns.planned import TargetObservation
 from mauvecl.answers.campaigns.planned_injections import question_of
 from mauvecl.answers.report import write_study, write_table
@@ -19,6 +19,7 @@ from mauvecl.lightcurve.flares.energies import EnergyScale, quiescent_luminosity
 from mauvecl.lightcurve.flares.rates import davenport2019
 from mauvecl.lightcurve.search.completeness import Completeness
 from mauvecl.lightcurve.stares.along import stare_along
+from mauvecl.schema.tables import records
 from mauvecl.study.cases import Case
 from mauvecl.study.orbits import read_targets
 from mauvecl.study.spectral_types import nearest_spectrum, subtype
@@ -122,11 +123,11 @@ def test_each_number_of_the_report_is_in_the_table_it_names(answer: PlanAnswer, 
             for token in NUMBER.findall(value):
                 assert printed(token, values), (one.name, what, token)
                 count += 1
-        row = summary_rows(answer)[k]
-        for text, columns in zip(row[1:], SUMMARY_COLUMNS[1:], strict=True):
-            values = [n for column in columns.split(", ") for n in held(tables["plan"], column, one.name)]
-            for token in NUMBER.findall(text):
-                assert printed(token, values), (one.name, columns, token)
+        record = records(answer.table)[k]
+        for column in answer.columns[1:]:
+            values = [n for name in (column.name, *column.others) for n in held(tables["plan"], name, one.name)]
+            for token in NUMBER.findall(column.text(record) if column.heading else ""):
+                assert printed(token, values), (one.name, column.name, token)
                 count += 1
     whole = [
         n

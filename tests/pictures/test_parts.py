@@ -16,13 +16,13 @@ from mauvecl.answers.detection.detect import detect
 from mauvecl.answers.measurements.measure import measure
 from mauvecl.answers.signal.snr import snr
 from mauvecl.answers.stares.inject import inject
-from mauvecl.cli.verbs.limits import _largest
 from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
 from mauvecl.pictures import answers, injections, measurements
 from mauvecl.pictures.registry import pictures_of
 from mauvecl.study.parts import First, note_of, part_note
 from mauvecl.study.study import Study
+from mauvecl.study.unknowns import describe_shares
 
 SMALL = ("run.realisations=2000", "run.fap=0.1", 'star=[{library="G2V", magnitude=7.4}]', "flare.amplitudes=[0.5]")
 INJECTED = (
@@ -64,8 +64,8 @@ def test_pictures_of_a_part_say_so(case: str, monkeypatch: pytest.MonkeyPatch) -
 
 def test_the_largest_shares_say_how_many_there_are() -> None:
     shares = dict.fromkeys("abcde", 0.2)
-    assert _largest(shares) == "a 20 %, b 20 %, c 20 % (3 of 5 unknowns shown)"
-    assert _largest({"a": 1.0}) == "a 100 %"
+    assert describe_shares(shares) == "a 20 %, b 20 %, c 20 % (3 of 5 unknowns shown)"
+    assert describe_shares({"a": 1.0}) == "a 100 %"
 
 
 def test_a_part_has_a_note() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.campaigns.conditions import OrbitConditions
+from mauvecl.answers.campaigns.plan_text import energy, heading, months, two_digits
 from mauvecl.answers.campaigns.planned import (
     NOTHING,
     CompletenessOf,
@@ -21,15 +22,14 @@ from mauvecl.answers.campaigns.planned import (
     rates_of,
     star_of,
 )
-from mauvecl.answers.campaigns.visible import VisibleAnswer, visible
+from mauvecl.answers.campaigns.visible import VisibleAnswer, assumption_columns, visible
 from mauvecl.host.orbit.conditions import PARTICLES_SOURCE, THERMAL_SOURCE
 from mauvecl.lightcurve.search.counted_rate import DAY_S
 from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
 from mauvecl.runs.pool import map_in_order
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.tables import make_table
-from mauvecl.study.labels import describe_columns, stack_tables
+from mauvecl.schema.tables import Column, View, number, table_of
 from mauvecl.study.messages import SATURATED, collect_messages
 from mauvecl.study.sections import Rays
 from mauvecl.study.stare_expectation import refuse_priors
@@ -42,6 +42,71 @@ if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use
+
+
+def _interval(low: int | None, high: int | None) -> str:
+    return "" if low is None else f"{low} to {high}"
+
+
+#: Columns of the table of targets, but for false alarms, which stand before the last.
+COLUMNS = (
+    Column("target", "name", "", "name of the target", "target"),
+    Column("seen", "seen_h", "h", "time in which the target is seen", "seen (h)", ".0f"),
+    Column("hours", "", "h", "of it observed", "observed (h)", ".0f"),
+    Column("E50", lambda one: one.energy_at(0.5), "erg",
+           "bolometric energy from which on half of the flares are recovered", "E50 (erg)", energy),
+    Column("E90", lambda one: one.energy_at(0.9), "erg",
+           "bolometric energy from which on 90 % of the flares are recovered", "E90 (erg)", energy),
+    Column("expected", lambda one: one.recovered.expected if one.recovered else np.nan, "",
+           "flares recovered, by the rates as they are", "flares",
+           lambda expected: two_digits(expected) if expected == expected else "not known"),
+    Column("low", lambda one: one.recovered.low if one.recovered else None, "",
+           "95 % of campaigns recover at least so many: scatter of the rates and Poisson's", "95 %", _interval,
+           ("high",), int),
+    Column("high", lambda one: one.recovered.high if one.recovered else None, "",
+           "95 % of campaigns recover at most so many", kind=int),
+    Column("at_least_one", lambda one: one.recovered.at_least_one if one.recovered else np.nan, "",
+           "probability of recovering any", "P(>= 1)", number(".2f")),
+    Column("best_months", lambda one: " ".join(one.best_months), "", "those with most hours", "best months", months),
+)  # fmt: skip
+#: Columns of the table of what is put in.
+STAR_COLUMNS = (
+    Column("target", "name", "", "name of the target"),
+    Column("ra", "observation.target.ra_deg", "deg", "right ascension"),
+    Column("dec", "observation.target.dec_deg", "deg", "declination"),
+    Column("position", "observation.target.source", "", "who says so"),
+    Column("spectral_type", lambda one: one.observation.target.spectral_type or ""),
+    Column("spectrum", lambda one: one.observation.star.library or "", "",
+           "embedded spectrum that stands for the star"),
+    Column("V", lambda one: one.observation.star.magnitude or 0.0, "mag"),
+    Column("distance", lambda one: one.observation.star.distance_pc or 0.0, "pc"),
+    Column("sky", lambda one: np.nan if one.observation.sky is None else one.observation.sky, "mag / arcsec2",
+           "zodiacal light behind it, median over the days on which it is seen"),
+    Column("signal_per_frame", "observation.signal_per_frame", "", "S/N of one frame with a flare of amplitude 1"),
+    Column("energy_per_second", "observation.scale.erg_per_s", "erg / s",
+           "bolometric energy of a second of equivalent duration"),
+    Column("temperature", lambda one: one.observation.quiet.conditions["temperature_c"], "deg_C",
+           "of the detector, mean while it is seen"),
+    Column("hits", "observation.hits_per_cm2_s", "1 / (s cm2)",
+           "of cosmic rays and trapped protons, mean while it is seen"),
+    Column("window", lambda one: one.observation.window_s / 60, "min", "median stretch in which it is seen"),
+    Column("saturated", lambda one: int(one.observation.quiet.saturated.sum()), "",
+           "pixels left out since they saturate"),
+    Column("rates", lambda one: one.no_rates if one.rates is None else one.rates.source, "",
+           "where its flare rates are from, or why there are none"),
+    Column("recovered_per_day",
+           lambda one: np.nan if one.rates is None or one.completeness is None
+           else recovered_per_day(one.rates, one.completeness), "", "flares recovered in a day of exposure"),
+    Column("scatter", lambda one: np.nan if one.rates is None else one.rates.scatter_dex, "",
+           "standard deviation of the rate's logarithm, dex"),
+)  # fmt: skip
+#: Columns of the table of shares and rates by energy.
+ENERGY_COLUMNS = (
+    Column("target", description="name of the target", kind=str),
+    Column("energy", "", "erg", "bolometric"),
+    Column("recovered", "", "", "share of flares of this energy that is recovered"),
+    Column("rate_above", "", "1 / day", "flares of this energy or more, a day"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,107 +127,45 @@ class PlanAnswer(Answer):
     planned: tuple[Planned, ...]
 
     @property
-    def false_alarms(self) -> np.ndarray:
-        """Expected of each target, (n,)."""
-        return np.array([self.study.search.rate * one.hours / 24 for one in self.planned])
+    def columns(self) -> tuple[Column, ...]:
+        """Columns of the table of targets."""
+        alarms = Column("false_alarms", lambda one: self.study.search.rate * one.hours / 24, "", "expected of noise",
+                        "false alarms", two_digits)  # fmt: skip
+        return (*COLUMNS[:-1], alarms, COLUMNS[-1])
 
     @property
     def table(self) -> QTable:
         """One row per target."""
-        rows, nothing = self.planned, Yield(float("nan"), -1, -1, float("nan"))
-        recovered = [one.recovered or nothing for one in rows]
-        low, high = (
-            np.ma.MaskedArray(values, [value < 0 for value in values])
-            for values in ([one.low for one in recovered], [one.high for one in recovered])
-        )
-        return describe_columns(
-            make_table(
-                [
-                    ("target", [one.name for one in rows]),
-                    ("seen", [one.seen_h for one in rows], "time in which the target is seen", "h"),
-                    ("hours", [one.hours for one in rows], "of it observed", "h"),
-                    ("E50", [one.energy_at(0.5) for one in rows], f"{ENERGY} half of the flares are recovered", "erg"),
-                    ("E90", [one.energy_at(0.9) for one in rows], f"{ENERGY} 90 % of the flares are recovered", "erg"),
-                    ("expected", [one.expected for one in recovered], "flares recovered, by the rates as they are"),
-                    ("low", low, "95 % of campaigns recover at least so many: scatter of the rates and Poisson's"),
-                    ("high", high, "95 % of campaigns recover at most so many"),
-                    ("at_least_one", [one.at_least_one for one in recovered], "probability of recovering any"),
-                    ("false_alarms", self.false_alarms, "expected of noise"),
-                    ("best_months", [" ".join(one.best_months) for one in rows], "those with most hours"),
-                ],
-                start=self.seen.times.iso(0.0),
-                days=self.seen.times.days,
-                false_alarms_per_day=self.study.search.rate,
-                study=self.study.text(),
-            )
-        )
+        about = {"start": self.seen.times.iso(0.0), "days": self.seen.times.days}
+        about |= {"false_alarms_per_day": self.study.search.rate}
+        return table_of(self.columns, self.planned, **about, study=self.study.text())
+
+    @property
+    def views(self) -> list[View]:
+        return [View(heading(self), self.columns, self.table)]
 
     @property
     def stars(self) -> QTable:
         """What is put in: one row per target."""
-        rows, nan = [one.observation for one in self.planned], float("nan")
-        a_day = [
-            nan if one.rates is None or one.completeness is None else recovered_per_day(one.rates, one.completeness)
-            for one in self.planned
-        ]
-        sources = [one.no_rates if one.rates is None else one.rates.source for one in self.planned]
-        scatter = [nan if one.rates is None else one.rates.scatter_dex for one in self.planned]
-        columns = (
-            ("target", [one.target.name for one in rows]),
-            ("ra", [one.target.ra_deg for one in rows], "", "deg"),
-            ("dec", [one.target.dec_deg for one in rows], "", "deg"),
-            ("position", [one.target.source for one in rows], "who says so"),
-            ("spectral_type", [one.target.spectral_type or "" for one in rows]),
-            ("spectrum", [one.star.library or "" for one in rows], "embedded spectrum that stands for the star"),
-            ("V", [one.star.magnitude or 0.0 for one in rows], "", "mag"),
-            ("distance", [one.star.distance_pc or 0.0 for one in rows], "", "pc"),
-            ("sky", [nan if one.sky is None else one.sky for one in rows],
-             "zodiacal light behind it, median over the days on which it is seen", "mag / arcsec2"),
-            ("signal_per_frame", [one.signal_per_frame for one in rows],
-             "S/N of one frame with a flare of amplitude 1"),
-            ("energy_per_second", [one.scale.erg_per_s for one in rows],
-             "bolometric energy of a second of equivalent duration", "erg / s"),
-            ("temperature", [one.quiet.conditions["temperature_c"] for one in rows],
-             "of the detector, mean while it is seen", "deg_C"),
-            ("hits", [one.hits_per_cm2_s for one in rows],
-             "of cosmic rays and trapped protons, mean while it is seen", "1 / (s cm2)"),
-            ("window", [one.window_s / 60 for one in rows], "median stretch in which it is seen", "min"),
-            ("saturated", [int(one.quiet.saturated.sum()) for one in rows], "pixels left out since they saturate"),
-            ("rates", sources),
-            ("recovered_per_day", a_day, "flares recovered in a day of exposure"),
-            ("scatter", scatter, "standard deviation of the rate's logarithm, dex"),
-        )  # fmt: skip
-        return make_table(columns, study=self.study.text())
+        return table_of(STAR_COLUMNS, self.planned, study=self.study.text())
 
     @property
     def by_energy(self) -> QTable:
         """The share recovered and the rate by energy: one row per target and energy, where either changes."""
-        import astropy.units as u
-        from astropy.table import QTable
-
-        parts = []
+        rows = []
         for one in self.planned:
             if one.completeness is None:
                 continue
-            energy, p = one.completeness.energy_erg, one.completeness.probability
+            energies, p = one.completeness.energy_erg, one.completeness.probability
             first = max(int(np.argmax(p > 0)) - 1, 0)
-            part = slice(first, min(first + 161, energy.size))
-            rate = np.full(energy[part].size, np.nan) if one.rates is None else one.rates.per_day_above(energy[part])
-            columns = (
-                ("energy", energy[part], "bolometric", "erg"),
-                ("recovered", p[part], "share of flares of this energy that is recovered"),
-                ("rate_above", rate, "flares of this energy or more, a day", "1 / day"),
-            )
-            parts.append(({"target": one.name}, make_table(columns)))
-        if not parts:
-            return QTable({"target": np.array([], "U1"), "energy": np.array([]) * u.erg})
-        return stack_tables(parts, study=self.study.text())
+            part = slice(first, min(first + 161, energies.size))
+            rate = np.full(p[part].size, np.nan) if one.rates is None else one.rates.per_day_above(energies[part])
+            rows.append({"target": one.name, "energy": energies[part], "recovered": p[part], "rate_above": rate})
+        return table_of(ENERGY_COLUMNS, rows, study=self.study.text())
 
     @property
     def assumptions(self) -> Table:
         """Everything that is assumed, with where it is from."""
-        from astropy.table import Table
-
         law = self.study.plan.law()
         orbit = self.study.orbit.orbit()
         rows = list(self.seen.visibility.limits.assumptions)
@@ -207,7 +210,7 @@ class PlanAnswer(Answer):
         rows += [(f"flare rates of {one.name}", one.rates.source, _measured(one)) for one in self.planned if one.rates]
         rows += [("where the satellite will be", "", text) for text in orbit.messages(self.seen.times)]
         rows += [(f"completeness of {one.name}", "", one.completeness.how) for one in self.planned if one.completeness]
-        return Table(rows=rows, names=("assumption", "value", "source"))
+        return table_of(assumption_columns("assumption"), rows)
 
     @property
     def _along_orbit(self) -> list[tuple[str, str, str]]:
@@ -265,10 +268,6 @@ class PlanAnswer(Answer):
             )
         lines += self.seen.messages
         return list(dict.fromkeys(lines))
-
-
-#: Of E50 and E90.
-ENERGY = "bolometric energy from which on"
 
 
 def _measured(one: Planned) -> str:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, ClassVar
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +19,7 @@ from mauvecl.host.orbit.targets import Target
 from mauvecl.host.orbit.time_grid import DAY_S, TimeGrid
 from mauvecl.host.orbit.visibility import Visibility, Windows
 from mauvecl.schema.calls import public
-from mauvecl.schema.tables import make_table
-from mauvecl.study.labels import describe_columns, stack_tables
+from mauvecl.schema.tables import Column, View, percent, table_of
 from mauvecl.study.orbits import targets_of
 from mauvecl.study.study import Study
 
@@ -37,6 +37,50 @@ Float = NDArray[np.float64]
 MOST_WINDOWS = 100_000
 #: Hours of exposure in a day from which a day without single windows counts as one on which the target is seen.
 SEEN_H = 0.5
+
+
+#: Targets whose hours of each month are shown, at most.
+MOST_MONTHLY = 12
+TARGET_COLUMN = Column("target", description="name of the target", heading="target")
+#: Columns of the table of targets; one for each limit in force follows `share`.
+COLUMNS = (
+    TARGET_COLUMN,
+    Column("ra", "", "deg", "right ascension", "RA", ".3f"),
+    Column("dec", "", "deg", "declination", "dec", ".3f"),
+    Column("hours", "", "h", "exposure in the whole time, with the duty cycle", "hours", ".0f"),
+    Column("share", "", "", "of the time in which the target is seen", "share", percent(".1f")),
+    Column("windows", "", "", "stretches in which it is seen", "windows"),
+    Column("median_window", "", "min", "length of a stretch", "median", lambda minutes: f"{minutes:.0f} min"),
+    Column("longest_gap", "", "day", "longest time without one", "longest gap", lambda days: f"{days:.1f} d"),
+    Column("per_orbit", "", "min", "exposure in a mean orbit"),
+    Column("in_shadow", "", "", "share of the windows in the Earth's shadow"),
+    Column("best_month", "", "", "that with most exposure", "best month"),
+    Column("least_elongation", "", "deg", "least angle from the Sun", "least elongation",
+           lambda degrees: f"{degrees:.0f} deg"),
+    Column("most_elongation", "", "deg", "largest angle from the Sun"),
+    Column("brightest_sky", "", "mag / arcsec2", "zodiacal light at its brightest, V, where the table has it"),
+    Column("faintest_sky", "", "mag / arcsec2", "zodiacal light at its faintest, V"),
+)  # fmt: skip
+DAY_COLUMNS = (
+    TARGET_COLUMN,
+    Column("day", description="UTC"),
+    Column("hours", "", "h", "exposure"),
+    Column("elongation", "", "deg", "angle from the Sun at noon"),
+    Column("zodiacal_light", "", "mag / arcsec2", "V at noon; none where the table has none, near the Sun"),
+)
+WINDOW_COLUMNS = (
+    replace(TARGET_COLUMN, kind=str),
+    Column("start", description="UTC", kind=str),
+    Column("stop", description="UTC", kind=str),
+    Column("length", "", "min"),
+    Column("in_shadow", "", "min", "of it, in the Earth's shadow"),
+    Column("orbit", description="ascending nodes since the start of the plan", kind=int),
+)
+
+
+def assumption_columns(first: str) -> tuple[Column, ...]:
+    """Return the columns of a table of assumptions, for rows of what is assumed, its value and its source."""
+    return tuple(Column(name, itemgetter(k)) for k, name in enumerate((first, "value", "source")))
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,46 +133,62 @@ class VisibleAnswer(Answer):
         return tuple(self.visibility.windows(k) for k in range(len(self.targets)))
 
     @property
+    def columns(self) -> tuple[Column, ...]:
+        """Columns of the table of targets, for the number of each."""
+        limits = (
+            Column(f"leaves_{name}", itemgetter(f"leaves_{name}"), "",
+                   f"share of the time that the limit of {name} alone leaves")
+            for name in self.visibility.kept_by
+        )  # fmt: skip
+        place = [column.name for column in COLUMNS].index("share") + 1
+        return (*COLUMNS[:place], *limits, *COLUMNS[place:])
+
+    @property
     def table(self) -> QTable:
         """One row per target."""
-        seen, (names, hours) = self.visibility, self.visibility.by_month()
-        every = range(len(self.targets))
-        lengths = [one.length_s / 60 for one in self.windows]
-        dark = [float(w.in_shadow_s.sum() / w.length_s.sum()) if w.length_s.size else 0.0 for w in self.windows]
-        best = [names[int(np.argmax(hours[:, k]))] if hours[:, k].any() else "" for k in every]
-        away = [self.elongation_deg(k) for k in every]
-        light = [one[np.isfinite(one)] for one in self.zodiacal]
-        brightest, faintest = ([float(end(one)) if one.size else np.nan for one in light] for end in (np.min, np.max))
-        per_orbit = [float(np.mean(seen.by_orbit(k))) for k in every]
-        sky = "mag / arcsec2"
-        columns: list[tuple[object, ...]] = [
-            ("target", [one.name for one in self.targets]),
-            ("ra", [one.ra_deg for one in self.targets], "", "deg"),
-            ("dec", [one.dec_deg for one in self.targets], "", "deg"),
-            ("hours", seen.hours, "exposure in the whole time, with the duty cycle", "h"),
-            ("share", seen.share, "of the time in which the target is seen"),
-            *(
-                (f"leaves_{name}", kept, f"share of the time that the limit of {name} alone leaves")
-                for name, kept in seen.kept_by.items()
-            ),
-            ("windows", [one.size for one in lengths], "stretches in which it is seen"),
-            (
-                "median_window",
-                [float(np.median(one)) if one.size else 0.0 for one in lengths],
-                "length of a stretch",
-                "min",
-            ),
-            ("longest_gap", [self._longest_gap_d(k) for k in every], "longest time without one", "day"),
-            ("per_orbit", per_orbit, "exposure in a mean orbit", "min"),
-            ("in_shadow", dark, "share of the windows in the Earth's shadow"),
-            ("best_month", best, "that with most exposure"),
-            ("least_elongation", [float(one.min()) for one in away], "least angle from the Sun", "deg"),
-            ("most_elongation", [float(one.max()) for one in away], "largest angle from the Sun", "deg"),
-            ("brightest_sky", brightest, "zodiacal light at its brightest, V, where the table has it", sky),
-            ("faintest_sky", faintest, "zodiacal light at its faintest, V", sky),
-        ]
+        rows = [self._row(k) for k in range(len(self.targets))]
         about = {"start": self.times.iso(0.0), "days": self.times.days}
-        return describe_columns(make_table(columns, **about, study=self.study.text()))
+        return table_of(self.columns, rows, **about, study=self.study.text())
+
+    def _row(self, k: int) -> dict[str, Any]:
+        """Return the row of a target, by the names of columns."""
+        seen, windows, target = self.visibility, self.windows[k], self.targets[k]
+        names, by_month = seen.by_month()
+        hours, away = by_month[:, k], self.elongation_deg(k)
+        light = self.zodiacal[k][np.isfinite(self.zodiacal[k])]
+        length = windows.length_s
+        return {
+            "target": target.name,
+            "ra": target.ra_deg,
+            "dec": target.dec_deg,
+            "hours": seen.hours[k],
+            "share": seen.share[k],
+            **{f"leaves_{name}": kept[k] for name, kept in seen.kept_by.items()},
+            "windows": length.size,
+            "median_window": float(np.median(length / 60)) if length.size else 0.0,
+            "longest_gap": self._longest_gap_d(k),
+            "per_orbit": float(np.mean(seen.by_orbit(k))),
+            "in_shadow": float(windows.in_shadow_s.sum() / length.sum()) if length.size else 0.0,
+            "best_month": names[int(np.argmax(hours))] if hours.any() else "",
+            "least_elongation": float(away.min()),
+            "most_elongation": float(away.max()),
+            "brightest_sky": float(light.min()) if light.size else np.nan,
+            "faintest_sky": float(light.max()) if light.size else np.nan,
+        }
+
+    @property
+    def views(self) -> list[View]:
+        title = f"Seen in {self.times.days:g} days from {self.times.iso(0.0)} UTC"
+        views = [View(title, self.columns, self.table)]
+        if len(self.targets) <= MOST_MONTHLY:
+            names, hours = self.visibility.by_month()
+            columns = (TARGET_COLUMN, *(Column(name, heading=name, format=".0f") for name in map(str, names)))
+            rows = [
+                {"target": one.name} | {str(name): hours[m, k] for m, name in enumerate(names)}
+                for k, one in enumerate(self.targets)
+            ]
+            views.append(View("Hours of exposure by month", columns, table_of(columns, rows)))
+        return views
 
     def _longest_gap_d(self, k: int) -> float:
         """Days without a window."""
@@ -143,59 +203,47 @@ class VisibleAnswer(Answer):
     def months(self) -> QTable:
         """One row per month, one column of hours per target."""
         names, hours = self.visibility.by_month()
-        each = ((one.name, hours[:, k], "", "h") for k, one in enumerate(self.targets))
-        return make_table([("month", names), *each], study=self.study.text())
+        columns = [Column("month"), *(Column(one.name, unit="h") for one in self.targets)]
+        values = {"month": names} | {one.name: hours[:, k] for k, one in enumerate(self.targets)}
+        return table_of(columns, [values], study=self.study.text())
 
     @property
     def by_day(self) -> QTable:
         """One row per target and day."""
-        told = "V at noon; none where the table has none, near the Sun"
-        parts = (
-            (
-                {"target": one.name},
-                make_table(
-                    [
-                        ("day", self.days),
-                        ("hours", self.visibility.by_day(k), "", "h"),
-                        ("elongation", self.elongation_deg(k), "angle from the Sun at noon", "deg"),
-                        ("zodiacal_light", self.zodiacal[k], told, "mag / arcsec2"),
-                    ]
-                ),
-            )
+        rows = (
+            {
+                "target": one.name,
+                "day": self.days,
+                "hours": self.visibility.by_day(k),
+                "elongation": self.elongation_deg(k),
+                "zodiacal_light": self.zodiacal[k],
+            }
             for k, one in enumerate(self.targets)
         )
-        return stack_tables(parts, study=self.study.text())
+        return table_of(DAY_COLUMNS, rows, study=self.study.text())
 
     @property
     def window_table(self) -> QTable:
         """One row per window."""
         times, z = self.times, self.visibility.track.of_date_km[:, 2]
         nodes = times.seconds[1:][(z[:-1] < 0) & (z[1:] >= 0)]
-        nothing, orbits = np.array([], "U19"), "ascending nodes since the start of the plan"
-        parts = (
-            (
-                {"target": one.name},
-                make_table(
-                    [
-                        ("start", [times.iso(float(t)) for t in windows.start_s] or nothing),
-                        ("stop", [times.iso(float(t)) for t in windows.stop_s] or nothing),
-                        ("length", windows.length_s / 60, "", "min"),
-                        ("in_shadow", windows.in_shadow_s / 60, "of it, in the Earth's shadow", "min"),
-                        ("orbit", np.searchsorted(nodes, windows.start_s), orbits),
-                    ]
-                ),
-            )
+        rows = (
+            {
+                "target": one.name,
+                "start": np.array([times.iso(float(t)) for t in windows.start_s], str),
+                "stop": np.array([times.iso(float(t)) for t in windows.stop_s], str),
+                "length": windows.length_s / 60,
+                "in_shadow": windows.in_shadow_s / 60,
+                "orbit": np.searchsorted(nodes, windows.start_s),
+            }
             for one, windows in zip(self.targets, self.windows, strict=True)
         )
-        return stack_tables(parts, study=self.study.text(), step_s=times.step_s)
+        return table_of(WINDOW_COLUMNS, rows, study=self.study.text(), step_s=times.step_s)
 
     @property
     def assumptions(self) -> Table:
         """Each limit in force, with its value and where its default is from."""
-        from astropy.table import Table
-
-        rows = self.visibility.limits.assumptions
-        return Table(rows=rows, names=("limit", "value", "source"))
+        return table_of(assumption_columns("limit"), self.visibility.limits.assumptions)
 
     @property
     def tables(self) -> dict[str, Table]:
@@ -259,9 +307,6 @@ class VisibleAnswer(Answer):
         k = [one.name for one in self.targets].index(name)
         alone = [limit for limit, kept in self.visibility.kept_by.items() if kept[k] == 0]
         return f"the limit of {alone[0]} alone leaves nothing" if alone else "its limits together leave nothing"
-
-
-#: Columns of the table of targets.
 
 
 @public

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from operator import attrgetter
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import astropy.units as u
 import numpy as np
 import scipy
 from astropy.table import QTable
@@ -16,16 +17,17 @@ from numpy.typing import NDArray
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.measurements.along import MeasuredStare, measured_stare
 from mauvecl.answers.measurements.expected import ExpectedMeasurement, expected_measurements, matched_filter
+from mauvecl.lightcurve.stares.measured import MeasuredBins
 from mauvecl.results.measurements.fit import LEVELS, Measurement, fit
 from mauvecl.results.measurements.reduction import variance_of
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.tables import Column, View, make_table
-from mauvecl.statistics.intervals import clopper_pearson
+from mauvecl.schema.tables import Column, View, percent, records, stacked, table_of
+from mauvecl.statistics.intervals import Interval, clopper_pearson
 from mauvecl.study.cases import Case, cases
-from mauvecl.study.labels import stack_tables
+from mauvecl.study.labels import amplitude_column, place_columns
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.stare_section import check_sweep
 from mauvecl.study.study import Study
@@ -42,17 +44,6 @@ Float = NDArray[np.float64]
 
 #: Exposures drawn and fitted at once, which bounds the memory.
 BATCH = 4096
-#: What the terminal shows of measurements along a stare.
-BIN_COLUMNS = (
-    Column("start", heading="from (s)", format="g"),
-    Column("end", heading="to (s)", format="g"),
-    Column("snr", heading="S/N", format=".1f"),
-    Column("temperature", heading="temperature (K)", format=".0f"),
-    Column("temperature_error", heading="error", format=".0f"),
-    Column("temperature_without_noise", heading="without noise", format=".0f"),
-    Column("flux_bolometric", heading="bolometric flux (erg/s/cm2)", format=".3g"),
-    Column("p_value", heading="p-value", format=".2g"),
-)
 #: S/N below which the coverage of intervals differs from their nominal one, by bench/coverage.py.
 WILKS_SNR = 10.0
 #: A good fit is rejected where one of its p-value is less probable.
@@ -79,60 +70,89 @@ class MeasuredFlare(ExpectedMeasurement):
         return mean, np.linalg.solve(information, weighted @ (self.frame - mean)) @ self.unknown.spectra
 
     def rows(self) -> QTable:
-        """One row per quantity."""
+        """Return one row per quantity."""
         found, truth, chosen = self.found, self.truth, self.selected
-        columns: list[tuple[Any, ...]] = [
-            ("quantity", list(found.names), "what is measured"),
-            ("unit", list(found.units), "of truth, estimates and errors"),
-            ("truth", truth, "true value; undefined where the flare has none"),
-            ("error_known", self.known.errors, "standard error in advance, everything known"),
-            ("error", self.ahead.errors, "standard error in advance, unknowns marginalised over"),
-            ("perfect", self.perfect.estimates[0], "estimate from an exposure without noise"),
-            ("median", np.median(found.estimates, axis=0), "median of the estimates"),
-            ("bias", np.median(found.estimates, axis=0) - truth, "median of the estimates less the truth"),
-            ("scatter", _scatter(found.estimates), "half of the central 68.27 % of the estimates"),
-        ]
-        for name, which in (("", np.ones(chosen.size, np.bool_)), ("_selected", chosen)):
-            whose = "of detected flares" if name else "of all"
+        values = {
+            "quantity": list(found.names),
+            "unit": list(found.units),
+            "truth": truth,
+            "error_known": self.known.errors,
+            "error": self.ahead.errors,
+            "perfect": self.perfect.estimates[0],
+            "median": np.median(found.estimates, axis=0),
+            "bias": np.median(found.estimates, axis=0) - truth,
+            "scatter": _scatter(found.estimates),
+            "one_sided": found.one_sided[-1].mean(axis=0),
+        }
+        middle = np.median(found.estimates[chosen], axis=0) if chosen.any() else np.full(truth.size, np.nan)
+        values["bias_selected"] = middle - truth
+        for which, suffix in ((np.ones(chosen.size, np.bool_), ""), (chosen, "_selected")):
             for k, level in enumerate(found.levels):
-                cover = _coverage(found, truth, k, which)
-                percent = f"{100 * level:.0f}"
-                text = f"share of {percent} % intervals that hold the truth, {whose}"
-                columns.append((f"coverage_{percent}{name}", cover[0], text))
-                columns.append((f"coverage_{percent}{name}_low", cover[1], f"{text}: 95 % interval, lower end"))
-                columns.append((f"coverage_{percent}{name}_high", cover[2], f"{text}: 95 % interval, upper end"))
-            if name:
-                middle = np.median(found.estimates[which], axis=0) if which.any() else np.full(truth.size, np.nan)
-                columns.append(
-                    ("bias_selected", middle - truth, "median of the estimates of detected flares less the truth")
+                name = f"coverage_{100 * level:.0f}{suffix}"
+                values |= dict(
+                    zip((name, f"{name}_low", f"{name}_high"), _coverage(found, truth, k, which), strict=True)
                 )
-        columns.append(("one_sided", found.one_sided[-1].mean(axis=0), "share of 95 % intervals with one end"))
-        return make_table(columns)
+        return table_of(COLUMNS, [values])
 
-    def quality(self) -> QTable:
-        """One row: goodness of fit and detection."""
-        found = self.found
-        rejected = clopper_pearson(int((found.p_value < REJECTED).sum()), found.p_value.size)
-        detected = clopper_pearson(int(self.selected.sum()), self.selected.size)
-        return make_table(
-            [
-                ("snr", [self.snr[0]], "S/N of the flare in one exposure, everything known"),
-                ("snr_marginal", [self.snr[1]], "the same, unknowns marginalised over"),
-                ("dof", [found.dof], "degrees of freedom of chi-squared"),
-                ("chi2", [float(np.mean(found.chi2))], "mean chi-squared of the fits"),
-                (
-                    "chi2_perfect",
-                    [float(self.perfect.chi2[0])],
-                    "what the model cannot fit of an exposure without noise",
-                ),
-                ("rejected", [rejected.value], f"share of fits with a p-value below {REJECTED:g}"),
-                ("rejected_low", [rejected.low], "95 % interval, lower end"),
-                ("rejected_high", [rejected.high], "95 % interval, upper end"),
-                ("detected", [detected.value], "share that a matched filter for the true flare detects"),
-                ("detected_low", [detected.low], "95 % interval, lower end"),
-                ("detected_high", [detected.high], "95 % interval, upper end"),
-            ]
-        )
+    @cached_property
+    def rejected(self) -> Interval:
+        """Share of fits that are rejected, with its 95 % interval."""
+        return clopper_pearson(int((self.found.p_value < REJECTED).sum()), self.found.p_value.size)
+
+    @cached_property
+    def detected(self) -> Interval:
+        """Share of exposures in which the flare is detected, with its 95 % interval."""
+        return clopper_pearson(int(self.selected.sum()), self.selected.size)
+
+
+def _coverage_columns(level: float, suffix: str, whose: str, heading: str = "") -> list[Column]:
+    """Return the columns of the coverage of intervals of a level."""
+    name, text = f"coverage_{100 * level:.0f}{suffix}", f"share of {100 * level:.0f} % intervals that hold the truth, "
+    return [
+        Column(name, "", "", f"{text}{whose}", heading, percent(".1f")),
+        Column(f"{name}_low", "", "", f"{text}{whose}: 95 % interval, lower end"),
+        Column(f"{name}_high", "", "", f"{text}{whose}: 95 % interval, upper end"),
+    ]
+
+
+#: Columns of the table of measured quantities.
+COLUMNS = (
+    Column("quantity", "", "", "what is measured", "quantity"),
+    Column("unit", "", "", "of truth, estimates and errors", "unit"),
+    Column("truth", "", "", "true value; undefined where the flare has none", "truth", ".4g"),
+    Column("error_known", "", "", "standard error in advance, everything known", "error, all known", ".4g"),
+    Column("error", "", "", "standard error in advance, unknowns marginalised over", "error", ".4g"),
+    Column("perfect", "", "", "estimate from an exposure without noise", "fit without noise", ".4g"),
+    Column("median", "", "", "median of the estimates"),
+    Column("bias", "", "", "median of the estimates less the truth", "bias", ".4g"),
+    Column("scatter", "", "", "half of the central 68.27 % of the estimates", "scatter", ".4g"),
+    *_coverage_columns(LEVELS[0], "", "of all"),
+    *_coverage_columns(LEVELS[1], "", "of all", "95 % covers"),
+    *_coverage_columns(LEVELS[0], "_selected", "of detected flares"),
+    *_coverage_columns(LEVELS[1], "_selected", "of detected flares", "if detected"),
+    Column("bias_selected", "", "", "median of the estimates of detected flares less the truth"),
+    Column("one_sided", "", "", "share of 95 % intervals with one end", "one-sided", percent(".0f")),
+)
+#: Columns of the table of fits.
+FIT_COLUMNS = (
+    Column("snr", lambda one: one.snr[0], "", "S/N of the flare in one exposure, everything known", "S/N, all known",
+           ".2f"),
+    Column("snr_marginal", lambda one: one.snr[1], "", "the same, unknowns marginalised over", "S/N", ".2f"),
+    Column("dof", "found.dof", "", "degrees of freedom of chi-squared"),
+    Column("chi2", lambda one: float(np.mean(one.found.chi2)), "", "mean chi-squared of the fits", "chi-squared / dof",
+           lambda chi2, dof: f"{chi2:.1f} / {dof}", ("dof",)),
+    Column("chi2_perfect", lambda one: float(one.perfect.chi2[0]), "",
+           "what the model cannot fit of an exposure without noise"),
+    Column("rejected", "rejected.value", "", f"share of fits with a p-value below {REJECTED:g}", "p < 0.01",
+           percent(".1f")),
+    Column("rejected_low", "rejected.low", "", "95 % interval, lower end"),
+    Column("rejected_high", "rejected.high", "", "95 % interval, upper end"),
+    Column("detected", "detected.value", "", "share that a matched filter for the true flare detects", "detected",
+           percent(".1f")),
+    Column("detected_low", "detected.low", "", "95 % interval, lower end"),
+    Column("detected_high", "detected.high", "", "95 % interval, upper end"),
+)  # fmt: skip
+MODEL_COLUMN = Column("model", description="model that is fitted", heading="model")
 
 
 @dataclass(eq=False)
@@ -150,6 +170,7 @@ class MeasureAnswer(Answer):
     """
 
     USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
+    JSON = MappingProxyType({"rows": "table", "fits": "fits"})
 
     study: Study
     flares: list[MeasuredFlare]
@@ -159,12 +180,16 @@ class MeasureAnswer(Answer):
     @cached_property
     def table(self) -> QTable:
         """Errors, bias and coverage; one row per star, cell, flare, model and quantity."""
-        return self._together(MeasuredFlare.rows)
+        return stacked(self._first, ((one, one.rows()) for one in self.flares), study=self.study.text())
 
     @cached_property
     def fits(self) -> QTable:
         """Goodness of fit and detection; one row per star, cell, flare and model."""
-        return self._together(MeasuredFlare.quality)
+        return table_of((*self._first, *FIT_COLUMNS), self.flares, study=self.study.text())
+
+    @property
+    def _first(self) -> tuple[Column, ...]:
+        return (*place_columns(self.study, "amplitude"), amplitude_column(), MODEL_COLUMN)
 
     @property
     def tables(self) -> dict[str, Table]:
@@ -175,41 +200,42 @@ class MeasureAnswer(Answer):
     @cached_property
     def temperatures(self) -> QTable:
         """Measurements against time; one row per star, cell and bin of its stare."""
-        every = [(one, one.drawn.table()) for one in self.stares if not isinstance(one.drawn, str)]
-        for one, table in every:
-            assert one.perfect is not None
-            exact = one.perfect.found.estimates[:, 0]
-            table.add_column(exact * u.K, table.colnames.index("temperature") + 1, "temperature_without_noise")
-            table["temperature_without_noise"].info.description = "temperature fitted to the means of these frames"
-        parts = [({"star": one.label, **one.at, "model": one.model}, table) for one, table in every]
-        return stack_tables(parts, study=self.study.text()) if parts else QTable()
+        first = (*place_columns(self.study), MODEL_COLUMN)
+        parts = [
+            (one, table_of(_bin_columns(one.drawn), [one]))
+            for one in self.stares
+            if isinstance(one.drawn, MeasuredBins)
+        ]
+        return stacked(first, parts, study=self.study.text()) if parts else QTable()
 
     @property
     def views(self) -> list[View]:
-        if not self.stares:
-            return []
-        swept = [axis.quantity for axis in self.study.sweep.axes]
-        first = [Column(name, heading=name) for name in ("star", *swept)]
-        asked = f"S/N {self.study.measure.snr_per_bin:g}"
-        return [View(f"Measured along the stare, in bins of {asked}", [*first, *BIN_COLUMNS], self.temperatures)]
+        measured = self.table[self.table["unit"] != "erg / s"]
+        title = f"Measured in one exposure; {self.study.measure.fits} simulated fits of each flare"
+        views = [View(title, (*self._first, *COLUMNS), measured)]
+        drawn = [one.drawn for one in self.stares if isinstance(one.drawn, MeasuredBins)]
+        if drawn:
+            columns = (*place_columns(self.study), *_bin_columns(drawn[0]))
+            title = f"Measured along the stare, in bins of S/N {self.study.measure.snr_per_bin:g}"
+            views.append(View(title, columns, self.temperatures))
+        return [*views, View("Goodness of fit", (*self._first, *FIT_COLUMNS), self.fits)]
 
     @property
     def inputs(self) -> list[Expectation]:
         return list({id(one.quiet): one.quiet for one in self.flares}.values())
 
     def as_json(self) -> dict[str, Any]:
-        from mauvecl.answers.report import rows
+        along = {"temperatures": records(self.temperatures)} if self.stares else {}
+        return super().as_json() | along
 
-        along = {"temperatures": rows(self.temperatures)} if self.stares else {}
-        return {"messages": self.messages, "rows": rows(self.table), "fits": rows(self.fits)} | along
 
-    def _together(self, table_of: Callable[[MeasuredFlare], QTable]) -> QTable:
-        parts = []
-        for one in self.flares:
-            swept = {name: value for name, value in one.at.items() if name != "amplitude"}
-            first: dict[str, Any] = {"star": one.label, **swept, "amplitude": one.amplitude, "model": one.model}
-            parts.append((first, table_of(one)))
-        return stack_tables(parts, study=self.study.text())
+def _bin_columns(bins: MeasuredBins) -> list[Column]:
+    """Return the columns of measurements along a stare, for a `MeasuredStare`."""
+    columns = [column.of(attrgetter("drawn")) for column in bins.columns]
+    exact = Column("temperature_without_noise", lambda one: one.perfect.found.estimates[:, 0], "K",
+                   "temperature fitted to the means of these frames", "without noise", ".0f")  # fmt: skip
+    place = [column.name for column in columns].index("temperature") + 1
+    return [*columns[:place], exact, *columns[place:]]
 
 
 @public

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
-    from mauvecl.answers.campaigns.plan import PlanAnswer
-    from mauvecl.answers.campaigns.visible import VisibleAnswer
     from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
 
@@ -28,31 +26,7 @@ def visible(study: Study, session: Session) -> None:
 
     Example: mauvecl visible --look-at "eps Eri" --look-at "AU Mic" --start 2027-01-01 --days 365
     """
-    answer = session.ask(study)
-    session.answer(answer, lambda: _show_visible(answer))
-
-
-def _show_visible(answer: VisibleAnswer) -> None:
-    from mauvecl.cli.console import show_table
-
-    table = answer.table
-    show_table(
-        f"Seen in {answer.times.days:g} days from {answer.times.iso(0.0)} UTC",
-        ("target", "RA", "dec", "hours", "share", "windows", "median", "longest gap", "least elongation", "best month"),
-        [
-            (str(row["target"]), f"{row['ra'].value:.3f}", f"{row['dec'].value:.3f}", f"{row['hours'].value:.0f}",
-             f"{100 * row['share']:.1f} %", str(row["windows"]), f"{row['median_window'].value:.0f} min",
-             f"{row['longest_gap'].value:.1f} d", f"{row['least_elongation'].value:.0f} deg", str(row["best_month"]))
-            for row in table
-        ],
-    )  # fmt: skip
-    months = answer.months
-    if len(answer.targets) <= 12:
-        show_table(
-            "Hours of exposure by month",
-            ("target", *(str(name) for name in months["month"])),
-            [(one.name, *(f"{value.value:.0f}" for value in months[one.name])) for one in answer.targets],
-        )
+    session.answer(session.ask(study))
 
 
 @takes_study(
@@ -84,11 +58,4 @@ def plan(study: Study, session: Session) -> None:
             answer = compute(study, progress=meter)
     else:
         answer = session.ask(study)
-    session.answer(answer, lambda: _show_plan(answer))
-
-
-def _show_plan(answer: PlanAnswer) -> None:
-    from mauvecl.answers.campaigns.plan_text import SUMMARY, heading, summary_rows
-    from mauvecl.cli.console import show_table
-
-    show_table(heading(answer), SUMMARY, summary_rows(answer))
+    session.answer(answer)

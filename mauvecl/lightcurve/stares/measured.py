@@ -13,9 +13,10 @@ from mauvecl.results.measurements.fit import LEVELS, Measurement, fit
 from mauvecl.results.measurements.reduction import Reduction
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import Column, table_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from astropy.table import QTable
 
@@ -31,6 +32,13 @@ MOST_FRAMES_PER_BIN = 4096
 EVERY = 8
 #: Bins whose known conditions agree to this many digits are fitted together.
 DIGITS = 6
+
+
+#: Heading, format and heading of the error of the quantities that people read.
+SHOWN = {
+    "temperature": ("temperature (K)", ".0f", "error"),
+    "flux_bolometric": ("bolometric flux (erg/s/cm2)", ".3g", ""),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,34 +62,45 @@ class MeasuredBins:
 
     def table(self) -> QTable:
         """Return times, estimates, errors and intervals, one row per bin."""
+        return table_of(self.columns, [self])
+
+    @property
+    def columns(self) -> list[Column]:
+        """Columns of the table; those of the quantities depend on the model."""
+        found = self.found
+        return [
+            Column("start", "start_s", "s", "start of the bin, from the start of the stare", "from (s)", "g"),
+            Column("end", "end_s", "s", "end of the bin", "to (s)", "g"),
+            Column("frames", "count", "", "frames of the bin"),
+            Column("snr", "found.snr", "", "S/N of the flare in the bin", "S/N", ".1f"),
+            *(column for q in range(len(found.names)) for column in self._quantity(q)),
+            Column("chi2", "found.chi2", "", f"chi-squared of the fit, of {found.dof} degrees of freedom"),
+            Column("p_value", "found.p_value", "",
+                   "probability of a chi-squared at least as large where the model is right", "p-value", ".2g"),
+        ]  # fmt: skip
+
+    def _quantity(self, q: int) -> list[Column]:
+        """Return the columns of a quantity's estimates, errors and intervals."""
         from astropy import units
 
-        from mauvecl.schema.tables import make_table
-
-        found = self.found
-        columns: list[tuple[object, ...]] = [
-            ("start", self.start_s, "start of the bin, from the start of the stare", "s"),
-            ("end", self.end_s, "end of the bin", "s"),
-            ("frames", self.count, "frames of the bin"),
-            ("snr", found.snr, "S/N of the flare in the bin"),
+        found, name = self.found, self.found.names[q]
+        column, unit = name.replace(" ", "_"), str(units.Unit(found.units[q]))
+        heading, spec, error = SHOWN.get(column, ("", "", ""))
+        columns = [
+            Column(column, lambda bins: bins.found.estimates[:, q], unit, f"{name} of the flare", heading, spec),
+            Column(f"{column}_error", lambda bins: bins.found.errors[:, q], unit, "its standard error", error, spec),
         ]
-        for q, (name, unit) in enumerate(zip(found.names, found.units, strict=True)):
-            column, unit = name.replace(" ", "_"), str(units.Unit(unit))
+        for k, level in enumerate(found.levels):
+            text = f"end of its {100 * level:.4g} % interval; infinite where there is none"
             columns += [
-                (column, found.estimates[:, q], f"{name} of the flare", unit),
-                (f"{column}_error", found.errors[:, q], "its standard error", unit),
+                Column(f"{column}_low_{100 * level:.0f}", self._end("low", k, q), unit, f"lower {text}"),
+                Column(f"{column}_high_{100 * level:.0f}", self._end("high", k, q), unit, f"higher {text}"),
             ]
-            for level, *ends in zip(found.levels, found.low, found.high, strict=True):
-                columns += [
-                    (f"{column}_{side}_{100 * level:.0f}", values[:, q],
-                     f"{side}er end of its {100 * level:.4g} % interval; infinite where there is none", unit)
-                    for side, values in zip(("low", "high"), ends, strict=True)
-                ]  # fmt: skip
-        columns += [
-            ("chi2", found.chi2, f"chi-squared of the fit, of {found.dof} degrees of freedom"),
-            ("p_value", found.p_value, "probability of a chi-squared at least as large where the model is right"),
-        ]
-        return make_table(columns)
+        return columns
+
+    @staticmethod
+    def _end(side: str, level: int, q: int) -> Callable[[MeasuredBins], Float]:
+        return lambda bins: np.asarray(getattr(bins.found, side)[level][:, q])
 
 
 @public

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.web.closed_forms import percent, short
+from mauvecl.web.closed_forms import short
 from mauvecl.web.figures import Canvas
 from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
@@ -94,26 +94,12 @@ class Plan(Tab):
     )
     pictures = (Recovered(), Expected())
     simulations = {"plan": "Plan"}  # noqa: RUF012
+    shows = "plan"
     files = dict.fromkeys(("plan", "stars", "energies", "assumptions"), "plan")
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         tables: dict[str, Table] = answers["plan"].tables
         return tables[name]
-
-    def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
-        if "plan" not in answers:
-            return []
-        (row,) = answers["plan"].table
-        flares = "no rates known"
-        if np.isfinite(row["expected"]):
-            flares = f"{row['expected']:.3g}; 95 % of campaigns: {row['low']} to {row['high']}"
-        told = {
-            "target": str(row["target"]), "hours": short(row["hours"].value), "half recovered at": _energy(row["E50"]),
-            "90 % recovered at": _energy(row["E90"]), "flares expected": flares,
-            "at least one": percent(row["at_least_one"]), "false alarms": f"{row['false_alarms']:.2g}",
-            "best months": str(row["best_months"]),
-        }  # fmt: skip
-        return [[*told], [*told.values()]]
 
     def study(self, name: str, closed: ClosedForms, answers: Answers) -> Study:
         study: Study = answers["plan"].study

@@ -63,14 +63,8 @@ class Visibility(Tab):
     )
     pictures = (Hours(),)
     simulations = {"visible": "Find when"}  # noqa: RUF012
+    shows, view = "visible", 1
     files = {"visible": "visible", "months": "visible", "days": "visible"}  # noqa: RUF012
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         return answers["seen"][{"visible": "table", "months": "months", "days": "by_day"}[name]]
-
-    def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
-        if "visible" not in answers:
-            return []
-        table = answers["seen"]["months"]
-        (target,) = (name for name in table.colnames if name != "month")
-        return [["month", *map(str, table["month"])], ["hours", *(f"{h:.0f}" for h in table[target].to_value("h"))]]
