@@ -20,9 +20,9 @@ typedef struct {
 % if photons:
     uintv photon[${chunk}];
 % endif
-% if cosmic:
-    floatv cosmic[${chunk}];
-% endif
+% for name in additive:
+    floatv ${name}[${chunk}];
+% endfor
 } Draws;
 
 <% skies = any(factor == "sky" for _, factor in modulations) %>\
@@ -66,11 +66,11 @@ INLINE void draw(SCENE_GIVEN, const Address *at, uint exposure, uint start, Draw
 % if photons:
     draw_words(at, exposure + ${streams["photon"]}u, group, out->photon);
 % endif
-% if cosmic:
-    draw_words(at, exposure + ${streams["cosmic"]}u, group, w);
+% for name in additive:
+    draw_words(at, exposure + ${streams[name]}u, group, w);
     for (uint i = 0; i < CHUNK; i++)
-        out->cosmic[i] = TO_FLOAT(AS_INT(alias_draw(w[i], tables + job->cosmic_table, job->cosmic_bits)) + (intv)job->cosmic_low);
-% endif
+        out->${name}[i] = TO_FLOAT(AS_INT(alias_draw(w[i], tables + job->${name}_table, job->${name}_bits)) + (intv)job->${name}_low);
+% endfor
 }
 
 /* Factors of a realisation, minus one, common to all its frames and pixels. */
@@ -161,9 +161,9 @@ INLINE floatv analogue(SCENE_GIVEN, const Draws *drawn, uint i, __global const L
     poisson_pair(drawn->photon[i & ~1u], drawn->photon[i | 1u], photon_counts + (at & ~1u), photon_counts + (at | 1u), tables, both);
     v = FMA(both[i & 1u], (floatv)photon_counts[at].gain, v);
 % endif
-% if cosmic:
-    v = FMA(drawn->cosmic[i], (floatv)pixels[pixel].cosmic_gain, v);
-% endif
+% for name in additive:
+    v = FMA(drawn->${name}[i], (floatv)pixels[pixel].electron_gain, v);
+% endfor
     return v;
 }
 

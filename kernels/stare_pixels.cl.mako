@@ -75,9 +75,9 @@ void stare_pixels(SCENE, STARE, const uint first_low, const uint first_high, con
                 floatv v = FMA(z, straight, FMA(skew, FMA(zz, (floatv)0.16666667f, (floatv)-0.16666667f), (floatv)m->rest));
                 v = FMA(even * each, each, v);
                 v += FMA(strengths.dark, (floatv)m->dark, light);
-% if cosmic:
-                v = FMA(drawn.cosmic[i], (floatv)pixels[start + i].cosmic_gain, v);
-% endif
+% for name in additive:
+                v = FMA(drawn.${name}[i], (floatv)pixels[start + i].electron_gain, v);
+% endfor
                 x[i] = digitise(v, edges + start + i) - MAGIC;
             }
 % for s in range(sums):

@@ -1,7 +1,7 @@
 ## Fast kernel for the most frequent statistics: chi2, chi2_element and linear ones of every scenario against its
 ## reference, from one pass over common draws. `comparison.cl.mako` computes the others.
 <%
-    plain = joint and not (modulations or frames or photons or cosmic)
+    plain = joint and not (modulations or frames or photons or additive)
     powers = (["c4"] if quartic else []) + ["c3", "c2", "c1", "c0"]
 
     def each(text):

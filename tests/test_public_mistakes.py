@@ -184,7 +184,8 @@ def test_a_wrong_argument_is_one_sentence(path: str, tmp_path: Path, monkeypatch
 
 def records(record: type[Record] = Record) -> Iterator[type[Record]]:
     for one in record.__subclasses__():
-        yield one
+        if not inspect.isabstract(one):
+            yield one
         yield from records(one)
 
 

@@ -195,7 +195,13 @@ CASES: dict[str, Case] = {
     "simulate.realisation": Case(lambda v: mauvecl.simulate(few(), realisation=v), "count", 0, 10**6, (-1, 0.5)),
     "Comparison.exposures": Case(lambda v: mauvecl.Comparison(v), "count", 0, 1000, (-1, 1.5, 10**9)),
     "CosmicRays.rate_per_cm2_s": Case(
-        lambda v: mauvecl.CosmicRays(v).rate_per_cm2_s, "1 / (cm2 s)", 0.1, 100, (-1, 1e9)
+        lambda v: mauvecl.CosmicRays(rate_per_cm2_s=v).rate_per_cm2_s, "1 / (cm2 s)", 0.1, 100, (-1, 1e9)
+    ),
+    "CosmicRays.with_particles.rate_per_cm2_s": Case(
+        lambda v: mauvecl.CosmicRays().with_particles(v).rate_per_cm2_s, "1 / (cm2 s)", 0.1, 100, (-1, 1e9)
+    ),
+    "Processes.with_particles.rate_per_cm2_s": Case(
+        lambda v: mauvecl.Processes().with_particles(v).particles_per_cm2_s, "1 / (cm2 s)", 0.1, 100, (-1, 1e9)
     ),
     "CosmicRays.pixels": Case(lambda v: mauvecl.CosmicRays(pixels=v), "count", 1, 5000, (0, 1.5)),
     "CosmicRays.charge.seconds": Case(lambda v: mauvecl.CosmicRays().charge(v), "s", 1, 500, (-1,)),

@@ -69,7 +69,7 @@ class Variant:
     joint: bool = True
     quartic: bool = True
     photons: bool = False
-    cosmic: bool = False
+    additive: tuple[str, ...] = ()
     modulations: tuple[tuple[str, str], ...] = ()
     row_type: str = "int"
     sums: int = 0

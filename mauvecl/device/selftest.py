@@ -106,17 +106,27 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "apart": ({}, {"recipe": "apart"}),
     "apart, tables": ({"frames": 2, "dark": 30.0, "read": 0.4, "photon_noise": "poisson"}, {"mode": "frames"}),
     "apart, pairs of two ways": ({"frames": 1, "read": 1.0, "light": 1000.0, "photon_noise": "poisson"}, {}),
-    "cosmic rays": ({}, {"processes": Processes(_RAYS)}),
+    "cosmic rays": ({}, {"processes": Processes(cosmic_rays=_RAYS)}),
     "noisy references": ({"frames": 4}, {"comparison": Comparison(3)}),
     "estimated variances": ({"frames": 2}, {"mode": "frames", "comparison": Comparison(1, estimated=True)}),
     "priors": (
         {"frames": 5},
-        {"processes": Processes(_RAYS, Uniform(0.0, 0.05), Uniform(13.0, 21.0), Uniform(0.24, 0.44))},
+        {
+            "processes": Processes(
+                cosmic_rays=_RAYS,
+                jitter=Uniform(0.0, 0.05),
+                detector_temperature=Uniform(13.0, 21.0),
+                light_loss=Uniform(0.24, 0.44),
+            )
+        },
     ),
     "priors, fourth power": ({"frames": 1, "dark": 288.0}, {"processes": Processes(jitter=Uniform(0.0, 0.05))}),
     "priors, frames": (
         {"frames": 5, "photon_noise": "poisson"},
-        {"mode": "frames", "processes": Processes(None, Uniform(0.0, 0.05), Uniform(13.0, 21.0))},
+        {
+            "mode": "frames",
+            "processes": Processes(jitter=Uniform(0.0, 0.05), detector_temperature=Uniform(13.0, 21.0)),
+        },
     ),
     "marginalised, the sky unknown": (
         {"frames": 5},

@@ -18,7 +18,7 @@ from mauvecl.lightcurve.stares.components import Components
 from mauvecl.lightcurve.stares.requests import Arrays, StaresRequest
 from mauvecl.lightcurve.stares.scene import Flares, StareScene
 from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.noise.processes import CosmicRays
+from mauvecl.noise.processes import NONE, CosmicRays, Processes
 
 #: Small stares that run every branch: options of `toy`, unknowns of the stare, number of sums.
 CASES: dict[str, tuple[dict[str, Any], dict[str, Any], int]] = {
@@ -41,10 +41,10 @@ def stares(engine: Engine) -> Iterator[Check]:
         given = np.linspace(0.0, 2.0, COUNT * stare.n_frames).reshape(COUNT, stare.n_frames, 1)
         flares, frames = Flares.of(components, stare, given, None, COUNT), range(stare.n_frames)
         for method, slow in (("pixels", twin.pixels), ("cumulants", twin.sums)):
-            rays = CosmicRays(rate_per_cm2_s=300.0) if method == "pixels" else None
-            how: dict[str, Any] = {"seed": SEED, "method": method, "cosmic_rays": rays}
+            processes = Processes(cosmic_rays=CosmicRays(rate_per_cm2_s=300.0)) if method == "pixels" else NONE
+            how: dict[str, Any] = {"seed": SEED, "method": method, "processes": processes}
             ours = Stares(engine.open_device).frames(components, stare, given, first=START, count=COUNT, **how)
-            theirs = slow(StareScene.of(components, stare, rays), flares, index, frames, SEED)[0]
+            theirs = slow(StareScene.of(components, stare, processes), flares, index, frames, SEED)[0]
             apart = float(np.max(np.abs(ours - theirs).max(axis=(0, 1)) / theirs.std(axis=(0, 1))))
             if engine.device.promise == SAME_BITS:
                 passed, text = bool((ours == theirs).all()), f"{ours.size} sums, {apart:.2g} sigma apart"

@@ -35,7 +35,7 @@ class StareLaunches(Launches):
         variant = replace(
             device.variant,
             clip=scene.clip,
-            cosmic=scene.cosmic,
+            additive=scene.additive,
             sums=stare.components.n_statistics,
             spectra=stare.components.n_flares,
             unknown_groups=-(-len(stare.kinds) // 4),

@@ -16,7 +16,7 @@ from mauvecl.lightcurve.stares.requests import Arrays, Kept, Method, StaresReque
 from mauvecl.lightcurve.stares.scene import Flares, StareScene, padded_frames
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.stares.sums import check_sums
-from mauvecl.noise.processes import CosmicRays
+from mauvecl.noise.processes import NONE, Processes
 from mauvecl.results.requests.requests import Shard
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
@@ -91,7 +91,7 @@ class Stares:
         seed: int,
         method: Method = "pixels",
         amplitudes: NDArray[Any] | None = None,
-        cosmic_rays: CosmicRays | None = None,
+        processes: Processes = NONE,
     ) -> Floats:
         """Draw the statistics of each frame of stares `first` to `first + count - 1`.
 
@@ -109,8 +109,8 @@ class Stares:
             Draw every pixel, or the sums directly from their cumulants. The conditions of frames are equal for both.
         amplitudes : ndarray, shape (n_scenario, count) or (n_scenario, 1), optional
             Factors on `flare`, for several scenarios on common draws.
-        cosmic_rays : CosmicRays, optional
-            Cosmic rays, supported by the method "pixels" only.
+        processes : Processes
+            Additive processes, supported by the method "pixels" only; the priors of a stare are its `unknowns`.
 
         Returns
         -------
@@ -122,7 +122,7 @@ class Stares:
         flares = Flares.of(components, stare, flare, amplitudes, count)
         shape = (len(flares.amplitudes), count, components.n_statistics, padded_frames(stare.n_frames))
         out = np.empty(shape, np.float32)
-        with self._launches(components, stare, flares, seed, method, cosmic_rays) as launches:
+        with self._launches(components, stare, flares, seed, method, processes) as launches:
 
             def work(tile: Tile, done: int) -> None:
                 launches.upload_flares(flares.part(done, tile.wanted))
@@ -148,7 +148,7 @@ class Stares:
         there = shard or Shard(0, request.start, request.realisations)
         _check(there.start, there.count, request.seed, request.method)
         components, stare, reduction = request.components, request.stare, request.reduction or Kept()
-        how = (request.seed, request.method, request.cosmic_rays)
+        how = (request.seed, request.method, request.processes)
         scenarios = slice(None) if request.amplitudes is not None else 0
         parts = list[Arrays]()
         shape = (components.n_statistics, padded_frames(stare.n_frames))
@@ -187,10 +187,10 @@ class Stares:
         flares: Flares,
         seed: int,
         method: Method,
-        cosmic_rays: CosmicRays | None,
+        processes: Processes,
     ) -> StareLaunches:
         self.open_device.check_process()
-        scene = _scene_of(components, stare, cosmic_rays)
+        scene = _scene_of(components, stare, processes)
         scene.check(flares)
         if method == "cumulants":
             check_sums(scene, flares)

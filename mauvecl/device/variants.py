@@ -48,7 +48,7 @@ def scene_launches(
         joint=scene.joint,
         quartic=scene.quartic,
         photons=scene.photons,
-        cosmic=scene.cosmic,
+        additive=scene.additive,
         modulations=scene.modulations,
         row_type=row_type,
         chunk=min(chunk or device.variant.chunk, device.variant.chunk),

@@ -11,6 +11,7 @@ from scipy import special
 from mauvecl.noise import reference
 from mauvecl.noise.drawing import DrawingOptions
 from mauvecl.noise.scene import prepare
+from mauvecl.noise.unknowns import ADDITIVE
 from mauvecl.schema.tables import Column, table_of
 
 if TYPE_CHECKING:
@@ -42,8 +43,9 @@ def components(
     -------
     QTable
         One row per pixel, in DN summed over the exposure: ``raw``, as drawn by the engine; the mean signals ``source``
-        and ``sky``; ``photon_noise`` and ``read_noise``; ``dark``; ``cosmic_rays``, if enabled; ``bias``; and
-        ``digitisation``, the effect of rounding and clipping. ``raw`` is the sum of the others.
+        and ``sky``; ``photon_noise`` and ``read_noise``; ``dark``; the charge of each enabled additive
+        process by its name; ``bias``; and ``digitisation``, the effect of rounding and clipping. ``raw`` is the sum of
+        the others.
 
     Notes
     -----
@@ -56,12 +58,13 @@ def components(
     n = scene.n_pixel
     each = x.n_frames // scene.n_draws  # frames in one draw
     gain = x.gain_dn_per_electron
-    parts = {name: np.zeros(n) for name in ("source", "sky", "photon_noise", "dark", "read_noise", "cosmic_rays")}
+    parts = {name: np.zeros(n) for name in ("source", "sky", "photon_noise", "dark", "read_noise", *scene.additive)}
     raw = np.zeros(n)
     for frame in range(scene.n_draws):
         factors = reference.factors(scene, index, frame, seed)
         light, warm, glow = ((1.0 + float(f[0])) * middle for f, middle in zip(factors, scene.medians, strict=True))
-        dark_dn, photon_dn, cosmic, analogue, dn = np.zeros((5, len(scene.pixels)))
+        dark_dn, photon_dn, analogue, dn = np.zeros((4, len(scene.pixels)))
+        added = {name: np.zeros(len(scene.pixels)) for name in scene.additive}
         u_dark, z_split = np.zeros((2, len(scene.pixels)))
         for group in range(len(scene.pixels) // 4):
             drawn = reference.draws(scene, index, frame, group, seed)
@@ -73,8 +76,8 @@ def components(
                 dn[p] = reference.digitise(v, scene.edges[0, p], clip=scene.clip)[0]
                 z_split[p] = apart[i][0]
                 u_dark[p] = (float(chance[i][0]) + 0.5) / 2**32
-                if scene.cosmic:
-                    cosmic[p] = scene.pixels[p]["cosmic_gain"] * drawn.cosmic[i][0]
+                for name, electrons in drawn.added.items():
+                    added[name][p] = scene.pixels[p]["electron_gain"] * electrons[i][0]
                 if not scene.joint:
                     dark_dn[p] = scene.dark_counts[p]["gain"] * drawn.dark[i][0]
                 if drawn.photon is not None:
@@ -87,7 +90,10 @@ def components(
         read_variance = each * x.read_noise_dn**2 + (each - 1) / 12
         mean_dark = each * warm * x.dark_dn
         # All random parts of this draw: photon noise + read noise + dark counts, DN.
-        total = scene.base_dn[0] + analogue[:n] - cosmic[:n] - source - sky - each * x.bias_dn
+        total = scene.base_dn[0] + analogue[:n]
+        for charge in added.values():
+            total = total - charge[:n]
+        total = total - source - sky - each * x.bias_dn
         if scene.joint:
             dark = _dark_given_total(total, mean_dark, x.dark_step_dn, photon_variance + read_variance, u_dark[:n])
         else:
@@ -99,12 +105,11 @@ def components(
             both = photon_variance + read_variance
             share = np.divide(photon_variance, both, out=np.zeros(n), where=both > 0)
             photon = rest * share + np.sqrt(read_variance * share) * z_split[:n]
-        for name, values in zip(parts, (source, sky, photon, dark, rest - photon, cosmic[:n]), strict=True):
-            parts[name] += values
+        charges = (charge[:n] for charge in added.values())
+        for name, part in zip(parts, (source, sky, photon, dark, rest - photon, *charges), strict=True):
+            parts[name] += part
         raw += scene.base_dn[0] + dn[:n]
     parts["bias"] = np.asarray(x.n_frames * x.bias_dn)
-    if not scene.cosmic:
-        del parts["cosmic_rays"]
     values = {"wavelength": x.wavelength_nm, "raw": raw} | parts
     values["digitisation"] = raw - sum(parts.values())
     values["net"] = raw - x.n_frames * (x.bias_dn + x.dark_dn) - x.subtracted_dn
@@ -143,7 +148,7 @@ COLUMNS = (
             "photon_noise": "drawn photon noise of star and sky",
             "dark": "drawn dark counts",
             "read_noise": "drawn read noise",
-            "cosmic_rays": "drawn charge of cosmic rays",
+            **{name: f"drawn charge of {process.label}" for name, process in ADDITIVE.items()},
             "bias": "bias",
             "digitisation": "what rounding and clipping changed",
             "net": "raw less bias, mean dark and, where the signal is the star's alone, mean sky",

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from mauvecl.noise.cumulants import Cumulants, joint_is_exact, needs_fourth_power, stack_is_exact
 from mauvecl.noise.drawing import Drawing, Mode, Recipe
+from mauvecl.noise.factors import Factors
 from mauvecl.noise.pixels import sky_share
-from mauvecl.noise.processes import CosmicRays, Factors
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
+    from mauvecl.noise.processes import Processes
 
 #: Frames are drawn one by one if a pixel's mean is within this many standard deviations of a rail.
 RAIL_SIGMA = 8.0
@@ -49,7 +50,7 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: F
     for other in scenarios[1:]:
         _check_same_detector(quiet, other)
     corners = _corners(factors)
-    frames = _draw_frames(scenarios, drawing.mode, factors, processes.cosmic_rays, corners)
+    frames = _draw_frames(scenarios, drawing.mode, factors, processes, corners)
     each = 1 if frames else quiet.n_frames
     cumulants = [Cumulants.of(x, each) for x in scenarios]
     varied = [[_scaled(x, c, corner) for corner in corners] for x, c in zip(scenarios, cumulants, strict=True)]
@@ -70,10 +71,10 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: F
     )
 
 
-def near_rail(x: Expectation, factors: Factors, rays: CosmicRays | None) -> NDArray[np.bool_]:
+def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray[np.bool_]:
     """Return the pixels whose frames come within `RAIL_SIGMA` of zero or saturation, shape (n_pixel,).
 
-    The limits include all values allowed by the priors and the largest number of cosmic rays per frame.
+    The limits include all values allowed by the priors and the largest charge of additive processes per frame.
     """
     variance, light = x.unsaturated_variance_dn2 / x.n_frames, x.light_dn / x.n_frames
     mean = x.mean_raw_dn
@@ -83,9 +84,9 @@ def near_rail(x: Expectation, factors: Factors, rays: CosmicRays | None) -> NDAr
         there = mean + (more_light - 1.0) * light + (more_dark - 1.0) * x.dark_dn
         more = (more_light - 1.0) * x.gain_dn_per_electron * light + (more_dark - 1.0) * x.dark_variance_dn2
         ends.append((there, RAIL_SIGMA * np.sqrt(variance + np.maximum(more, 0.0))))
-    hits = 0.0 if rays is None else x.gain_dn_per_electron * rays.most_electrons(x.frame_s)
+    added = x.gain_dn_per_electron * sum(one.most_electrons(x.frame_s) for one in processes.additive.values())
     low: NDArray[np.bool_] = ends[0][0] - ends[0][1] < 0.0
-    high: NDArray[np.bool_] = ends[1][0] + ends[1][1] + hits > x.highest_dn
+    high: NDArray[np.bool_] = ends[1][0] + ends[1][1] + added > x.highest_dn
     return low | high
 
 
@@ -125,14 +126,14 @@ def _draw_frames(
     scenarios: Sequence[Expectation],
     mode: Mode,
     factors: Factors,
-    rays: CosmicRays | None,
+    processes: Processes,
     corners: Sequence[tuple[float, float, float]],
 ) -> bool:
     if scenarios[0].n_frames == 1 or mode == "frames":
         # For a single frame, both modes give the same draws.
         return mode == "frames" and scenarios[0].n_frames > 1
     for x in scenarios:
-        near = near_rail(x, factors, rays)
+        near = near_rail(x, factors, processes)
         # The approximation of rounding as noise is worst for the least light and dark.
         coarse = ~stack_is_exact(_scaled(x, Cumulants.of(x, 1), corners[0]), x)
         for pixels, why in (

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.noise.factors import Factors
 from mauvecl.noise.prior_tables import nodes
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ class FactorDistributions:
         """Return the distributions of processes for a star, or None if they draw no factors."""
         if not processes.modulations:
             return None
-        factors = processes.factors(quiet.conditions)
+        factors = Factors.of(processes, quiet.conditions)
         medians = factors.light, factors.dark, factors.sky
         return cls._of(processes.modulations, factors.tables, medians, quiet.n_frames)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mauvecl.noise.unknowns import CHANGING, PROCESSES
+from mauvecl.noise.unknowns import ADDITIVE, CHANGING, PROCESSES
 
 WORD_BITS = 32
 
@@ -19,20 +19,23 @@ STREAMS = {
     "noise": 0,
     "dark": 1,
     "photon": 2,
-    "cosmic": 3,
     "split": 9,
     "split_dark": 10,
     "stare_unknown": 16,
     "stare_frame": 17,
     "stare_sums": 18,
     "stare_glow": 19,
-} | {name: process.stream for name, process in PROCESSES.items()}
+    **{name: process.stream for name, process in ADDITIVE.items()},
+    **{name: process.stream for name, process in PROCESSES.items()},
+}
 #: Offset of the stream for draws of a reference exposure.
 REFERENCE = 64
 
-#: Parameters of a launch: seed, sizes, numbers of the first frame and group of four pixels, alias table of the cosmic
-#: rays' charge, number of averaged quiescent exposures and its inverse, and half the ratio of the inverse variance of
-#: one exposure to the one used.
+#: Fields of a launch for the alias table of an additive process: its start, bits (0 if disabled) and lowest value.
+TABLE_FIELDS = (("table", "u4"), ("bits", "u4"), ("low", "i4"))
+#: Parameters of a launch: seed, sizes, numbers of the first frame and group of four pixels, alias tables of the charge
+#: of additive processes, number of averaged quiescent exposures and its inverse, and half the ratio of the inverse
+#: variance of one exposure to the one used.
 JOB = np.dtype(
     [
         ("seed_low", "u4"),
@@ -44,9 +47,7 @@ JOB = np.dtype(
         ("frame_count", "u4"),
         ("first_frame", "u4"),
         ("first_group", "u4"),
-        ("cosmic_table", "u4"),
-        ("cosmic_bits", "u4"),
-        ("cosmic_low", "i4"),
+        *((f"{name}_{field}", kind) for name in ADDITIVE for field, kind in TABLE_FIELDS),
         ("reference_count", "u4"),
         ("reference_weight", "f4"),
         ("pair_scale", "f4"),
@@ -54,7 +55,7 @@ JOB = np.dtype(
 )
 
 #: Properties of a pixel shared by all scenarios.
-PIXEL = np.dtype([("used", "f4"), ("element_end", "u4"), ("four_uneven", "u4"), ("cosmic_gain", "f4")])
+PIXEL = np.dtype([("used", "f4"), ("element_end", "u4"), ("four_uneven", "u4"), ("electron_gain", "f4")])
 
 #: A scenario in a pixel, read in every inner loop: coefficients of the draw as a polynomial of z, whole DN between
 #: `nearest`'s result and the reference, the reference's inverse variance, and twice its product with the reference's

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from mauvecl.noise import layout
 from mauvecl.noise.cumulants import Cumulants
+from mauvecl.noise.factors import Factors
 from mauvecl.noise.poisson import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, table_set
-from mauvecl.noise.processes import Factors
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def detector_pixels(quiet: Expectation, used: NDArray[np.bool_]) -> NDArray[np.v
     # Groups of four used pixels in one element are summed without tests of single pixels.
     uneven = (pixels["element_end"] > 0) | (pixels["used"] == 0)
     pixels["four_uneven"] = np.repeat(uneven.reshape(-1, 4).any(axis=1), 4)
-    pixels["cosmic_gain"][:n_pixel] = quiet.gain_dn_per_electron
+    pixels["electron_gain"][:n_pixel] = quiet.gain_dn_per_electron
     return pixels
 
 

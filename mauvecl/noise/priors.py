@@ -5,8 +5,12 @@ Studies contain priors, so this module imports NumPy only when a quantile is com
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import PlainSerializer, PlainValidator, WithJsonSchema
 
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.quantities import number
@@ -106,3 +110,54 @@ class Normal:
 
 
 Prior = Uniform | Normal
+
+#: Keys of a prior in a study, each with the number of its values.
+_FORMS: dict[type[Prior], dict[str, int]] = {Uniform: {"uniform": 2}, Normal: {"normal": 2, "between": 2}}
+
+
+def _from_study(given: Any) -> Prior:
+    """Return the prior that a study gives as a table; raises InputError otherwise."""
+    if isinstance(given, Uniform | Normal):
+        return given
+    for kind, form in _FORMS.items():
+        if isinstance(given, Mapping) and {key for key in given if given[key] is not None} == form.keys():
+            return kind(*(value for key, n in form.items() for value in _values(key, given[key], n)))
+    raise InputError(
+        "a prior is neither { uniform = [low, high] } nor { normal = [mean, sd], between = [low, high] }",
+        "one of them",
+        key="uniform",
+        value=given.get("uniform") if isinstance(given, Mapping) else given,
+    )
+
+
+def _values(key: str, given: Any, n: int) -> list[float]:
+    if not isinstance(given, list | tuple) or len(given) != n:
+        raise InputError.of(key, given, f"{n} numbers")
+    # Numbers in quotes are accepted, as in other fields.
+    return [float(value) if isinstance(value, int) or _is_number(value) else value for value in given]
+
+
+def _is_number(text: Any) -> bool:
+    with contextlib.suppress(ValueError):
+        return isinstance(text, str) and float(text) is not None
+    return False
+
+
+def _to_study(prior: Prior) -> dict[str, tuple[float, ...]]:
+    """Return the table that a study contains."""
+    if isinstance(prior, Uniform):
+        return {"uniform": (prior.low, prior.high)}
+    return {"normal": (prior.mean, prior.sd), "between": (prior.low, prior.high)}
+
+
+def _json_schema() -> dict[str, Any]:
+    def pair(keys: Mapping[str, int]) -> dict[str, Any]:
+        several = {"type": "array", "items": {"type": "number"}}
+        lists = {key: several | {"minItems": n, "maxItems": n} for key, n in keys.items()}
+        return {"type": "object", "properties": lists, "required": [*keys], "additionalProperties": False}
+
+    return {"anyOf": [pair(form) for form in _FORMS.values()]}
+
+
+#: Prior as a field of a study's section.
+PriorField = Annotated[Prior, PlainValidator(_from_study), PlainSerializer(_to_study), WithJsonSchema(_json_schema())]

@@ -136,7 +136,7 @@ class Draws:
     z: list[Floats]
     dark: list[Floats]
     photon: Words | None
-    cosmic: list[Floats]
+    added: dict[str, list[Floats]]  # electrons of additive processes
 
 
 def poisson_draw(words: Words, i: int, source: np.void, tables: NDArray[np.uint32], pairs: Sequence[Floats]) -> Floats:
@@ -167,14 +167,14 @@ def draws(
         four = scene.dark_counts[4 * group : 4 * group + 4]
         dark = [poisson_draw(w, i, four[i], scene.tables, y) for i in range(4)]
     photon = words_at(*address, "photon", *place) if scene.photons else None
-    cosmic: list[Floats] = []
-    if scene.cosmic:
-        table, bits = scene.tables[int(job["cosmic_table"]) :], int(job["cosmic_bits"])
-        cosmic = [
-            (alias_draw(word, table, bits).astype(np.int32) + job["cosmic_low"]).astype(np.float32)
-            for word in words_at(*address, "cosmic", *place)
+    added: dict[str, list[Floats]] = {}
+    for name in scene.additive:
+        table, bits = scene.tables[int(job[f"{name}_table"]) :], int(job[f"{name}_bits"])
+        added[name] = [
+            (alias_draw(word, table, bits).astype(np.int32) + job[f"{name}_low"]).astype(np.float32)
+            for word in words_at(*address, name, *place)
         ]
-    return Draws(z, dark, photon, cosmic)
+    return Draws(z, dark, photon, added)
 
 
 def quantile(word: NDArray[np.uint32], finer: NDArray[np.uint32], table: Floats) -> Floats:
@@ -235,8 +235,8 @@ def analogue(
         # Both pixels of a pair use both words if the count comes from a normal.
         count = poisson_draw(drawn.photon, i, source, scene.tables, four_normals(drawn.photon))
         v = fma(count, source["gain"], v)
-    if scene.cosmic:
-        v = fma(drawn.cosmic[i], scene.pixels[pixel]["cosmic_gain"], v)
+    for electrons in drawn.added.values():
+        v = fma(electrons[i], scene.pixels[pixel]["electron_gain"], v)
     return v
 
 

@@ -14,9 +14,9 @@ from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.cumulants import polynomial
 from mauvecl.noise.draw_method import DrawMethod, check_reach, choose_method
 from mauvecl.noise.drawing import Drawing, DrawingOptions
+from mauvecl.noise.factors import Factors
 from mauvecl.noise.poisson import AliasTable, table_of
-from mauvecl.noise.processes import Factors
-from mauvecl.noise.unknowns import SignalPart
+from mauvecl.noise.unknowns import ADDITIVE, SignalPart
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -104,9 +104,9 @@ class Scene:
         return self.n_frames if self.frames else 1
 
     @property
-    def cosmic(self) -> bool:
-        """Whether cosmic rays are drawn."""
-        return bool(self.job["cosmic_bits"])
+    def additive(self) -> tuple[str, ...]:
+        """Names of the additive processes that are drawn."""
+        return tuple(name for name in ADDITIVE if self.job[f"{name}_bits"])
 
     def constants(
         self, weights: NDArray[np.float32], linear_end: NDArray[np.uint32], pixels_end: NDArray[np.uint32]
@@ -169,7 +169,7 @@ def prepare(
     """
     drawing = drawing or Drawing(**words)
     quiet = scenarios[0]
-    factors = drawing.processes.factors(quiet.conditions)
+    factors = Factors.of(drawing.processes, quiet.conditions)
     method = choose_method(scenarios, drawing, factors)
     compared = np.zeros(len(scenarios), np.uint32) if references is None else np.array(references, np.uint32)
     used = ~np.any([scenarios[t].saturated for t in np.unique(compared)], axis=0)
@@ -315,7 +315,7 @@ def _job(
     first_group: int,
     tables: list[AliasTable],
 ) -> NDArray[np.void]:
-    """Return the parameters of a launch, layout.JOB, shape (), and append the table of cosmic rays to `tables`."""
+    """Return the parameters of a launch, layout.JOB, shape (); append the tables of additive processes to `tables`."""
     quiet = scenarios[0]
     job = np.zeros((), layout.JOB)
     n_pixel = quiet.wavelength_nm.size
@@ -324,10 +324,9 @@ def _job(
     job["first_frame"], job["first_group"] = drawing.first_frame, first_group
     job["reference_count"], job["reference_weight"] = comparison.exposures, comparison.added_variance
     job["pair_scale"] = variance_factor(comparison) / 2.0
-    rays = drawing.processes.cosmic_rays
-    if rays is not None:
-        table = table_of(rays.charge(method.each * quiet.frame_s))
-        job["cosmic_table"] = sum(t.entries.size for t in tables)
-        job["cosmic_bits"], job["cosmic_low"] = table.bits, table.low
+    for name, process in drawing.processes.additive.items():
+        table = table_of(process.charge(method.each * quiet.frame_s))
+        job[f"{name}_table"] = sum(t.entries.size for t in tables)
+        job[f"{name}_bits"], job[f"{name}_low"] = table.bits, table.low
         tables.append(table)
     return job

@@ -11,6 +11,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
+from mauvecl.noise.additive import AdditiveProcess
+from mauvecl.noise.cosmic_rays import CosmicRays
 from mauvecl.noise.priors import Normal, Prior, Uniform
 from mauvecl.schema.fields import range_of
 from mauvecl.schema.physical import DetectorTemperature
@@ -190,6 +192,9 @@ def _lost(key: str) -> Callable[[Conditions, Float], Float]:
 def _by_name(*rows: Row) -> dict[str, Row]:
     return {row.name: row for row in rows}
 
+
+#: Additive processes: fields of `processes.Processes`, keys of studies' ``processes``.
+ADDITIVE: dict[str, type[AdditiveProcess]] = {"cosmic_rays": CosmicRays}
 
 #: Processes in the order of their tables in kernels: fields of `processes.Processes`, keys of studies' ``processes``.
 PROCESSES = _by_name(

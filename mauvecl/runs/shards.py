@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel
 
 from mauvecl.results.requests.requests import Countable, Divisible, Shard
 
@@ -68,6 +69,11 @@ def _feed(digest: Any, value: Any, leave: tuple[str, ...] = ()) -> None:
             if each.name not in (*leave, *_DESCRIPTIVE):
                 digest.update(each.name.encode())
                 _feed(digest, getattr(value, each.name))
+    elif isinstance(value, BaseModel):
+        digest.update(f"<{type(value).__name__}".encode())
+        for name in type(value).model_fields:
+            digest.update(name.encode())
+            _feed(digest, getattr(value, name))
     elif isinstance(value, np.ndarray):
         digest.update(f"<{value.dtype.str}{value.shape}".encode())
         digest.update(np.ascontiguousarray(value).tobytes())

@@ -120,7 +120,7 @@ class Case:
     @cached_property
     def processes(self) -> Processes:
         """Noise processes to draw."""
-        processes = self.study.processes.processes()
+        processes = self.study.processes
         if self.study.nuisances.usual:
             return self.study.nuisances.processes(processes, self.instrument.temperature_c)
         return processes

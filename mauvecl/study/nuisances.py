@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -126,7 +125,9 @@ class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  #
         if not self.usual:
             return named
         added = default_processes(temperature_c)
-        return replace(named, **{name: prior for name, prior in added.items() if getattr(named, name) is None})  # type: ignore[arg-type]
+        update = {name: prior for name, prior in added.items() if getattr(named, name) is None}
+        every: Processes = named.model_copy(update=update)
+        return every
 
 
 def usual_spreads(quiet: Expectation) -> dict[str, float]:

@@ -10,8 +10,8 @@ from pydantic import Field, create_model, field_validator, model_validator
 
 from mauvecl.host.sky import DEFAULT_SKY
 from mauvecl.host.stars.band_names import ALIASES
-from mauvecl.noise.priors import Normal, Uniform
-from mauvecl.noise.unknowns import INSTRUMENT_VALUES, PROCESSES
+from mauvecl.noise.priors import Prior, PriorField
+from mauvecl.noise.unknowns import INSTRUMENT_VALUES
 from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Quantity, Range
@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from mauvecl.host.stars.flare_spectra import FlareSpectrum
     from mauvecl.host.stars.source import Source
     from mauvecl.noise.comparison import Comparison
-    from mauvecl.noise.priors import Prior
-    from mauvecl.noise.processes import CosmicRays, Processes
 
 
 def amplitudes_in(path: Path, _: str) -> list[float]:
@@ -289,75 +287,6 @@ class SkyLight(Section):
         return Sky.none() if self.surface_brightness is None else Sky.of_brightness(self.surface_brightness)
 
 
-class PriorText(Section):
-    """Prior of a value that varies between realisations: uniform or truncated normal."""
-
-    uniform: tuple[float, float] | None = None
-    normal: tuple[float, float] | None = None
-    between: tuple[float, float] | None = None
-
-    @model_validator(mode="after")
-    def _one_shape(self) -> Self:
-        if (self.uniform is None) == (self.normal is None) or (self.normal is None) != (self.between is None):
-            raise InputError(
-                "a prior is neither { uniform = [low, high] } nor { normal = [mean, sd], between = [low, high] }",
-                "one of them",
-                key="uniform",
-                value=self.uniform,
-            )
-        self.prior()
-        return self
-
-    @classmethod
-    def of(cls, prior: Prior) -> Self:
-        """Return the text of a prior."""
-        if isinstance(prior, Uniform):
-            return cls(uniform=(prior.low, prior.high))
-        return cls(normal=(prior.mean, prior.sd), between=(prior.low, prior.high))
-
-    def prior(self) -> Prior:
-        """Return the prior for the engine."""
-        if self.normal is not None and self.between is not None:
-            return Normal(*self.normal, *self.between)
-        return Uniform(*(self.uniform or (0.0, 0.0)))  # the validator ensures that one of them is given
-
-
-class Rays(Section):
-    """Cosmic-ray hits; see `noise.processes.CosmicRays`."""
-
-    rate_per_cm2_s: float = 1.0
-    area_cm2: float = 0.057
-    electrons: tuple[float, float] = (500.0, 1000.0)
-    weights: tuple[float, ...] | None = None
-
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
-        self.rays()
-        return self
-
-    def rays(self) -> CosmicRays:
-        """Return the process for the engine."""
-        from mauvecl.noise.processes import CosmicRays
-
-        return CosmicRays(**self.model_dump())
-
-
-#: Cosmic rays, and a prior for each quantity that may vary.
-_keys: Any = {"cosmic_rays": (Rays | None, None)} | dict.fromkeys(PROCESSES, (PriorText | None, None))
-
-
-class NoiseProcesses(create_model("_Priors", __base__=Section, **_keys)):  # type: ignore[misc]
-    """Optional noise processes, disabled by default; see `unknowns.PROCESSES` and `processes.CosmicRays`."""
-
-    def processes(self) -> Processes:
-        """Return the processes for the engine."""
-        from mauvecl.noise.processes import Processes
-
-        rays = None if self.cosmic_rays is None else self.cosmic_rays.rays()
-        given = {name: getattr(self, name) for name in PROCESSES}
-        return Processes(rays, **{name: None if text is None else text.prior() for name, text in given.items()})
-
-
 class Run(Section):
     """Number of realisations, seed, statistics and false-alarm probability."""
 
@@ -428,11 +357,7 @@ Known = Annotated[
 #: Number of draws, priors by name, and names of known values.
 _unknown_keys: Any = (
     {"draws": (Draws, 0)}
-    | {
-        name: (PriorText | None, PriorText.of(row.prior))
-        for name, row in INSTRUMENT_VALUES.items()
-        if isinstance(row.prior, Uniform | Normal)
-    }
+    | {name: (PriorField | None, value.prior) for name, value in INSTRUMENT_VALUES.items()}
     | {"known": (Known, ())}
 )
 
@@ -452,10 +377,9 @@ class Unknowns(create_model("_InstrumentValues", __base__=Section, **_unknown_ke
             raise InputError(
                 f"unknowns.known names {other!r}", f"some of {', '.join(INSTRUMENT_VALUES)}", key="known", value=other
             )
-        self.priors()
         return self
 
     def priors(self) -> dict[str, Prior]:
         """Return the priors of unknown values by the instrument's names, and of `qe_scale`."""
         given = {name: getattr(self, name) for name in INSTRUMENT_VALUES if name not in self.known}
-        return {name: text.prior() for name, text in given.items() if text is not None}
+        return {name: prior for name, prior in given.items() if prior is not None}

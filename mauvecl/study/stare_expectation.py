@@ -20,19 +20,18 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from mauvecl.lightcurve.stares.curves import Curve
+    from mauvecl.noise.processes import Processes
     from mauvecl.study.cases import Case
-    from mauvecl.study.sections import NoiseProcesses
     from mauvecl.study.stare_section import CurveText
     from mauvecl.study.study import Study
 
 Float = NDArray[np.float64]
 
 
-def refuse_priors(processes: NoiseProcesses) -> None:
+def refuse_priors(processes: Processes) -> None:
     """Raise InputError for processes that only apply to single exposures, in questions about stares."""
-    modulations = processes.processes().modulations
-    if modulations:
-        name, _ = modulations[0]
+    if processes.modulations:
+        name, _ = processes.modulations[0]
         raise InputError(
             f"processes.{name} applies to single exposures only",
             "jitters, offsets, drifts or cycles in [stare]",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 from pydantic import Field, ValidationError, model_validator
 
 from mauvecl.host.files.parsed import possible, read_text, toml
+from mauvecl.noise.processes import NONE, Processes
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.records import input_error
@@ -28,7 +29,7 @@ from mauvecl.study.questions import (
     Sweep,
 )
 from mauvecl.study.searches import InjectionQuestion, SearchChoice, drop_default_search
-from mauvecl.study.sections import Flare, NoiseProcesses, Observation, Run, Section, SkyLight, Star, Unknowns
+from mauvecl.study.sections import Flare, Observation, Run, Section, SkyLight, Star, Unknowns
 from mauvecl.study.stare_section import EventText, StareQuestion, drop_default_stare, resolve_stare_paths
 from mauvecl.study.study_text import locate_files, parse_toml_value, read_embedded_study, set_key, with_file_digests
 
@@ -60,7 +61,7 @@ class Study(Section):
     flare: Flare = Flare()
     observation: Observation = Observation()
     sky: SkyLight = SkyLight()
-    processes: NoiseProcesses = NoiseProcesses()
+    processes: Processes = NONE
     nuisances: NuisanceChoice = NuisanceChoice()
     run: Run = Run()
     campaign: CampaignQuestion = CampaignQuestion()

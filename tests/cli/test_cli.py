@@ -192,7 +192,9 @@ def test_a_study_may_ask_for_processes(tmp_path: Path, engine: Engine) -> None:
     (tmp_path / "study.toml").write_text(PROCESSES)
     study = Study.read(tmp_path / "study.toml")
     processes = Processes(
-        CosmicRays(rate_per_cm2_s=500), jitter=Uniform(0.0, 0.05), detector_temperature=Normal(21, 2, 13, 25)
+        cosmic_rays=CosmicRays(rate_per_cm2_s=500),
+        jitter=Uniform(0.0, 0.05),
+        detector_temperature=Normal(21, 2, 13, 25),
     )
     assert Case(study).draw_options == {"mode": "auto", "recipe": "joint", "processes": processes}
     (tmp_path / "again.toml").write_text(study.toml())

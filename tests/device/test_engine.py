@@ -74,7 +74,7 @@ CASES = {
     "priors": {"processes": PRIORS},
     "priors, electrons, frames": {"processes": PRIORS, "name": "mauve-electrons", "mode": "frames", "exposure": 25.0},
     "jitter, cold": {"processes": Processes(jitter=Uniform(0.0, 0.05)), "temperature_c": -30.0, "exposure": 5.0},
-    "jitter, one frame, rays": {"processes": Processes(RAYS, jitter=Uniform(0.0, 0.05)), "exposure": 5.0},
+    "jitter, one frame, rays": {"processes": Processes(cosmic_rays=RAYS, jitter=Uniform(0.0, 0.05)), "exposure": 5.0},
 }
 
 

@@ -87,7 +87,7 @@ DRAWN = {
     "all that is usual": (
         ("G2V", 7.4, (0.1, 0.02)),
         {"dark": FREE, "light": FREE, "sky": 0.1, "tilt": FREE},
-        Processes(None, Uniform(0.0, 0.05), _prior(21.0, 0.5), sky_level=_prior(1.0, 0.1)),
+        Processes(jitter=Uniform(0.0, 0.05), detector_temperature=_prior(21.0, 0.5), sky_level=_prior(1.0, 0.1)),
     ),
     "uniform light": (("K3V", 5.0, (0.01, 0.001)), {"light": 0.09}, Processes(light_loss=Uniform(0.24, 0.44))),
 }  # fmt: skip

@@ -11,9 +11,10 @@ from refusals import refused
 
 from mauvecl.device.probes import Probes
 from mauvecl.noise import reference
+from mauvecl.noise.factors import Factors
 from mauvecl.noise.prior_tables import nodes
 from mauvecl.noise.priors import Normal, Prior, Uniform
-from mauvecl.noise.processes import Factors, Processes
+from mauvecl.noise.processes import Processes
 
 CONDITIONS = {"temperature_c": 21.0, "dark_slope_per_c": 0.0684, "light_loss": 0.34, "pointing_loss": 0.02}
 #: What each prior's value makes of the light or the dark.
@@ -51,7 +52,7 @@ PRIORS = [
 @cache
 def factors(name: str, prior: Prior) -> Factors:
     """Return the table of one prior, made once for all tests."""
-    return Processes(**{name: prior}).factors(CONDITIONS)
+    return Factors.of(Processes(**{name: prior}), CONDITIONS)
 
 
 def drawn(probes: Probes, name: str, prior: Prior, tail: np.ndarray, upper: bool) -> np.ndarray:
@@ -161,7 +162,7 @@ def outside(prior: Prior, value: float, upper: bool) -> float:
 
 def test_reference_has_the_same_bits(probes: Probes) -> None:
     """At the ends of words, octaves and cells, and at random words."""
-    table = Processes(qe_scale=Normal(1.0, 0.01, 0.5, 1.5)).factors(CONDITIONS).tables[0]
+    table = Factors.of(Processes(qe_scale=Normal(1.0, 0.01, 0.5, 1.5)), CONDITIONS).tables[0]
     ends = np.concatenate([[2**k - 1, 2**k, 2**k + 1] for k in range(1, 32)]).astype(np.uint32)
     word, finer = (grid.ravel() for grid in np.meshgrid(np.concatenate([[0], ends, ~ends, [2**32 - 1]]), ends))
     word, finer = word.astype(np.uint32), finer.astype(np.uint32)

@@ -21,7 +21,7 @@ from mauvecl.lightcurve.search.injection_sites import OVERLAP, places_of
 from mauvecl.lightcurve.search.injections import Injections
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.noise.processes import CosmicRays
+from mauvecl.noise.processes import CosmicRays, Processes
 from mauvecl.results.requests.requests import Shard
 from mauvecl.runs.shards import fingerprint
 
@@ -142,7 +142,7 @@ def test_completeness_of_five_cells(injections, stares, rays):
 
     All together notice flares that come out a sixth too bright, and frames without the rays.
     """
-    one, injections = injections.survey, replace(injections, cosmic_rays=rays)
+    one, injections = injections.survey, replace(injections, processes=Processes(cosmic_rays=rays))
     rng = np.random.default_rng(9)
     n = 100
     critical = np.stack([stares.reduced(injections.request(p))["critical"] for p in range(POSITIONS)])

@@ -19,7 +19,7 @@ from mauvecl.lightcurve.stares.requests import StaresRequest
 from mauvecl.lightcurve.stares.scene import Flares, StareScene
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.stares.sums import SumTable
-from mauvecl.noise.processes import CosmicRays
+from mauvecl.noise.processes import CosmicRays, Processes
 from mauvecl.results.requests.requests import Shard
 
 SEED = 2**63 + 12345
@@ -41,7 +41,7 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any], int, int, int, dict[str, 
     "electrons": ({"name": "mauve-electrons"}, WOBBLE, 2, 1, 3, {}),
     "cold, fourth cumulants": ({"temperature_c": -20.0, "output_max_nm": 303.0}, WOBBLE, 2, 1, 0, {}),
     "Poisson photons": ({"photon_noise": "poisson"}, WOBBLE, 3, 1, 0, {}),
-    "cosmic rays": ({}, WOBBLE, 2, 1, 2, {"cosmic_rays": CosmicRays(rate_per_cm2_s=200.0)}),
+    "cosmic rays": ({}, WOBBLE, 2, 1, 2, {"processes": Processes(cosmic_rays=CosmicRays(rate_per_cm2_s=200.0))}),
 }
 
 

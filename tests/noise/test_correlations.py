@@ -38,7 +38,10 @@ SCENES = {
     "dark by every mixture": (detector(MIXED, 0.0), {}),
     "photons by every mixture": (detector(0.0, MIXED, photon_noise="poisson"), {}),
     "both by every mixture": (detector(MIXED, MIXED[::-1], photon_noise="poisson"), {"recipe": "apart"}),
-    "cosmic rays": (detector(MIXED, 0.0), {"processes": Processes(CosmicRays(3000.0, electrons=(20.0, 40.0)))}),
+    "cosmic rays": (
+        detector(MIXED, 0.0),
+        {"processes": Processes(cosmic_rays=CosmicRays(rate_per_cm2_s=3000.0, electrons=(20.0, 40.0)))},
+    ),
 }
 ROWS = 50_000
 

@@ -70,7 +70,7 @@ ENDS = [
         ("dark", {}, {"recipe": "apart"}),
         ("dark", {"temperature_c": -30.0}, {"recipe": "apart"}),
         ("photon", {"name": "mauve-electrons"}, {"recipe": "apart"}),
-        ("cosmic", {}, {"processes": Processes(cosmic_rays=CosmicRays(rate_per_cm2_s=500.0))}),
+        ("cosmic_rays", {}, {"processes": Processes(cosmic_rays=CosmicRays(rate_per_cm2_s=500.0))}),
     ],
 )
 def test_extreme_words_in_production_kernel_equal_reference(
@@ -86,7 +86,7 @@ def test_extreme_words_in_production_kernel_equal_reference(
     np.testing.assert_array_equal(raw, reference.realise(scene, np.array([index], np.uint64), seed))
     # No word gives more than 6.77 sigma of its own noise, or half the tables' 2**-33.
     z = (raw[0, :4] - x.mean_raw_dn[:4]) / np.sqrt(x.variance_dn2[:4])
-    if stream != "cosmic":
+    if stream != "cosmic_rays":
         assert np.abs(z).max() < 15
     if stream == "noise" and words == (0, 0, 0, 0):
         assert z[0] > 6.5

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
 
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.noise import layout
 from mauvecl.noise.processes import Processes
 from mauvecl.noise.unknowns import (
+    ADDITIVE,
     COURSES,
     DOCUMENTED_NUISANCES,
     INSTRUMENT_VALUES,
@@ -21,7 +20,7 @@ from mauvecl.noise.unknowns import (
 )
 from mauvecl.schema.errors import InputError
 from mauvecl.study.nuisances import NuisanceChoice
-from mauvecl.study.sections import NoiseProcesses, Unknowns
+from mauvecl.study.sections import Unknowns
 from mauvecl.study.stare_section import StareQuestion
 
 ROWS = [
@@ -34,8 +33,7 @@ ROWS = [
 
 def test_keys_of_studies_are_the_registry() -> None:
     """Compare names and order of the processes' fields and of the keys of each section with the registry."""
-    fields = [field.name for field in dataclasses.fields(Processes)]
-    assert fields == ["cosmic_rays", *PROCESSES] == list(NoiseProcesses.model_fields)
+    assert list(Processes.model_fields) == [*ADDITIVE, *PROCESSES]
     assert list(NuisanceChoice.model_fields) == ["usual", *NUISANCES, "own"]
     assert list(Unknowns.model_fields) == ["draws", *INSTRUMENT_VALUES, "known"]
     assert set(COURSES) <= StareQuestion.model_fields.keys()
@@ -52,7 +50,7 @@ def test_every_default_prior_has_a_source_or_documentation() -> None:
 
 
 def test_streams_of_processes_are_those_of_the_rows() -> None:
-    assert all(layout.STREAMS[name] == row.stream for name, row in PROCESSES.items())
+    assert all(layout.STREAMS[name] == row.stream for name, row in (*ADDITIVE.items(), *PROCESSES.items()))
 
 
 def test_default_values_of_documented_set() -> None:
@@ -69,7 +67,8 @@ def test_default_values_of_documented_set() -> None:
         "drifts": {"star": 0.01},
         "cycles": {"temperature": 0.5},
     }
-    assert {name: text.model_dump(exclude_none=True) for name, text in Unknowns() if name in INSTRUMENT_VALUES} == {
+    dumped = Unknowns().model_dump()
+    assert {name: dumped[name] for name in INSTRUMENT_VALUES} == {
         "temperature_c": {"uniform": (13.0, 21.0)},
         "light_loss": {"normal": (0.34, 0.10), "between": (0.04, 0.64)},
         "pointing_loss": {"uniform": (0.0, 0.05)},

@@ -61,7 +61,7 @@ def study(number: int) -> tuple[list[Expectation], dict]:
     used = ("chi2", "chi2_element", "chi2_pair", "matched", "paper", own)
     how = {
         "statistics": (*used, "uv_excess") if low < 330.0 else used,
-        "processes": Processes(rays, **{name: priors[name] for name in names}),
+        "processes": Processes(cosmic_rays=rays, **{name: priors[name] for name in names}),
         "comparison": Comparison(int(rng.choice([0, 0, 1, 3])), bool(rng.random() < 0.3)),
     }
     return scenario, how
@@ -163,9 +163,11 @@ def test_signal_to_noise_is_that_of_sorting(width: int, number: int) -> None:
     n = 1000
     processes = how["processes"]
     if number < 3:
-        processes = (Processes(CosmicRays(rate_per_cm2_s=300.0)), PRIOR, Processes(light_loss=Uniform(0.2, 0.5)))[
-            number
-        ]
+        processes = (
+            Processes(cosmic_rays=CosmicRays(rate_per_cm2_s=300.0)),
+            PRIOR,
+            Processes(light_loss=Uniform(0.2, 0.5)),
+        )[number]
     engine = Engine(width=width)
     found = engine.snr(quiet, realisations=n, seed=3, processes=processes)
     raw = engine.realise(quiet, count=n, seed=3, processes=processes).astype(float)

@@ -67,7 +67,8 @@ UNKNOWNS = {
     "all that is usual": (
         {"dark": FREE, "light": FREE, "sky": 0.1},
         Processes(
-            None, Uniform(0.0, 0.05), Normal(21.0, 0.5, 18.5, 23.5), sky_level=Normal(1.0, 0.1, 0.5, 1.5)
+            jitter=Uniform(0.0, 0.05), detector_temperature=Normal(21.0, 0.5, 18.5, 23.5),
+            sky_level=Normal(1.0, 0.1, 0.5, 1.5),
         ),
     ),
 }  # fmt: skip

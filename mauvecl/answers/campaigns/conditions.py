@@ -7,12 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.expectation import Expectation
 from mauvecl.host.orbit.conditions import Particles, Thermal
 from mauvecl.host.orbit.constraints import sunlight
 from mauvecl.host.orbit.orbit import Track
 from mauvecl.host.orbit.visibility import Visibility
-from mauvecl.study.sections import Rays
 
 Float = NDArray[np.float64]
 
@@ -30,10 +28,6 @@ class Conditions:
         """Return the swing of N orbits."""
         kept = [point for point in self.swing if point[0] < orbit_s]
         return tuple((n * orbit_s + t, value) for n in range(orbits) for t, value in kept)
-
-    def rays(self, study: Rays | None) -> Rays:
-        """Return a study's particle hits at this rate."""
-        return (study or Rays()).model_copy(update={"rate_per_cm2_s": self.hits_per_cm2_s})
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +57,3 @@ class OrbitConditions:
         orbit = self.temperature_c[first : first + int(np.ceil(orbit_s / step))] - mean
         swing = tuple((float((n + 0.5) * step), float(value)) for n, value in enumerate(orbit))
         return Conditions(mean, swing, float(self.hits_per_cm2_s[seen].mean()))
-
-
-def hits_variance_dn2(rays: Rays, quiet: Expectation) -> Float:
-    """Return the variance that particle hits add to each pixel of a frame, DN^2, shape (n_pixel,)."""
-    charge = rays.rays().charge(quiet.frame_s)
-    electrons = np.arange(charge.size)
-    variance = float(charge @ electrons**2 - (charge @ electrons) ** 2)
-    return np.asarray(variance * quiet.gain_dn_per_electron**2)

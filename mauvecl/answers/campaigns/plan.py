@@ -31,7 +31,6 @@ from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column, View, number, table_of
 from mauvecl.study.messages import SATURATED, collect_messages
-from mauvecl.study.sections import Rays
 from mauvecl.study.stare_expectation import refuse_priors
 from mauvecl.study.study import Study
 
@@ -216,12 +215,11 @@ class PlanAnswer(Answer):
     def _along_orbit(self) -> list[tuple[str, str, str]]:
         if not self.study.plan.along_orbit:
             return [("temperature and particles", "the study's", "the same for all targets")]
-        rays = Rays() if self.study.processes.cosmic_rays is None else self.study.processes.cosmic_rays
-        low, high = rays.electrons
+        hits = self.study.processes.with_particles(0.0).particle_processes
         return [
             ("temperature", "along the orbit", THERMAL_SOURCE),
             ("hits by particles", "along the orbit", PARTICLES_SOURCE),
-            ("charge of a hit", f"{low:g} to {high:g} electrons in one pixel", "assumption; adds to the noise"),
+            *(process.assumption for process in hits),
         ]
 
     @property

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.campaigns.conditions import Conditions, OrbitConditions, hits_variance_dn2
+from mauvecl.answers.campaigns.conditions import Conditions, OrbitConditions
 from mauvecl.host.orbit.targets import Target
 from mauvecl.lightcurve.flares.energies import EnergyScale, quiescent_luminosity
 from mauvecl.lightcurve.flares.rates import BOLOMETRIC, Rates
@@ -54,15 +54,14 @@ class TargetObservation:
     @property
     def hits_per_cm2_s(self) -> float:
         """Rate of particle hits."""
-        rays = self.case.study.processes.cosmic_rays
-        return 0.0 if rays is None else rays.rate_per_cm2_s
+        return float(self.case.study.processes.particles_per_cm2_s)
 
     @cached_property
     def signal_per_frame(self) -> float:
         """S/N of a frame with a flare of amplitude 1; 0 if every pixel saturates."""
         (flare,) = self.case.expect(self.case.flaring(SMALL))
-        rays = self.case.study.processes.cosmic_rays
-        hits = None if rays is None else hits_variance_dn2(rays, self.quiet)
+        added = [process.variance_dn2(self.quiet) for process in self.case.study.processes.additive.values()]
+        hits = np.sum(added, axis=0) if added else None
         return frame_signal(self.quiet, flare, SMALL, added_variance_dn2=hits)
 
     @cached_property
@@ -179,8 +178,7 @@ def observe(
     if sky is not None:
         changes["sky"] = SkyLight(surface_brightness=sky)
     if conditions is not None:
-        rays = conditions.rays(study.processes.cosmic_rays)
-        changes["processes"] = study.processes.model_copy(update={"cosmic_rays": rays})
+        changes["processes"] = study.processes.with_particles(conditions.hits_per_cm2_s)
         if study.observation.temperature_c is None:
             at = {"temperature_c": conditions.temperature_c}
             changes["observation"] = study.observation.model_copy(update=at)

@@ -259,7 +259,7 @@ def detect(
     blinding = [f"{text[:-1]} ({star.title})." for star in stars for text in star.detection.messages]
     blinding += [f"{t[:-1]} ({star.title})." for star in stars for t in star.detection.without_threshold(run.fap)]
     blinding += [f"{t[:-1]} ({star.title})." for star in stars for t in star.detection.lowered]
-    messages = [*blinding, *collect_messages(expectations, study.processes.processes())]
+    messages = [*blinding, *collect_messages(expectations, study.processes)]
     errors = answer.table["fap_error"][np.isfinite(answer.table["fap_error"])]
     if not countable(run.fap, run.realisations) and errors.size:
         messages.append(

@@ -199,7 +199,7 @@ def map(
             *_blinded(values),
             *_without_threshold(study.run, values),
             *_wrong_sign(case, lowered, len(x) * len(y)),
-            *worst_first([*collect_messages(seen, study.processes.processes()), *of_flares]),
+            *worst_first([*collect_messages(seen, study.processes), *of_flares]),
             *marginal_lines(study.nuisances),
             *_cost(case, x, y),
         ],

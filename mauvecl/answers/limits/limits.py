@@ -222,7 +222,7 @@ class LimitResult(Answer):
         stars = worst_first(
             [
                 *(text for one in self.limits for text in one.messages),
-                *collect_messages(self.inputs, self.study.processes.processes()),
+                *collect_messages(self.inputs, self.study.processes),
             ]
         )
         costs = [one.cost for one in self.limits if one.cost is not None]

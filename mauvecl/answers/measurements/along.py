@@ -42,13 +42,13 @@ def measured_stare(case: Case, engine: Engine | Pool, snr_per_bin: float) -> Mea
     study = case.study
     staring, events = case.stare_expectation, case.events
     quiet, stare, seed = staring.quiet, staring.stare, study.run.seed
-    rays = case.processes.cosmic_rays
+    processes = study.processes.additive_only
     name, model = list(models_of(case.one_frame).items())[-1]
     unknown = case.unknowns(quiet)
 
     def draw(components: Components) -> Float:
         request = StaresRequest(components, stare, 1, seed, staring.flare, start=study.stare.number, method="pixels",
-                                cosmic_rays=rays)  # fmt: skip
+                                processes=processes)  # fmt: skip
         if isinstance(engine, Pool):
             return np.asarray(engine.stares(request)["values"][0], np.float64)
         from mauvecl.device.stares import Stares
@@ -59,7 +59,7 @@ def measured_stare(case: Case, engine: Engine | Pool, snr_per_bin: float) -> Mea
         return {"frames": staring.raw(draw)}
 
     checkpoint = engine.checkpoint if isinstance(engine, Pool) else None
-    depends_on = ("pixels", quiet, staring.flare_electrons, stare, staring.flare, study.stare.number, seed, rays)
+    depends_on = ("pixels", quiet, staring.flare_electrons, stare, staring.flare, study.stare.number, seed, processes)
     raw = kept(checkpoint, depends_on, drawn)["frames"]
     where = case.label, case.at, name, staring, tuple(events)
     try:

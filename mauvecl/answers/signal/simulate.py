@@ -133,4 +133,4 @@ def simulate(
         everything += xs
         if progress is not None:
             progress(done, len(prepared))
-    return SimulateAnswer(study, observations, collect_messages(everything, study.processes.processes()))
+    return SimulateAnswer(study, observations, collect_messages(everything, study.processes))

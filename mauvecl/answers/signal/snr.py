@@ -158,7 +158,7 @@ def snr(
         study,
         stars,
         [
-            *collect_messages(quiet, study.processes.processes()),
+            *collect_messages(quiet, study.processes),
             *filter(None, map(_cut_off, stars)),
         ],
     )

@@ -328,11 +328,11 @@ def inject(
 def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], None]) -> StarCompleteness:
     """Inject flares into the stare of a case and search for them; `report` receives the share that is done."""
     choice, asked, seed = case.study.search, case.study.injections, case.study.run.seed
-    rays = case.study.processes.processes().cosmic_rays
+    processes = case.study.processes.additive_only
     known, survey = case.survey, case.survey.survey
     drawn = None
     if choice.nulls:
-        maxima = _reduced(engine, survey.null(choice.nulls, seed, rays))["maximum"]
+        maxima = _reduced(engine, survey.null(choice.nulls, seed, processes))["maximum"]
         drawn = CountedRate(np.sort(maxima), survey.stare.observed_s / DAY_S)
     tail = survey.tail(seed)
     threshold = (
@@ -342,7 +342,7 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
     values = injected_sizes(case, sizes, threshold.value)
     positions = min(asked.positions, asked.count)
     injections = Injections(
-        survey, 0, asked.half_widths_s, threshold.value, seed, positions, -(-asked.count // positions), rays
+        survey, 0, asked.half_widths_s, threshold.value, seed, positions, -(-asked.count // positions), processes
     )
     widths = np.array(injections.half_widths_s)
     amplitudes = np.asarray(sizes.amplitude(values[None], widths[:, None]))

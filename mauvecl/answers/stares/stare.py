@@ -418,15 +418,15 @@ def stare(
 
 def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStare:
     """Draw and search the stare of a case."""
-    q, seed, rays = case.study.stare, case.study.run.seed, case.study.processes.processes().cosmic_rays
+    q, seed, processes = case.study.stare, case.study.run.seed, case.study.processes.additive_only
     staring = case.stare_expectation
 
     def draw(components: Any) -> Any:
         def computed() -> Arrays:
             what = components, staring.stare, staring.flare
-            return {"frames": stares.frames(*what, first=q.number, count=1, seed=seed, cosmic_rays=rays)[0]}
+            return {"frames": stares.frames(*what, first=q.number, count=1, seed=seed, processes=processes)[0]}
 
-        depends_on = ("frames", components, staring.stare, staring.flare, q.number, seed, rays)
+        depends_on = ("frames", components, staring.stare, staring.flare, q.number, seed, processes)
         return kept(checkpoint, depends_on, computed)["frames"]
 
     light = seen(staring, q.bands_nm, draw)

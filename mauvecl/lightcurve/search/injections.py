@@ -23,12 +23,12 @@ from mauvecl.lightcurve.search.survey import select_frames, subtract_known
 from mauvecl.lightcurve.stares.components import STEADY, Components
 from mauvecl.lightcurve.stares.requests import Method, StaresRequest
 from mauvecl.lightcurve.stares.sums import method_for
+from mauvecl.noise.processes import NONE, Processes
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.search.survey import Survey
     from mauvecl.lightcurve.search.trend import Trend
-    from mauvecl.noise.processes import CosmicRays
 
 Float = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -57,7 +57,7 @@ class Injections:
     seed: int
     positions: int  # number of peak times, stratified over the recorded frames
     draws: int  # realisations per position
-    cosmic_rays: CosmicRays | None = None  # require frames that are drawn by pixel
+    processes: Processes = NONE  # additive ones require frames that are drawn by pixel
 
     def __post_init__(self) -> None:
         if not self.half_widths_s or not all(np.isfinite(w) and w > 0 for w in self.half_widths_s):
@@ -113,7 +113,7 @@ class Injections:
     @cached_property
     def method(self) -> Method:
         """Method of drawing frames."""
-        return method_for(self.quiescent, self.survey.stare, self.cosmic_rays)
+        return method_for(self.quiescent, self.survey.stare, self.processes)
 
     def places(self, position: int) -> tuple[Place, ...]:
         """Return the sites of all half-widths at a peak time."""
@@ -151,7 +151,7 @@ class Injections:
             self.seed,
             start=start,
             method=self.method,
-            cosmic_rays=self.cosmic_rays,
+            processes=self.processes,
             reduction=injecting,
             glow=True,
         )

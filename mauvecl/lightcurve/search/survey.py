@@ -16,12 +16,12 @@ from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.search.trend import Trend
 from mauvecl.lightcurve.stares.requests import StaresRequest
 from mauvecl.lightcurve.stares.sums import method_for
+from mauvecl.noise.processes import NONE, Processes
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.search.bank import Bank
     from mauvecl.lightcurve.stares.components import Components
     from mauvecl.lightcurve.stares.stare import Stare
-    from mauvecl.noise.processes import CosmicRays
     from mauvecl.noise.unknowns import Changing
 
 Float = NDArray[np.float64]
@@ -124,12 +124,12 @@ class Survey:
         """Subtract from simulated sums their known mean and the fitted trend, shape (n_stare, n_frame, n_sum)."""
         return subtract_known(sums, self.known, self.trend)
 
-    def null(self, count: int, seed: int, cosmic_rays: CosmicRays | None = None) -> StaresRequest:
+    def null(self, count: int, seed: int, processes: Processes = NONE) -> StaresRequest:
         """Return the request for the largest values of stares without a flare."""
         largest = Largest(self.bank, self.stare, self.curves, self.variance, self.known, self.trend)
-        method = method_for(self.components, self.stare, cosmic_rays)
+        method = method_for(self.components, self.stare, processes)
         return StaresRequest(
-            self.components, self.stare, count, seed, method=method, cosmic_rays=cosmic_rays, reduction=largest
+            self.components, self.stare, count, seed, method=method, processes=processes, reduction=largest
         )
 
     def tail(self, seed: int) -> SampledRate:

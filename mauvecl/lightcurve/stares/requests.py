@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mauvecl.lightcurve.stares.components import Components
 from mauvecl.lightcurve.stares.scene import Flares
 from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.noise.processes import CosmicRays
+from mauvecl.noise.processes import NONE, Processes
 from mauvecl.results.requests.requests import Countable
 
 Arrays = dict[str, NDArray[Any]]
@@ -71,7 +71,7 @@ class StaresRequest(Countable):
     amplitudes: NDArray[Any] | None = None
     start: int = 0
     method: Method = "cumulants"
-    cosmic_rays: CosmicRays | None = None
+    processes: Processes = NONE
     reduction: Reduction | None = None
     glow: bool = False
     #: Where rows of flares and amplitudes are counted from, where they differ from stare to stare.

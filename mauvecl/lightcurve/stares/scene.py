@@ -15,7 +15,7 @@ from mauvecl.lightcurve.stares.components import MOST_STATISTICS, STEADY, Compon
 from mauvecl.noise import layout
 from mauvecl.noise.cumulants import Cumulants, joint_is_exact
 from mauvecl.noise.pixels import padded
-from mauvecl.noise.processes import CosmicRays, Processes
+from mauvecl.noise.processes import NONE, Processes
 from mauvecl.noise.scene import Scene, prepare
 from mauvecl.schema.errors import InputError
 
@@ -115,7 +115,7 @@ class StareScene:
     components, stare
         What it is made of.
     scene : Scene
-        One quiescent frame, for addresses, rails and cosmic rays.
+        One quiescent frame, for addresses, rails and additive processes.
     numbers : ndarray of uint32, shape (n_padded_frame,)
         Frames as the generator counts them, gaps included.
     known : ndarray of float32, shape (7, n_padded_frame)
@@ -148,7 +148,7 @@ class StareScene:
     constants: Floats
 
     @classmethod
-    def of(cls, components: Components, stare: Stare, cosmic_rays: CosmicRays | None = None) -> Self:
+    def of(cls, components: Components, stare: Stare, processes: Processes = NONE) -> Self:
         """Lay out a stare.
 
         Raises
@@ -173,7 +173,9 @@ class StareScene:
                 key="unknowns",
                 value=len(stare.unknowns),
             )
-        scene = prepare([x], processes=Processes(cosmic_rays=cosmic_rays))
+        for name, _ in processes.modulations:
+            raise InputError(f"{name} is a prior of exposures", "an unknown of the stare", key=name)
+        scene = prepare([x], processes=processes)
         if not scene.joint:
             raise _apart(x.name)
         size = padded(n_pixel)

@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from mauvecl.lightcurve.stares.components import STEADY, Components
 from mauvecl.lightcurve.stares.scene import Flares, StareScene, unique
 from mauvecl.noise.cumulants import expansion_error
+from mauvecl.noise.processes import NONE, Processes
+from mauvecl.noise.unknowns import ADDITIVE
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.stares.requests import Method
     from mauvecl.lightcurve.stares.stare import Stare
-    from mauvecl.noise.processes import CosmicRays
 
 Float = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -107,12 +108,9 @@ def check_sums(scene: StareScene, flares: Flares) -> None:
     ------
     InputError
     """
-    if scene.scene.cosmic:
+    for name in scene.scene.additive:
         raise InputError(
-            "cosmic rays with method 'cumulants'",
-            "method 'pixels': they are rare and large",
-            key="method",
-            value="cumulants",
+            f"{ADDITIVE[name].label} with method 'cumulants'", "method 'pixels'", key="method", value="cumulants"
         )
     x = scene.components.quiet
     used = (scene.components.weights != 0).any(axis=0)
@@ -139,9 +137,9 @@ def check_sums(scene: StareScene, flares: Flares) -> None:
             )
 
 
-def method_for(components: Components, stare: Stare, rays: CosmicRays | None = None) -> Method:
+def method_for(components: Components, stare: Stare, processes: Processes = NONE) -> Method:
     """How frames without flares are drawn: by cumulants where these describe them, pixel by pixel elsewhere."""
-    scene = StareScene.of(components, stare, rays)
+    scene = StareScene.of(components, stare, processes)
     try:
         check_sums(scene, Flares.of(components, stare, None, None, 1))
         SumTable.of(components)

@@ -96,8 +96,8 @@ def pixels(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable
                 for k in range(len(flares.amplitudes)):
                     flare = _coefficients(scene, flares, frame, k, met["light"])
                     v = _count(scene, p, drawn.z[i], met, flare)
-                    if scene.scene.cosmic:
-                        v = fma(drawn.cosmic[i], scene.scene.pixels[p]["cosmic_gain"], v)
+                    for electrons in drawn.added.values():
+                        v = fma(electrons[i], scene.scene.pixels[p]["electron_gain"], v)
                     x = reference.digitise(v, scene.scene.edges[0, p], clip=scene.scene.clip)
                     for s, weight in enumerate(scene.weights[:, p]):
                         sums[k, i, s] = fma(x, weight, sums[k, i, s])

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.noise.cumulants import Cumulants
+from mauvecl.noise.unknowns import ADDITIVE
 from mauvecl.results.requests.fap import countable
 from mauvecl.schema.calls import public
 from mauvecl.schema.tables import INTERVAL, Column, interval, percent, table_of
@@ -90,8 +91,7 @@ def departures(detection: Detection, fap: float) -> list[Departure]:
     others = []
     if scene.comparison.estimated:
         others.append("variances estimated from the counts")
-    if scene.cosmic:
-        others.append("cosmic rays")
+    others += [ADDITIVE[name].label for name in scene.additive]
     if scene.modulations and not detection.setting.integrates:
         others.append("priors that the reference does not know")
     elif detection.nuisances is not None and not scene.modulations:

@@ -18,6 +18,7 @@ from scipy import special
 
 from mauvecl.noise import layout
 from mauvecl.noise.factor_distributions import quantile_at_score
+from mauvecl.noise.unknowns import ADDITIVE
 from mauvecl.results.requests.fap import check_atom
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.distributions import Form, Mixture, QuadraticForm
@@ -73,8 +74,8 @@ def tail(detection: Detection, fap: float, statistic: str, *, template: int = 0,
     NoThresholdError
         If no threshold has the probability.
     InputError
-        If noise is not drawn jointly and in stacks, cosmic rays are drawn, priors are drawn that the statistics are not
-        marginalised over, more than 30 quiescent exposures are averaged, or the error remains too large.
+        If noise is not drawn jointly and in stacks, additive processes are drawn, priors are drawn that the statistics
+        are not marginalised over, more than 30 quiescent exposures are averaged, or the error remains too large.
     """
     if not SMALLEST_FAP <= fap <= 0.1:
         raise InputError.of("fap", fap, f"{SMALLEST_FAP:g} to 0.1 for importance sampling")
@@ -106,7 +107,7 @@ def _check(detection: Detection) -> None:
     reasons = {
         "noise drawn apart": not scene.joint,
         "frames drawn one by one": scene.frames,
-        "cosmic rays": scene.cosmic,
+        **{ADDITIVE[name].label: True for name in scene.additive},
         "priors that statistics are not marginalised over": bool(scene.modulations) and not setting.integrates,
         f"{scene.comparison.exposures} averaged exposures": scene.comparison.exposures > MAX_AVERAGED,
     }
