@@ -120,6 +120,9 @@ def _own_error(model: type[BaseModel], path: list[str], key: str, first: Any) ->
     # What read the value knows more of it than where it stands.
     found = inner if own else inner.within(key)
     found.key = _full_key(model, path, inner.key)
+    if field is not None and model_in(field.annotation) is None and isinstance(first.get("input"), dict) and inner.key:
+        # The validator of a table that is no record names a key of it.
+        found.key = ".".join([*path, inner.key]) if found.key == inner.key else found.key
     return found
 
 
