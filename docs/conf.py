@@ -5,6 +5,9 @@ from pathlib import Path
 
 from astropy.table import Table
 
+from mauvecl.schema.reference import keys_of
+from mauvecl.study.study import Study
+
 project = "mauvecl"
 author = "the mauvecl developers"
 release = version = installed("mauvecl")
@@ -52,4 +55,15 @@ def bench_tables() -> None:
         (folder / f"{path.stem}.rst").write_text("\n".join(lines), encoding="utf-8")
 
 
+def study_keys() -> None:
+    """Write the reference of all keys of a study."""
+    lines = [".. list-table::", "   :header-rows: 1", "   :widths: 20 36 22 12 10", ""]
+    for key, *cells in keys_of(Study):
+        lines += [f"   * - ``{key}``", *(f"     - {cell.replace('*', chr(92) + '*')}" for cell in cells)]
+    head = ["   * - key", *(f"     - {name}" for name in ("meaning", "accepted", "default", "flag"))]
+    lines[4:4] = head
+    (Path(__file__).parent / "_generated" / "study_keys.rst").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
 bench_tables()
+study_keys()

@@ -23,6 +23,6 @@ def measure(study: Study, session: Session) -> None:
 
     mauvecl measure --star M3V --magnitude 9 --amplitude 0.5 --sweep exposure=50,300 --distance 5 --radius 0.4
 
-    mauvecl measure --star M3V --magnitude 9 --amplitude 2 --snr-per-bin 20 --hours 0.5 --distance 5
+    mauvecl measure --star M3V --magnitude 9 --amplitude 2 --snr-per-bin 20 --duration 1800 --distance 5
     """
     session.answer(session.ask(study))

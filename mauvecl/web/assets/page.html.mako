@@ -45,7 +45,7 @@
 </select>
 % else:
 <div class="number"><input id="f-${name}" name="${name}" type="text" value="${field.first}" autocomplete="off" spellcheck="false"
- ${"inputmode=decimal" if hasattr(field.read, "low") else ""} aria-describedby="w-${name}">
+ ${"inputmode=decimal" if hasattr(field.read, "range") else ""} aria-describedby="w-${name}">
 % if name == "magnitude":
 <label class="aside" for="f-band">in</label>
 <select id="f-band" name="band" aria-describedby="w-band">
