@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable, Table
+from refusals import refused
 from scenes import star
 from typer.testing import CliRunner
 
@@ -18,7 +19,6 @@ from mauvecl import Source
 from mauvecl.cli.app import app
 from mauvecl.host.stars.flare import blackbody
 from mauvecl.host.stars.flare_table import flares_of, read_flares
-from mauvecl.schema.errors import InputError
 
 
 def test_a_synphot_spectrum_in_and_out() -> None:
@@ -109,19 +109,12 @@ def test_a_data_frame_and_a_fits_table(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_flares(tmp_path / "f.fits")["amplitude"], [0.3])
 
 
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
-        ("time,flux\n1,2\n", "has the columns 'time, flux', expected one named ampl_rec"),
-        ("ampl_rec\n0.1\n-0.2\n", "the amplitude of flare 1 is -0.2, expected a relative rise above 0"),
-        ("ampl_rec\n", "holds 0 flares, expected 1 to 500"),
-    ],
-)
-def test_tables_that_cannot_be(tmp_path: Path, text: str, sentence: str) -> None:
+@pytest.mark.parametrize("text", ["time,flux\n1,2\n", "ampl_rec\n0.1\n-0.2\n", "ampl_rec\n"])
+def test_bad_tables_of_flares_are_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "f.csv").write_text(text)
-    with pytest.raises(InputError, match=sentence):
+    with refused("amplitude"):
         read_flares(tmp_path / "f.csv")
-    with pytest.raises(InputError, match=r"'nowhere\.csv' does not exist"):
+    with refused("file", value="nowhere.csv"):
         read_flares("nowhere.csv")
 
 

@@ -94,7 +94,12 @@ def question_time(study: Study, *, device: str | None, cluster: str | None, insi
     """
     count = study.run.realisations
     if count > MOST_REALISATIONS:
-        raise InputError(f"realisations = {count}, expected at most {MOST_REALISATIONS}: the index has 63 bits")
+        raise InputError(
+            f"realisations = {count}",
+            f"at most {MOST_REALISATIONS}: the index has 63 bits",
+            key="realisations",
+            value=count,
+        )
     if insist or count < 10**9:
         # A billion ends within hours anywhere: no need to look at the instrument.
         return
@@ -105,9 +110,11 @@ def question_time(study: Study, *, device: str | None, cluster: str | None, insi
     years = drawn / rate / YEAR_S
     if years > 1.0:
         raise InputError(
-            f"realisations = {count:.3g} of {len(study.star) * combinations} stars draw {drawn:.2g} pixels and take "
-            f"some {years:.2g} years at {rate:.2g} a second ({by}), expected less than a year; --insist begins all the "
-            "same"
+            f"realisations = {count:.3g} of {len(study.star) * combinations} stars draw {drawn:.2g} "
+            f"pixels and take some {years:.2g} years at {rate:.2g} a second ({by})",
+            "less than a year; --insist begins all the same",
+            key="realisations",
+            value=count,
         )
 
 
@@ -126,8 +133,11 @@ def question_room(store: Store, *, insist: bool) -> None:
     if store.n_bytes > free:
         rows = free // (store.n_bytes // store.rows)
         raise InputError(
-            f"realisations = {store.rows} take {_size(store.n_bytes)} and {str(store.path)!r} has room for "
-            f"{_size(free)}, expected at most {rows} of them, or another place; --insist begins all the same"
+            f"realisations = {store.rows} take {_size(store.n_bytes)} and {str(store.path)!r} has room "
+            f"for {_size(free)}",
+            f"at most {rows} of them, or another place; --insist begins all the same",
+            key="realisations",
+            value=store.rows,
         )
 
 

@@ -31,7 +31,9 @@ def study_of(
                 other = setting.setdefault((one.section, one.key), name)
                 if other != name:
                     raise InputError(
-                        f"--{other} and --{name} are both given, expected one of them: both set {one.section}.{one.key}"
+                        f"--{other} and --{name} are both given",
+                        f"one of them: both set {one.section}.{one.key}",
+                        key=other,
                     )
                 changes.setdefault(one.section, {})[one.key] = one.value(value)
     if given.get("nuisance"):
@@ -90,7 +92,7 @@ def sky_of(given: dict[str, Any]) -> dict[str, Any]:
         try:
             sky["surface_brightness"] = float(text)
         except ValueError as error:
-            raise InputError(f"--sky {text!r}, expected V mag/arcsec^2 or none") from error
+            raise InputError(f"--sky {text!r}", "V mag/arcsec^2 or none", key="sky", value=text) from error
     return sky
 
 
@@ -106,8 +108,10 @@ def nuisances_of(study: Study, texts: list[str]) -> dict[str, Any]:
         name, _, sd = (part.strip() for part in text.rpartition("="))
         if not (name and sd):
             raise InputError(
-                f"--nuisance {shortened(text)}, expected NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, "
-                "and a standard deviation or free"
+                f"--nuisance {shortened(text)}",
+                f"NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, and a standard deviation or free",
+                key="nuisance",
+                value=text,
             )
         if name in NUISANCES:
             nuisances[name] = sd
@@ -141,12 +145,14 @@ def stars_of(study: Study, given: dict[str, Any], flags: Mapping[str, StudyFlag]
     if magnitudes:
         if len(magnitudes) not in (1, len(stars)):
             of = "one star" if len(stars) == 1 else f"{len(stars)} stars"
-            raise InputError(f"{len(magnitudes)} magnitudes for {of}, expected one for all or one each")
+            raise InputError(
+                f"{len(magnitudes)} magnitudes for {of}", "one for all or one each", key="magnitude", value=magnitudes
+            )
         for entry, value in zip(stars, magnitudes * (len(stars) if len(magnitudes) == 1 else 1), strict=True):
             entry["magnitude"] = value
     if of_files and not any("file" in entry for entry in stars):
         named = " and ".join("--" + key.replace("_", "-") for key in of_files)
-        raise InputError(f"{named} without a spectrum file among the stars, expected --star FILE")
+        raise InputError(f"{named} without a spectrum file among the stars", "--star FILE", key=next(iter(of_files)))
     return [entry | same | (of_files if "file" in entry else {}) for entry in stars]
 
 

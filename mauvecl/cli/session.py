@@ -92,7 +92,7 @@ class Session:
         self._held.close()
         if kind is None and self._lost:
             others = f"; the same holds for {len(self._lost) - 1} more files of this answer" if self._lost[1:] else ""
-            raise InputError(self._lost[0] + others)
+            raise InputError(self._lost[0] + others, key="file")
 
     @cached_property
     def folder(self) -> Path:

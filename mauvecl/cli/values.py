@@ -8,9 +8,7 @@ from functools import partial
 from types import NoneType
 from typing import Annotated, Any, get_args, get_origin
 
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.parsing import count, number, several
-from mauvecl.schema.text import shortened
+from mauvecl.schema.parsing import count, number, refusal, several
 
 
 def as_text(kind: Any) -> tuple[Any, str, Callable[[str, str], Any] | None]:
@@ -48,5 +46,5 @@ def within(text: str, flag: str, *, read: Callable[[str, str], Any], low: float 
     value = read(text, flag)
     if (low is not None and not value >= low) or (high is not None and not value <= high):
         reach = f"at least {low:g}" if high is None else f"{low:g} to {high:g}"
-        raise InputError(f"{flag} {shortened(text)}, expected {reach}")
+        raise refusal(flag, text, reach)
     return value

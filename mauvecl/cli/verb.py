@@ -97,7 +97,12 @@ def takes_study(
                 given["targets"], study_file = study_file, None
             if "star" in flags and study_file is not None and is_star(study_file):
                 if given["star"]:
-                    raise InputError(f"{str(study_file)!r} and --star are both stars, expected one of them")
+                    raise InputError(
+                        f"{str(study_file)!r} and --star are both stars",
+                        "one of them",
+                        key="star",
+                        value=str(study_file),
+                    )
                 given["star"], study_file = [str(study_file)], None
             if study_file is None:
                 for one in flags.values():

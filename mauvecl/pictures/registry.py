@@ -13,7 +13,6 @@ from typing import Any, TypeVar
 
 from mauvecl.pictures.style import AXES
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shown
 
 F = TypeVar("F", bound=Callable[..., Any])
 #: Modules that a search for pictures must not import, since matplotlib is loaded only when a picture is drawn.
@@ -115,7 +114,7 @@ def load() -> None:
 def _draw(draw: Callable[..., Any], path: str | Path | None = None, *, ax: Any = None, **options: Any) -> Any:
     """Draw a picture and return the figure, the path of the saved file, or `ax`."""
     if ax is not None and not (hasattr(ax, "plot") and hasattr(ax, "figure")):
-        raise InputError(f"ax = {shown(ax)}, expected axes, as plt.subplots makes")
+        raise InputError.of("ax", ax, "axes, as plt.subplots makes")
     before = AXES.set(ax)
     try:
         drawn = draw(path=path, **options)

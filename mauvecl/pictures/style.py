@@ -115,7 +115,7 @@ class Within:
         spec = self._ax.get_subplotspec()
         if spec is None:
             raise InputError(
-                "ax is not of a grid, expected axes as plt.subplots makes, for a picture of several panels"
+                "ax is not of a grid", "axes as plt.subplots makes, for a picture of several panels", key="ax"
             )
         self._ax.set_axis_off()
         return self._ax.figure.add_subfigure(spec)

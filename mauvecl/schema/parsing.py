@@ -10,12 +10,18 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
 
+def refusal(name: str, text: str, expected: str, more: str = "") -> InputError:
+    """Return the error of a value's text; its key is the parameter that a flag sets, or else the value's name."""
+    parameter = name.split()[0].strip("-").replace("-", "_")
+    return InputError(f"{name} {shortened(text)}{more}", expected, key=parameter, value=text)
+
+
 def number(text: str, name: str) -> float:
     """Read a number."""
     try:
         return float(text)
     except ValueError as error:
-        raise InputError(f"{name} {shortened(text)}, expected a number") from error
+        raise refusal(name, text, "a number") from error
 
 
 def count(text: str, name: str) -> int:
@@ -27,7 +33,7 @@ def count(text: str, name: str) -> int:
     except InvalidOperation:
         exact, whole = Decimal(0), None
     if whole is None or whole != exact:
-        raise InputError(f"{name} {shortened(text)}, expected a whole number, such as 1000000 or 1e6")
+        raise refusal(name, text, "a whole number, such as 1000000 or 1e6")
     return whole
 
 
@@ -49,17 +55,15 @@ def axis(text: str, name: str) -> dict[str, Any]:
         try:
             return {"quantity": quantity, "values": parts if quantity == "star" else [float(part) for part in parts]}
         except ValueError as error:
-            raise InputError(f"{name} {text!r}, expected numbers, such as {quantity}=5,50,600") from error
+            raise refusal(name, text, f"numbers, such as {quantity}=5,50,600") from error
     parts = text.split(":")
     try:
         quantity, start, stop, steps, *rest = parts
         spaced = {"quantity": quantity, "start": float(start), "stop": float(stop), "steps": int(steps)}
     except ValueError as error:
-        raise InputError(
-            f"{name} {text!r}, expected quantity:start:stop:steps, with :log behind it if wanted, or quantity=a,b,c"
-        ) from error
+        raise refusal(name, text, "quantity:start:stop:steps, the same with :log, or quantity=a,b,c") from error
     if rest not in ([], ["log"]):
-        raise InputError(f"{name} {text!r} ends in {':'.join(rest)!r}, expected log or nothing")
+        raise refusal(name, text, "log or nothing", f" ends in {':'.join(rest)!r}")
     return spaced | {"log": bool(rest)}
 
 
@@ -74,28 +78,28 @@ def line_fluxes(texts: Sequence[str], name: str) -> dict[str, float]:
     for text in texts:
         line, equals, value = (part.strip() for part in text.rpartition("="))
         if not (line and equals):
-            raise InputError(f"{name} {shortened(text)}, expected NAME=FLUX, such as 'Mg II=0.05'")
+            raise refusal(name, text, "NAME=FLUX, such as 'Mg II=0.05'")
         lines[line] = number(value, f"{name} {shortened(text)}:")
     return lines
 
 
 def gaps(texts: Sequence[str], name: str) -> list[tuple[float, float]]:
     """Read ranges of time such as 1000:2000."""
-    return [_pair(text, f"{name} {text!r}, expected two times in s, such as 1000:2000") for text in texts]
+    return [_pair(text, name, "two times in s, such as 1000:2000") for text in texts]
 
 
 def declinations(text: str, name: str) -> tuple[float, float] | str:
     """Read a range of declinations such as -46.4:31.8, or none."""
     if text.strip().lower() == "none":
         return "none"
-    return _pair(text, f"{name} {shortened(text)}, expected low:high in degrees, or none")
+    return _pair(text, name, "low:high in degrees, or none")
 
 
-def _pair(text: str, fault: str) -> tuple[float, float]:
+def _pair(text: str, name: str, expected: str) -> tuple[float, float]:
     try:
         low, high = (float(part) for part in text.split(":"))
     except ValueError as error:
-        raise InputError(fault) from error
+        raise refusal(name, text, expected) from error
     return low, high
 
 
@@ -108,4 +112,4 @@ def _frame(text: str, name: str) -> int:
     try:
         return int(text)
     except ValueError as error:
-        raise InputError(f"{name} {shortened(text)}, expected stack, all, or numbers such as 0,4,9") from error
+        raise refusal(name, text, "stack, all, or numbers such as 0,4,9") from error

@@ -33,11 +33,11 @@ def local(address: str) -> bool:
         If it is empty, or no address or name that this machine knows.
     """
     if not address.strip():
-        raise InputError("address = '' is empty, expected one such as 127.0.0.1, ::1 or 0.0.0.0")
+        raise InputError("address = '' is empty", "one such as 127.0.0.1, ::1 or 0.0.0.0", key="address", value=address)
     try:
         known = {str(info[4][0]).split("%")[0] for info in socket.getaddrinfo(address, None, type=socket.SOCK_STREAM)}
     except (OSError, UnicodeError) as error:
-        raise InputError(f"address = {shortened(address)} is unknown here, expected one such as 127.0.0.1") from error
+        raise InputError.of("address", address, "one such as 127.0.0.1") from error
     return all(ipaddress.ip_address(one).is_loopback for one in known)
 
 
@@ -61,7 +61,7 @@ def origin(text: str) -> str:
     """
     host = re.sub(r"^https?://", "", text.strip().lower()).removesuffix("/")
     if re.fullmatch(HOST, host) is None:
-        raise InputError(f"allow_origin = {shortened(text)}, expected one host such as https://mauve.example.org")
+        raise InputError.of("allow_origin", text, "one host such as https://mauve.example.org")
     return plain(host)
 
 
@@ -84,8 +84,10 @@ def hosts(address: str, port: int, allowed: Iterable[str]) -> frozenset[str]:
     named = {origin(text) for text in allowed}
     if not local(address) and not named:
         raise InputError(
-            f"address = {shortened(address)} lets in other machines, expected `allow_origin` with the address that "
-            "visitors' browsers will show, such as https://mauve.example.org"
+            f"address = {shortened(address)} lets in other machines",
+            "`allow_origin` with the address that visitors' browsers will show, such as https://mauve.example.org",
+            key="address",
+            value=address,
         )
     own = {"127.0.0.1", "localhost", "::1"} | ({address} if local(address) else set())
     return frozenset(plain(netloc(one, port)) for one in own) | named

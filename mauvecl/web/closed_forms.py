@@ -61,7 +61,9 @@ class ClosedForms:
         quiet, flare = case.expectations
         one, setting = STATISTICS[q.statistic], case.setting(quiet, flare)
         if not setting.used.any():
-            raise InputError(f"every pixel of {quiet.name} is saturated, expected a fainter star")
+            raise InputError(
+                f"every pixel of {quiet.name} is saturated", "a fainter star", key="star", value=quiet.name
+            )
         one.check(setting)
         odds = one.detection_forms(setting, flare, q.fap)
         chance = float("nan") if flare.saturated[setting.used].all() else odds.probability

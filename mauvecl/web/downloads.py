@@ -65,10 +65,12 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
     from mauvecl.answers.report import write_table
 
     if name not in tab.files or ending not in ("ecsv", "fits", "study"):
-        raise InputError(f"{tab.title} has no file {name[:40]!r}.{ending[:10]}, expected one of its own")
+        raise InputError(
+            f"{tab.title} has no file {name[:40]!r}.{ending[:10]}", "one of its own", key="name", value=name
+        )
     wanted = tab.files[name]
     if wanted is not None and wanted not in answers:
-        raise InputError(f"no {name} is computed yet, expected a simulation first")
+        raise InputError(f"no {name} is computed yet", "a simulation first", key="name", value=name)
     if ending == "study":
         return study_file(tab.study(name, closed, answers), f"mauvecl-{name}")
     with tempfile.TemporaryDirectory() as folder:

@@ -55,16 +55,16 @@ class Number:
     def __call__(self, text: str) -> float | int:
         """Parse the number; an error states what is accepted."""
         kind = "a whole number" if self.whole else "a number"
-        accepted = f"expected {self.range.words(self.unit, whole=self.whole)}"
+        accepted = self.range.words(self.unit, whole=self.whole)
         form = r"[+-]?\d+" if self.whole else r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?"
         if not text.strip():
-            raise InputError(f"nothing is entered, {accepted}")
+            raise InputError("nothing is entered", accepted, key="number", value=text)
         if re.fullmatch(form, text.strip(), flags=re.ASCII) is None:
             point = ", with a point for decimals" if "," in text else ""
-            raise InputError(f"{shortened(text)} is not {kind}, {accepted}{point}")
+            raise InputError(f"{shortened(text)} is not {kind}", f"{accepted}{point}", key="number", value=text)
         value = int(text) if self.whole else float(text)
         if value not in self.range:
-            raise InputError(f"{shortened(text.strip())} is out of range, {accepted}")
+            raise InputError(f"{shortened(text.strip())} is out of range", accepted, key="number", value=value)
         return value
 
 
@@ -83,7 +83,9 @@ class Choice:
     def __call__(self, text: str) -> Any:
         """Parse the value; an error states what is accepted."""
         if text not in self.options:
-            raise InputError(f"{shortened(text)} is no choice here, expected one of {', '.join(self.options)}")
+            raise InputError(
+                f"{shortened(text)} is no choice here", f"one of {', '.join(self.options)}", key="choice", value=text
+            )
         return self.made(text)
 
 
@@ -91,7 +93,9 @@ def several(text: str) -> tuple[str, ...]:
     """Parse names of simulations, without repetitions."""
     names = [name for name in text.split(",") if name]
     if len(names) > len(SIMULATIONS) or not set(names) <= SIMULATIONS.keys():
-        raise InputError(f"{shortened(text)} is no simulation, expected some of {', '.join(SIMULATIONS)}")
+        raise InputError(
+            f"{shortened(text)} is no simulation", f"some of {', '.join(SIMULATIONS)}", key="simulated", value=text
+        )
     return tuple(dict.fromkeys(names))
 
 
@@ -102,10 +106,17 @@ def points(text: str) -> tuple[tuple[float, float], ...] | None:
     number = Number(Range(-1e30, 1e30))
     pairs = [pair.split() for pair in text.split(",") if text.strip()]
     if any(len(pair) != 2 for pair in pairs):
-        raise InputError(f"{shortened(text)} is no spectrum, expected pairs of nm and DN with commas between them")
+        raise InputError(
+            f"{shortened(text)} is no spectrum",
+            "pairs of nm and DN with commas between them",
+            key="own_unknown",
+            value=text,
+        )
     spectrum = tuple((float(number(nm)), float(number(dn))) for nm, dn in pairs)
     if any(low >= high for (low, _), (high, _) in itertools.pairwise(spectrum)):
-        raise InputError(f"{shortened(text)} does not ascend in nm, expected pairs of nm and DN that do")
+        raise InputError(
+            f"{shortened(text)} does not ascend in nm", "pairs of nm and DN that do", key="own_unknown", value=text
+        )
     return spectrum
 
 
@@ -123,7 +134,7 @@ def line_fluxes(text: str) -> tuple[tuple[str, float], ...]:
         (EmissionLine.named(name).name, float(number_of(LineFraction)(value))) for name, _, value in pairs
     )
     if len(dict(fractions)) < len(fractions):
-        raise InputError(f"{shortened(text)} holds a line twice, expected each once")
+        raise InputError(f"{shortened(text)} holds a line twice", "each once", key="lines", value=text)
     return fractions
 
 
@@ -145,10 +156,12 @@ def star_name(text: str) -> str:
     if text == UPLOADED:
         return UPLOADED
     if not text.strip():
-        raise InputError("no star is chosen, expected a name of the library, or an upload")
+        raise InputError("no star is chosen", "a name of the library, or an upload", key="star", value=text)
     entry = embedded(_spaced().get(_key(text), text))
     if entry is None:
-        raise InputError(f"{shortened(text)} is not in the library, expected a name such as G2V, HD 40307 or Vega")
+        raise InputError(
+            f"{shortened(text)} is not in the library", "a name such as G2V, HD 40307 or Vega", key="star", value=text
+        )
     return entry["name"]
 
 
@@ -161,8 +174,10 @@ def seen_target(text: str) -> str:
             Target.of(text)
     except InputError as error:
         raise InputError(
-            f"{shortened(text)} is neither a target of the list nor coordinates, expected a name such as eps Eri or "
-            "AU Mic, or coordinates such as 53.23 -9.46"
+            f"{shortened(text)} is neither a target of the list nor coordinates",
+            "a name such as eps Eri or AU Mic, or coordinates such as 53.23 -9.46",
+            key="see",
+            value=text,
         ) from error
     return text
 

@@ -65,7 +65,7 @@ class Question:
         if self.uploaded is None:
             return Study.build(self.data(), "page")
         if folder is None:
-            raise InputError("no folder for the uploaded star")
+            raise InputError("no folder for the uploaded star", "a folder", key="folder")
         return Study.build(self.data(str(write_spectrum(self.uploaded, folder))), "page")
 
     def data(self, file: str = STAR_FILE) -> dict[str, Any]:

@@ -47,7 +47,7 @@ def read_limited(content: bytes) -> Source:
         If it holds no usable spectrum, or reading it takes more memory or time than allowed.
     """
     if not _turns.acquire(timeout=SECONDS):
-        raise InputError("too many uploads are read at the same time, expected yours again in a minute")
+        raise InputError("too many uploads are read at the same time", "yours again in a minute", key="upload")
     try:
         answer = _read_apart(content)
     finally:
@@ -85,20 +85,26 @@ def _read_apart(content: bytes) -> bytes:
             )
         except subprocess.TimeoutExpired as error:
             raise InputError(
-                f"the upload takes more than {SECONDS} s to read, expected a spectrum of some thousand points"
+                f"the upload takes more than {SECONDS} s to read", "a spectrum of some thousand points", key="upload"
             ) from error
         except OSError as error:
-            raise InputError(f"the upload cannot be read now ({error.strerror}), expected it again later") from error
+            raise InputError(
+                f"the upload cannot be read now ({error.strerror})",
+                "it again later",
+                key="upload",
+                value=error.strerror,
+            ) from error
     if done.returncode == 0:
         return done.stdout
     if done.returncode == _REFUSED:
-        raise InputError(done.stderr.decode("utf-8", "replace").strip())
+        raise InputError(done.stderr.decode("utf-8", "replace").strip(), key="upload")
     if done.returncode == _NO_ROOM:
         raise InputError(
-            f"the upload takes more than {MEMORY_MIB} MiB of memory to read, expected a spectrum of some thousand "
-            "points"
+            f"the upload takes more than {MEMORY_MIB} MiB of memory to read",
+            "a spectrum of some thousand points",
+            key="upload",
         )
-    raise InputError("the upload ends its reader, expected a spectrum as text, ECSV, VOTable or FITS")
+    raise InputError("the upload ends its reader", "a spectrum as text, ECSV, VOTable or FITS", key="upload")
 
 
 def _here() -> str:

@@ -73,8 +73,10 @@ def campaign_plan(study: Study) -> PlanAnswer:
     for name in study.orbit.targets:
         if Target.of(name).spectral_type is None:
             raise InputError(
-                f"neither type nor magnitude nor distance of {shortened(name)} are known, expected a target of the "
-                "list, such as eps Eri or AU Mic"
+                f"neither type nor magnitude nor distance of {shortened(name)} are known",
+                "a target of the list, such as eps Eri or AU Mic",
+                key="see",
+                value=name,
             )
     data = study.model_dump()
     data["plan"] |= {"targets": [{"name": name} for name in study.orbit.targets], "completeness": "closed form"}

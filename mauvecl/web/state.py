@@ -57,10 +57,14 @@ class State:
             self.faults.pop(name, None)
             try:
                 if len(text) > MOST_CHARACTERS:
-                    raise InputError(f"{shortened(text)} is too long, expected at most {MOST_CHARACTERS} characters")
+                    raise InputError(
+                        f"{shortened(text)} is too long", f"at most {MOST_CHARACTERS} characters", key=name, value=text
+                    )
                 value = self._fields[name].read(text)
                 if (text == UPLOADED and self.uploaded is None) or (text == UPLOADED_UNKNOWN and self.unknown is None):
-                    raise InputError(f"the {text} is not here, expected its file again: links do not hold it")
+                    raise InputError(
+                        f"the {text} is not here", "its file again: links do not hold it", key=name, value=text
+                    )
                 self._values[name] = value
             except InputError as error:
                 self.faults[name] = str(error)
@@ -114,7 +118,7 @@ class State:
             If some field is not right, with what each accepts.
         """
         if self.faults:
-            raise InputError(self.fault)
+            raise InputError(self.fault, key=next(iter(self.faults)))
         values = {name: self._values[name] for name in FIELDS}
         if values["own_unknown"] is None:
             values["own_unknown"] = self.unknown

@@ -44,10 +44,15 @@ def read_upload(name: str, content: bytes) -> Source:
         exception is told to the visitor too.
     """
     if len(content) > MOST_UPLOADED:
-        raise InputError(too_large(len(content)))
+        raise InputError(too_large(len(content)), key="upload", value=len(content))
     source = read_limited(content)
     if source.wavelength_nm.size > MOST_POINTS:
-        raise InputError(f"upload of {source.wavelength_nm.size} points, expected at most {MOST_POINTS}")
+        raise InputError(
+            f"upload of {source.wavelength_nm.size} points",
+            f"at most {MOST_POINTS}",
+            key="points",
+            value=source.wavelength_nm.size,
+        )
     return replace(source, name=UPLOADED, origin="upload")
 
 
@@ -60,14 +65,24 @@ def read_pairs(name: str, content: bytes) -> Points:
         If it is too large or holds no such columns.
     """
     if len(content) > MOST_PAIRS_BYTES:
-        raise InputError(f"upload of {len(content) / 1024:.0f} KiB, expected at most {MOST_PAIRS_BYTES // 1024} KiB")
+        raise InputError(
+            f"upload of {len(content) / 1024:.0f} KiB",
+            f"at most {MOST_PAIRS_BYTES // 1024} KiB",
+            key="upload",
+            value=len(content),
+        )
     try:
         text = content.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise InputError(f"{shortened(name)} is no text, expected two columns, nm and DN") from error
+        raise InputError(f"{shortened(name)} is no text", "two columns, nm and DN", key="upload", value=name) from error
     pairs = columns(f"upload {shortened(name)}", text)
     if pairs.ndim != 2 or pairs.shape[1] != 2 or not 2 <= len(pairs) <= MOST_PAIRS:
-        raise InputError(f"{shortened(name)} has other rows, expected 2 to {MOST_PAIRS} of two numbers, nm and DN")
+        raise InputError(
+            f"{shortened(name)} has other rows",
+            f"2 to {MOST_PAIRS} of two numbers, nm and DN",
+            key="upload",
+            value=name,
+        )
     if not np.isfinite(pairs).all() or (np.diff(pairs[:, 0]) <= 0).any():
-        raise InputError(f"{shortened(name)} does not ascend in nm, expected rows that do")
+        raise InputError(f"{shortened(name)} does not ascend in nm", "rows that do", key="upload", value=name)
     return tuple((float(nm), float(dn)) for nm, dn in pairs)

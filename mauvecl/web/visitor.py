@@ -255,7 +255,7 @@ class Visitor(WebSocketHandler):
         key = self._key(state)
         closed = await self._beside(partial(self.closed, state))
         if self.job is not None:
-            raise InputError("there is a simulation already, expected its end first")
+            raise InputError("there is a simulation already", "its end first", key="simulate", value=kind)
         job = self.job = Job(partial(SIMULATIONS[kind], closed.study), drawing=kind in DRAWING)
         done = asyncio.wrap_future(job.future)
         try:

@@ -16,6 +16,7 @@ from unittest import mock
 import numpy as np
 import pytest
 from commands import ended, run
+from refusals import refused as refused_by_key
 
 from mauvecl.cli import foresight
 from mauvecl.schema.errors import InputError
@@ -221,7 +222,7 @@ def test_manifests_that_are_none(content: str, tmp_path: Path) -> None:
     from mauvecl.runs.checkpoint import Checkpoint
 
     with (
-        pytest.raises(InputError, match="is not mauvecl's, expected another output folder"),
+        refused_by_key("folder"),
         Checkpoint(tmp_path / "run", "detect", Study(), resume=True),
     ):
         pass
@@ -353,7 +354,7 @@ def test_how_long_a_year_is() -> None:
     here = {"device": None, "cluster": None}
     foresight.question_time(study.with_settings([f"run.realisations={int(year * 0.99)}"]), **here, insist=False)
     longer = study.with_settings([f"run.realisations={int(year * 1.01)}"])
-    with pytest.raises(InputError, match="1 years"):
+    with refused_by_key("realisations", expected="less than a year"):
         foresight.question_time(longer, **here, insist=False)
     foresight.question_time(longer, **here, insist=True)
     foresight.question_time(longer, device="0", cluster=None, insist=False)
@@ -361,7 +362,7 @@ def test_how_long_a_year_is() -> None:
     swept = longer.with_settings(["run.realisations=1", "sweep.axes=[{quantity='magnitude', values=[4, 5]}]"])
     assert swept.sweep.size == 2
     beyond = study.with_settings([f"run.realisations={2**63}"])
-    with pytest.raises(InputError, match="63 bits"):
+    with refused_by_key("realisations", expected="63 bits"):
         foresight.question_time(beyond, **here, insist=True)
 
 
@@ -382,7 +383,7 @@ def test_what_the_disk_has_no_room_for_is_questioned(tmp_path: Path) -> None:
         fits = Store(tmp_path / "s.zarr", study.with_settings([f"run.realisations={most}"]))
         foresight.question_room(fits, insist=False)
         more = Store(tmp_path / "s.zarr", study.with_settings([f"run.realisations={most + 1}"]))
-        with pytest.raises(InputError, match="--insist"):
+        with refused_by_key("realisations", value=most + 1):
             foresight.question_room(more, insist=False)
         foresight.question_room(more, insist=True)
 
@@ -398,25 +399,25 @@ def test_uploads_are_read_apart(tmp_path: Path) -> None:
     write_star(tmp_path / "star.txt")
     content = (tmp_path / "star.txt").read_bytes()
     assert sandboxed_reader.read_limited(content).digest == Source.read(tmp_path / "star.txt").digest
-    with pytest.raises(InputError, match="not numeric"):
+    with pytest.raises(InputError):
         sandboxed_reader.read_limited(b"200 a\n300 b\n")
     # Limits hold in the other process, whatever is read there.
     with (
         mock.patch.object(sandboxed_reader, "MEMORY_MIB", 64),
-        pytest.raises(InputError, match=r"memory|ends its reader"),
+        refused_by_key("upload"),
     ):
         sandboxed_reader.read_limited(b"".join(b"%f 1e-12\n" % nm for nm in np.linspace(170.0, 800.0, 150_000)))
     started = time.monotonic()
-    with mock.patch.object(sandboxed_reader, "SECONDS", 0.05), pytest.raises(InputError, match=r"more than 0\.05 s"):
+    with mock.patch.object(sandboxed_reader, "SECONDS", 0.05), refused_by_key("upload", "0.05 s"):
         # Python itself takes longer to start.
         sandboxed_reader.read_limited(content)
-    with pytest.raises(InputError, match=r"unpacks to more than 64 MiB"):
+    with pytest.raises(InputError, match="64 MiB"):
         sandboxed_reader.read_limited(gzip.compress(bytes(70 << 20)))
     assert time.monotonic() - started < 10.0
     with mock.patch.object(sandboxed_reader, "SECONDS", 0):
         turns = [sandboxed_reader._turns.acquire() for _ in range(sandboxed_reader.TOGETHER)]
         try:
-            with pytest.raises(InputError, match="too many uploads"):
+            with refused_by_key("upload"):
                 sandboxed_reader.read_limited(content)
         finally:
             for _ in turns:

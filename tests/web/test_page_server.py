@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import run
+from refusals import refused
 
 pytest.importorskip("bokeh")
 
@@ -65,7 +66,7 @@ def test_no_number_is_guessed(name: str, text: str) -> None:
     state.enter({name: text})
     assert re.search(r"expected a (whole )?number from \S+ to \S+", state.faults[name]), "what it accepts"
     assert state.entered[name] == text, "what stands there stays"
-    with pytest.raises(InputError, match=re.escape(FIELDS[name].label)):
+    with refused(name, FIELDS[name].label):
         state.question()
     state.enter({name: FIELDS[name].first})
     assert not state.faults
@@ -78,7 +79,7 @@ def test_ranges_end_where_they_say(name: str) -> None:
     for end in (read.low, read.high):
         assert read(f"{end:.17g}") == end
     for beyond in (read.low - 1, 2 * read.high + 1):
-        with pytest.raises(InputError, match="out of range"):
+        with refused("number"):
             read(f"{beyond:.15g}")
 
 
@@ -118,7 +119,7 @@ def test_a_plan_needs_a_target_that_is_known() -> None:
     state.enter({"see": "12 34", "hours": "50"})
     study = state.question().study()
     assert study.plan.hours == 50.0
-    with pytest.raises(InputError, match="neither type nor magnitude nor distance of '12 34' are known, expected"):
+    with refused("see", value="12 34"):
         campaign_plan(study)
 
 
@@ -332,8 +333,10 @@ def test_bombs_end_in_a_sentence_and_take_little(bomb: Callable[[], bytes]) -> N
         return used.ru_utime + used.ru_stime, used.ru_maxrss
 
     before, most = spent()
-    with pytest.raises(InputError, match=r", expected [^\n]*$"):
+    with pytest.raises(InputError) as error:
         read_upload("star.fits", content)
+    assert error.value.expected
+    assert "\n" not in str(error.value)
     # The clock's limit is the reader's own; processor time is the same on a busy machine, 3 s with the start of Python.
     assert spent()[0] - before < 10.0
     # The largest of all processes that these tests have started, in KiB; others may have been larger, and a child is as
@@ -347,8 +350,9 @@ def test_an_unknown_spectrum_by_upload() -> None:
     assert found == ((200.0, 1.0), (450.0, 3.5), (700.0, 1.0))
     odd = b"", b"200 1\n", b"200 1 2\n300 1 2\n", b"300 1\n200 1\n", b"\xff\xfe", b"a b\nc d\n", b"1 nan\n2 1\n"
     for wrong in (*odd, b"1 1\n" * 100_000):
-        with pytest.raises(InputError, match="expected"):
+        with pytest.raises(InputError) as error:
             read_pairs("stray.txt", wrong)
+        assert error.value.expected
     state = State(unknown=found)
     state.enter({"own_unknown": UPLOADED_UNKNOWN})
     assert state.question().study().nuisances.own["own"].points == found
@@ -607,9 +611,8 @@ def test_every_table_is_the_same_bytes_on_the_command_line(served: Any, tmp_path
     again = Study.read(folder / "out" / "detection.ecsv")
     assert again.star[0].file == (folder / "star.ecsv").resolve()
     (folder / "star.ecsv").write_bytes(star_file(tmp_path / "other.txt"))
-    with pytest.raises(InputError) as error:
+    with refused("file", value="star.ecsv"):
         Study.read(folder / "out" / "detection.ecsv")
-    assert (error.value.key, error.value.value) == ("file", "star.ecsv")
 
 
 @pytest.mark.parametrize(
@@ -654,16 +657,11 @@ def test_command_and_program_are_the_question(link: str, tmp_path: Path) -> None
 
 
 def test_addresses_are_checked_before_anything_is_served() -> None:
-    with pytest.raises(InputError, match="is empty"):
-        access.hosts("", 5006, [])
-    with pytest.raises(InputError, match="expected `allow_origin`"):
-        access.hosts("0.0.0.0", 5006, [])
-    with pytest.raises(InputError, match="expected `allow_origin`"):
-        access.hosts("::", 5006, [])
-    with pytest.raises(InputError, match="unknown here"):
-        access.hosts("no such host", 5006, [])
+    for address in ("", "0.0.0.0", "::", "no such host"):
+        with refused("address", value=address):
+            access.hosts(address, 5006, [])
     for wrong in ("*", "http://*", "", "a b", "https://x/path", "x:port", "x,y"):
-        with pytest.raises(InputError, match="expected one host"):
+        with refused("allow_origin", value=wrong):
             access.hosts("0.0.0.0", 5006, [wrong])
     assert access.hosts("127.0.0.1", 5006, []) == {"127.0.0.1:5006", "localhost:5006", "[::1]:5006"}
     assert access.hosts("0.0.0.0", 5006, ["https://Mauve.example.org/"]) >= {"mauve.example.org"}

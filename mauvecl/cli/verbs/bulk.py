@@ -54,7 +54,9 @@ def realise(study: Study, session: Session) -> None:
     place = session.output or Path("mauvecl-frames.zarr")
     one_file = place.suffix in ENDINGS
     if not one_file and place.suffix not in ("", ".zarr"):
-        raise InputError(f"--output {str(place)!r}, expected a name ending in .zarr, {', '.join(ENDINGS)}")
+        raise InputError(
+            f"--output {str(place)!r}", f"a name ending in .zarr, {', '.join(ENDINGS)}", key="output", value=str(place)
+        )
     folder = bulk.unfinished(place) if one_file else place
     question_room(Store(folder, study), insist=session.insist)
     with (
@@ -138,8 +140,11 @@ def verify(
     if is_answer(store):
         if repair or redraw or rows is not None:
             raise InputError(
-                f"{str(store)!r} is the folder of an answer, expected no --repair, --redraw or --rows, which are for "
-                "stores: the same command with --restart writes the answer again"
+                f"{str(store)!r} is the folder of an answer",
+                "no --repair, --redraw or --rows, which are for stores: the same command with "
+                "--restart writes the answer again",
+                key="store",
+                value=str(store),
             )
         _verify_answer(store, as_json=as_json)
         return
@@ -214,4 +219,4 @@ def _rows_of(text: str | None) -> tuple[int, int] | None:
     try:
         return int(first), int(stop)
     except ValueError as error:
-        raise InputError(f"--rows {text!r}, expected a range such as 1000:2000") from error
+        raise InputError(f"--rows {text!r}", "a range such as 1000:2000", key="rows", value=text) from error

@@ -90,7 +90,7 @@ def add(
     from mauvecl.schema.errors import InputError
 
     if name is not None and len(files) > 1:
-        raise InputError(f"--name {name!r} for {len(files)} files, expected one file")
+        raise InputError(f"--name {name!r} for {len(files)} files", "one file", key="name", value=name)
     for file in files:
         star = add(file, name, replace=replace, wavelength_unit=wavelength_unit, flux_unit=flux_unit, extend=extend)
         _tell(star, quiet)

@@ -36,12 +36,15 @@ def serve(
 
     number = within(port, "--port", read=count, low=1, high=65535)
     if find_spec("bokeh") is None or find_spec("tornado") is None:
-        raise InputError("Bokeh is missing, expected it for the page: pip install 'mauvecl[web]'")
+        raise InputError("Bokeh is missing", "it for the page: pip install 'mauvecl[web]'", key="bokeh")
     from mauvecl.web.server import serve
 
     try:
         serve(address, number, show=show, allow_origin=allow_origin or ())
     except OSError as error:
         raise InputError(
-            f"port {port} of {shortened(address)} cannot be used ({error.strerror}), expected another: --port"
+            f"port {port} of {shortened(address)} cannot be used ({error.strerror})",
+            "another: --port",
+            key="port",
+            value=port,
         ) from error
