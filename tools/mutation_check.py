@@ -60,7 +60,7 @@ MUTATIONS = {
     "sums of stares without their skewness": Mutation(
         (
             ("kernels/stare_sums.cl.mako", "x${a} = FMA(s${name(a, b, c)}, q${b}${c}, x${a});", ";"),
-            ("mauvecl/lightcurve/stares/twin.py", "total = fma(of(skew, a, b, d), q, total)", "pass"),
+            ("mauvecl/lightcurve/stares/reference.py", "total = fma(of(skew, a, b, d), q, total)", "pass"),
         ),
         "tests/lightcurve/test_draws.py::test_sums_by_cumulants_are_distributed_as_by_pixels[cold]",
     ),
@@ -68,7 +68,7 @@ MUTATIONS = {
         (
             ("kernels/stare_sums.cl.mako", "(uintv)first_high, number,", "(uintv)first_high, number & (uintv)0u,"),
             (
-                "mauvecl/lightcurve/stares/twin.py",
+                "mauvecl/lightcurve/stares/reference.py",
                 'words_at(numbers, int(scene.numbers[frame]), "stare_',
                 'words_at(numbers, 0, "stare_',
             ),
@@ -87,7 +87,7 @@ MUTATIONS = {
                 "FMA(0.0f * light, (floatv)m->photon_variance, FMA(strengths.dark",
             ),
             (
-                "mauvecl/lightcurve/stares/twin.py",
+                "mauvecl/lightcurve/stares/reference.py",
                 'fma(light, m["photon_variance"], fma(',
                 'fma(0 * light, m["photon_variance"], fma(',
             ),
@@ -102,7 +102,7 @@ MUTATIONS = {
                 "_padded(np.arange(stare.n_frames), np.uint32)",
             ),
         ),
-        "tests/lightcurve/test_twin.py::test_a_split_changes_no_bit[cumulants]",
+        "tests/lightcurve/test_stare_reference.py::test_a_split_changes_no_bit[cumulants]",
     ),
     "a shard's flares from the first": Mutation(
         (("mauvecl/device/stares.py", "request.flares.part(first - request.start,", "request.flares.part(done,"),),

@@ -32,13 +32,7 @@ FITS_KEYWORDS = {"name": "OBJECT", "exposure_s": "EXPTIME", "frames": "NFRAMES",
 
 
 def make_folder(path: Path) -> Path:
-    """A folder to write to.
-
-    Raises
-    ------
-    InputError
-        If it cannot be made or written to.
-    """
+    """Make a folder; raises InputError if it cannot be made or written to."""
     if path.exists() and not path.is_dir():
         raise InputError(
             f"output folder {str(path)!r} is a file", "the name of a folder", key="output", value=str(path)
@@ -59,7 +53,7 @@ def make_folder(path: Path) -> Path:
 
 
 def write_table(table: Table, path: Path) -> Path:
-    """A table as ECSV, or as FITS by the file's ending; whole or not at all.
+    """Write a table as ECSV, or as FITS by the file's ending, atomically.
 
     Raises
     ------
@@ -78,7 +72,7 @@ def write_table(table: Table, path: Path) -> Path:
 
 
 def ecsv_text(table: Table) -> str:
-    """A table as astropy writes it, to the last byte, in a third of the time where there are many rows."""
+    """Return a table as ECSV text with the bytes of astropy's writer, but faster for many rows."""
     text = io.StringIO()
     cells = [_words(column) for column in table.itercols()]
     if None in cells:
@@ -90,7 +84,7 @@ def ecsv_text(table: Table) -> str:
 
 
 def _words(column: Any) -> list[str] | None:
-    """The cells of a column one by one; None for masked ones, and for columns of anything but numbers and text."""
+    """Return the cells of a column as text, or None if it is masked or contains anything but numbers and text."""
     import numpy as np
 
     values = np.asarray(column)
@@ -111,13 +105,13 @@ def _quoted(word: str) -> str:
 
 
 def write_document(content: bytes, path: Path) -> Path:
-    """A file that is there already as bytes; errors as `write_table`."""
+    """Write a file from its bytes; errors as for `write_table`."""
     write_whole(path, content)
     return path
 
 
 def write_study(study: Study, folder: Path) -> Path:
-    """The study, to be run again as it was; errors as `write_table`."""
+    """Write the study; errors as for `write_table`."""
     path = folder / "study.toml"
     write_whole(path, study.toml().encode())
     return path
@@ -136,7 +130,7 @@ def write_record(
     files: Sequence[Path] | None = None,
     whole: bool = True,
 ) -> Path:
-    """The run record: what made this answer.
+    """Write the run record, which says how an answer was computed.
 
     Parameters
     ----------
@@ -235,7 +229,7 @@ def _versions(*names: str) -> dict[str, str]:
 
 
 def rows(table: Table) -> list[dict[str, Any]]:
-    """A table as plain rows, for JSON; units are in the table's file."""
+    """Return a table as rows for JSON; the units are in the table's file."""
     return [{name: _plain(row[name]) for name in table.colnames} for row in table]
 
 

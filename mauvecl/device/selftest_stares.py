@@ -13,7 +13,7 @@ from mauvecl.device.engine import Engine
 from mauvecl.device.program import SAME_BITS
 from mauvecl.device.selftest import COUNT, SEED, START, Check, toy
 from mauvecl.device.stares import Stares
-from mauvecl.lightcurve.stares import twin
+from mauvecl.lightcurve.stares import reference
 from mauvecl.lightcurve.stares.components import Components
 from mauvecl.lightcurve.stares.requests import Arrays, StaresRequest
 from mauvecl.lightcurve.stares.scene import Flares, StareScene
@@ -40,7 +40,7 @@ def stares(engine: Engine) -> Iterator[Check]:
         stare = Stare.of(100.0, gaps=[(10.0, 40.0)], **wobble)
         given = np.linspace(0.0, 2.0, COUNT * stare.n_frames).reshape(COUNT, stare.n_frames, 1)
         flares, frames = Flares.of(components, stare, given, None, COUNT), range(stare.n_frames)
-        for method, slow in (("pixels", twin.pixels), ("cumulants", twin.sums)):
+        for method, slow in (("pixels", reference.pixels), ("cumulants", reference.sums)):
             processes = Processes(cosmic_rays=CosmicRays(rate_per_cm2_s=300.0)) if method == "pixels" else NONE
             how: dict[str, Any] = {"seed": SEED, "method": method, "processes": processes}
             ours = Stares(engine.open_device).frames(components, stare, given, first=START, count=COUNT, **how)
@@ -53,7 +53,7 @@ def stares(engine: Engine) -> Iterator[Check]:
             yield Check(f"same bits as the NumPy reference: {name}, by {method}", passed, text)
         request = StaresRequest(components, stare, COUNT, SEED, start=START, reduction=Glow(), glow=True)
         ours = Stares(engine.open_device).reduced(request)["glow"]
-        theirs = twin.glow(StareScene.of(components, stare), index, frames, SEED)
+        theirs = reference.glow(StareScene.of(components, stare), index, frames, SEED)
         apart = float(np.abs(ours - theirs).max())
         passed = bool((ours == theirs).all()) if engine.device.promise == SAME_BITS else apart < 0.2
         yield Check(f"same bits as the NumPy reference: {name}, noise of flares", passed, f"{apart:.2g} apart")

@@ -12,7 +12,7 @@ from mauvecl.device.device import Device
 from mauvecl.device.stare_launches import StareLaunches
 from mauvecl.device.tiles import Progress, Tile, Tiles
 from mauvecl.lightcurve.stares.components import Components
-from mauvecl.lightcurve.stares.requests import Arrays, Kept, Method, StaresRequest, joined
+from mauvecl.lightcurve.stares.requests import Arrays, KeepStatistics, Method, StaresRequest, joined
 from mauvecl.lightcurve.stares.scene import Flares, StareScene, padded_frames
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.stares.sums import check_sums
@@ -147,7 +147,7 @@ class Stares:
         """
         there = shard or Shard(0, request.start, request.realisations)
         _check(there.start, there.count, request.seed, request.method)
-        components, stare, reduction = request.components, request.stare, request.reduction or Kept()
+        components, stare, reduction = request.components, request.stare, request.reduction or KeepStatistics()
         how = (request.seed, request.method, request.processes)
         scenarios = slice(None) if request.amplitudes is not None else 0
         parts = list[Arrays]()

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from mauvecl.host.sky.zodiacal import Sky
     from mauvecl.host.stars.source import Source
     from mauvecl.lightcurve.flares.events import Event
-    from mauvecl.lightcurve.stares.observed import StareExpectation
+    from mauvecl.lightcurve.stares.light_curves import StareExpectation
     from mauvecl.lightcurve.stares.stare import Stare
     from mauvecl.noise.processes import Processes
     from mauvecl.statistics.nuisances import Nuisances

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mauvecl.lightcurve.flares.energies import EnergyScale, Kind, amplitude_of, amplitude_of_peak
 from mauvecl.lightcurve.flares.events import Cooling, Event, check_seen, coefficients, temperatures_of
-from mauvecl.lightcurve.stares.observed import StareExpectation
+from mauvecl.lightcurve.stares.light_curves import StareExpectation
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.noise.unknowns import CHANGING, COURSES, Changing, default_spreads
 from mauvecl.schema.errors import InputError

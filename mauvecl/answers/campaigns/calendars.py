@@ -28,7 +28,7 @@ class Entry:
 
 
 def calendar_bytes(entries: Iterable[Entry], name: str) -> bytes:
-    """A calendar as the bytes of an .ics file."""
+    """Return a calendar as the bytes of an .ics file."""
     lines = [
         "BEGIN:VCALENDAR",
         "VERSION:2.0",

@@ -282,7 +282,7 @@ def plan(
     *,
     completeness: CompletenessOf | None = None,
 ) -> PlanAnswer:
-    """A campaign on a study's targets.
+    """Plan a campaign on a study's targets.
 
     Parameters
     ----------

@@ -22,17 +22,17 @@ LEGEND = (
 
 
 def two_digits(value: float) -> str:
-    """Return a number with two digits, or all that it has before the point."""
+    """Format a number with two significant digits, or without decimals if it is large."""
     return f"{value:.0f}" if value == 0 or value >= 9.95 else f"{value:#.2g}"
 
 
 def energy(value: float, unit: str = "") -> str:
-    """Return an energy with two digits, or that there is none."""
+    """Format an energy with two significant digits, or "none" if it is not finite."""
     return f"{value:.1e}{unit}" if math.isfinite(value) else "none"
 
 
 def months(names: str) -> str:
-    """Return months such as 2027-01 by name, each year after its own."""
+    """Return months such as 2027-01 by name, with their years."""
     years: dict[str, list[str]] = {}
     for name in names.split():
         years.setdefault(name[:4], []).append(calendar.month_abbr[int(name[5:])])
@@ -40,7 +40,7 @@ def months(names: str) -> str:
 
 
 def target_lines(answer: PlanAnswer, k: int) -> list[tuple[str, str, str]]:
-    """Return everything said of a target: what, how much, and the file and column that have it."""
+    """Return the lines on a target: quantity, value, and the file and column of the value."""
     one, observation = answer.planned[k], answer.planned[k].observation
     record = records(answer.table)[k]
     said = {column.name: column.text(record) for column in answer.columns if column.heading}
@@ -79,7 +79,7 @@ def target_lines(answer: PlanAnswer, k: int) -> list[tuple[str, str, str]]:
 
 
 def heading(answer: PlanAnswer) -> str:
-    """Return what the plan is, in a line."""
+    """Return a line with the number of targets and the time of the plan."""
     times = answer.seen.times
     targets = "1 target" if len(answer.planned) == 1 else f"{len(answer.planned)} targets"
     return f"{targets}, {times.days:g} days from {times.iso(0.0)[:10]} (UTC)"

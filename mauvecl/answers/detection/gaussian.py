@@ -151,7 +151,7 @@ def beyond(x: Expectation, sigmas: float) -> NDArray[np.float64]:
 
 
 def _promises(result: SnrResult) -> QTable:
-    """The formula's S/N and intervals beside the simulation's, one row per resolution element."""
+    """Return S/N and intervals of the formula and of the simulation, one row per resolution element."""
     table, x = result.element, result.expectation
     values = {name: np.asarray(table[name].value) for name in ("wavelength", "expected", "mean", "std")}
     values["error"] = values["std"] / np.sqrt(result.counts.n)
@@ -232,7 +232,7 @@ def _by_star(table: QTable, stars: int) -> list[QTable]:
 
 
 def _of_signal(result: SnrResult, elements: QTable) -> dict[str, float]:
-    """The worst of a star's S/N, and of the intervals made of it."""
+    """Return the largest errors of a star's S/N, and of the intervals that follow from it."""
     sure = elements[np.abs(elements["mean"] - elements["expected"]) > SURE * elements["error"]]
     worst = sure[np.argmax(np.abs(sure["mean"] - sure["expected"]))] if len(sure) else None
     x, rare = result.expectation, special.ndtr(-5.0)
@@ -248,7 +248,7 @@ def _of_signal(result: SnrResult, elements: QTable) -> dict[str, float]:
 
 
 def _of_thresholds(tested: QTable, flares: QTable) -> dict[str, float | str]:
-    """The worst of a star's false-alarm and detection probabilities."""
+    """Return the largest errors of a star's false-alarm and detection probabilities."""
     off = tested[tested["differs"]]
     wrong = off[np.argmax(np.abs(np.log(np.maximum(off["ratio"], SMALLEST_RATIO))))] if len(off) else None
     missed = flares["probability"] - flares["closed_form_probability"]
@@ -267,7 +267,7 @@ def _of_thresholds(tested: QTable, flares: QTable) -> dict[str, float | str]:
 def gaussian(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> GaussianReport:
-    """The usual formula beside the simulation, over magnitude and exposure or what else the study sweeps.
+    """Compare the usual formula with the simulation, over magnitude and exposure or the study's sweep.
 
     Parameters
     ----------

@@ -141,7 +141,7 @@ class MapResult(Answer):
 def map(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> MapResult:
-    """Detection probability of the study's first star and flare over its map's axes.
+    """Compute the detection probability of the study's first star and flare over two quantities.
 
     Parameters
     ----------

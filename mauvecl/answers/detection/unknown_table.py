@@ -72,7 +72,7 @@ class UnknownTable(Answer):
     quiets: tuple[Expectation, ...] = ()
 
     def smallest(self, star: str, unknown: str | None) -> float:
-        """The flare amplitude detected with the study's power at its false-alarm probability, marginalised.
+        """Return the flare amplitude detected with the study's power at its false-alarm probability, marginalised.
 
         Parameters
         ----------
@@ -136,5 +136,5 @@ def unknown_table(study: Study, unknowns: Mapping[str, NuisanceChoice] = SHOWN) 
 
 
 def power(snr: NDArray[np.float64], fap: float) -> NDArray[np.float64]:
-    """Detection probability of a normal statistic at its own threshold, shape as given."""
+    """Return the detection probability of a normal statistic with some S/N, shape of the S/N."""
     return np.asarray(special.ndtr(snr + special.ndtri(fap)))

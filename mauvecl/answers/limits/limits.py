@@ -341,13 +341,13 @@ limiting_magnitude = limit
 
 @public
 def smallest_amplitude(study: Study, engine: Engine | Pool | None = None) -> LimitResult:
-    """The smallest flare that is detected; as `limit`."""
+    """Compute the smallest flare that is detected; see `limit`."""
     return limit(_asking(study, "amplitude"), engine)
 
 
 @public
 def shortest_exposure(study: Study, engine: Engine | Pool | None = None) -> LimitResult:
-    """The shortest exposure in which the flares are detected; as `limit`."""
+    """Compute the shortest exposure in which the flares are detected; see `limit`."""
     return limit(_asking(study, "exposure"), engine)
 
 

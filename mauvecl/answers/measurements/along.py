@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
     from mauvecl.lightcurve.flares.events import Event
     from mauvecl.lightcurve.stares.components import Components
-    from mauvecl.lightcurve.stares.observed import StareExpectation
+    from mauvecl.lightcurve.stares.light_curves import StareExpectation
     from mauvecl.study.cases import Case
 
 Float = NDArray[np.float64]

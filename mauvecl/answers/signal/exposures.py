@@ -145,7 +145,7 @@ def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
 def exposure(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> ExposureResult:
-    """The fewest frames whose closed-form S/N at a wavelength reaches a wanted one.
+    """Compute the fewest frames whose closed-form S/N at a wavelength reaches a wanted one.
 
     Parameters
     ----------

@@ -389,7 +389,7 @@ def _reduced(engine: Stares | Pool, request: StaresRequest) -> Arrays:
 def _checked(
     drawn: CountedRate | None, value: float, probability: float, error: float, longer: float
 ) -> tuple[Interval, float]:
-    """False alarms per star-day of drawn stares at a value, within 4 standard errors, and what was expected."""
+    """Return false alarms per star-day of drawn stares at a value, within 4 standard errors, and the expected rate."""
     if drawn is None:
         return Interval(np.nan, np.nan, np.nan), float("nan")
     n = drawn.maxima.size

@@ -24,7 +24,7 @@ NO_TIME_MJD = 61_041
 
 
 def light_curve_file(answer: StareAnswer, number: int = 0) -> bytes:
-    """The file of one star and cell."""
+    """Return the FITS file of a star in a cell of the sweep."""
     from astropy.io import fits
 
     one = answer.stares[number]

@@ -17,7 +17,7 @@ from mauvecl.answers.answer import Answer, InCell
 from mauvecl.lightcurve.flares.energies import Kind
 from mauvecl.lightcurve.flares.events import Event, coefficients, temperatures_of
 from mauvecl.lightcurve.search.alarms import Alarm, alarms
-from mauvecl.lightcurve.stares.observed import Draw, Light, StareExpectation, seen
+from mauvecl.lightcurve.stares.light_curves import Draw, LightCurves, StareExpectation, draw_light_curves
 from mauvecl.runs.checkpoint import kept
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
@@ -100,7 +100,7 @@ class StarStare(InCell):
 
     staring: StareExpectation
     flares: tuple[Flaring, ...]
-    light: Light
+    light: LightCurves
     searched: Searched | str | None = None
 
     @property
@@ -429,7 +429,7 @@ def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStar
         depends_on = ("frames", components, staring.stare, staring.flare, q.number, seed, processes)
         return kept(checkpoint, depends_on, computed)["frames"]
 
-    light = seen(staring, q.bands_nm, draw)
+    light = draw_light_curves(staring, q.bands_nm, draw)
     searched = _search(case, draw, checkpoint) if q.search else None
     return StarStare(case.label, case.at, staring, _flares(case), light, searched)
 

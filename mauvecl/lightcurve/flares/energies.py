@@ -1,4 +1,4 @@
-"""Energies of flares: how energy, equivalent duration, amplitude and half-width follow from each other.
+"""Conversions between the energy, equivalent duration, amplitude and half-width of flares.
 
 Amplitude and equivalent duration count photons, as a detector does; energies weight them with their energy. Both
 describe the same light, the flare's excess over the quiescent star:
@@ -9,9 +9,9 @@ describe the same light, the flare's excess over the quiescent star:
 - energy in the band: 4 pi d^2 int dt int R F_flare dlambda, with R's highest value 1, erg;
 - bolometric energy: 4 pi d^2 int dt int F_flare dlambda, over all wavelengths, erg.
 
-`EnergyScale` is the one place that converts between photons and energies. It takes all light to leave alike in all
-directions. Published energies differ in two ways: `EnergyScale.shibayama2013` gives those of a flat patch seen face on,
-and `quiescent_luminosity` times the equivalent duration is what many catalogues call the energy in a band.
+`EnergyScale` converts between photons and energies, assuming isotropic emission. Published energies differ in two ways:
+`EnergyScale.shibayama2013` gives those of a flat patch seen face-on, and many catalogues call `quiescent_luminosity`
+times the equivalent duration the energy in a band.
 """
 
 from __future__ import annotations
@@ -37,34 +37,23 @@ if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
 
 Float = NDArray[np.float64]
-#: What an integral over a band weights the response with.
+#: Weighting of the response in an integral over a band.
 Weighted = Literal["energy", "photons"]
-#: Which light of a flare: that in the band of its amplitude, or all of it.
+#: Light of a flare that counts for its energy: in the band of its amplitude, or at all wavelengths.
 Kind = Literal["band", "bolometric"]
-#: Points of the integral over a band; a tenth of its own sampling at most.
+#: Number of points of the integral over a band; the step is at most a tenth of the sampling of the band.
 POINTS = 20_001
 
 
 @public
 @dataclass(frozen=True)
 class EnergyScale:
-    """Energy of the light of a flare per second of its equivalent duration.
+    """Energy of a flare's light per second of equivalent duration."""
 
-    Attributes
-    ----------
-    band : str
-        In which amplitude and equivalent duration are measured.
-    kind : {"band", "bolometric"}
-        Energy in the band alone, or of all wavelengths.
-    erg_per_s : float
-    how : str
-        What it was made of, for tables.
-    """
-
-    band: str
-    kind: Kind
+    band: str  # of amplitude and equivalent duration
+    kind: Kind  # energy in the band, or at all wavelengths
     erg_per_s: float
-    how: str
+    how: str  # description of star and flare, for tables
 
     @classmethod
     def of_star(
@@ -79,24 +68,23 @@ class EnergyScale:
         geometry: Geometry = "added",
         photosphere_k: float | None = None,
     ) -> Self:
-        """Return the scale of a spectrum that is seen from a distance: 4 pi d^2 times the flux of the flare.
+        """Return the scale for a spectrum at a distance: 4 pi d^2 times the flux of the flare.
 
         Parameters
         ----------
         source : Source
-            At its magnitude.
+            Spectrum at the magnitude of the star.
         distance_pc : float
         band : str
         flare_k : float
             Temperature of the flare's blackbody.
         flare : FlareSpectrum, optional
-            Light of the flare in place of that blackbody.
+            Spectrum of the flare, instead of a blackbody.
         kind : {"band", "bolometric"}
         geometry : {"added", "replaces"}
-            As `Source.flaring`. The photosphere that a flare replaces is subtracted; for bolometric energies it is a
-            blackbody.
+            As for `Source.flaring`. The replaced photosphere is subtracted; for bolometric energies it is a blackbody.
         photosphere_k : float, optional
-            For ``replaces``, in place of the star's own `temperature_k`.
+            For ``replaces``; the source's `temperature_k` by default.
 
         Raises
         ------
@@ -137,7 +125,7 @@ class EnergyScale:
         geometry: Geometry = "added",
         photosphere_k: float | None = None,
     ) -> Self:
-        """Return the scale of a star of a radius and a temperature, taken for a blackbody.
+        """Return the scale for a star that is a blackbody of given radius and temperature.
 
         Parameters
         ----------
@@ -174,9 +162,9 @@ class EnergyScale:
         """Return the published scale for bolometric energies, for comparisons with catalogues.
 
         [int R B(star) / int R B(flare)] pi R_star^2 sigma T_flare^4 (Shibayama et al. 2013,
-        doi 10.1088/0067-0049/209/1/5). It differs from `of_blackbody` twice: a flat patch seen face on gives off a
-        quarter of the energy of light that leaves alike in all directions, and the response weights energies although
-        equivalent durations count photons.
+        doi 10.1088/0067-0049/209/1/5). It differs from `of_blackbody` in two ways: a flat patch seen face-on emits a
+        quarter of the energy of an isotropic source, and the response weights energies although equivalent durations
+        count photons.
         """
         checked(Radius, "radius_rsun", radius_rsun)
         checked(Temperature, "temperature_k", temperature_k)
@@ -204,7 +192,7 @@ class EnergyScale:
         geometry: Geometry,
         photosphere_k: float | None,
     ) -> Self:
-        """Return the energy of what a flare of amplitude 1 adds to a flux, through a sphere around the star."""
+        """Return the scale for the light that a flare of amplitude 1 adds to a flux, over a sphere around the star."""
         light = added_light(
             wavelength_nm,
             flux_flam,
@@ -225,17 +213,11 @@ class EnergyScale:
         return cls(find_band(band).name, kind, sphere_cm2 * (flux - lost), how)
 
     def energy(self, equivalent_duration_s: float) -> float:
-        """Energy of an equivalent duration, erg."""
+        """Return the energy for an equivalent duration, erg."""
         return equivalent_duration_s * self.erg_per_s
 
     def equivalent_duration(self, energy_erg: float) -> float:
-        """Equivalent duration of an energy, s.
-
-        Raises
-        ------
-        InputError
-            For an energy of 0 or less.
-        """
+        """Return the equivalent duration for an energy above 0, s."""
         if not (np.isfinite(energy_erg) and energy_erg > 0):
             raise InputError.of("energy", energy_erg, "one above 0", unit="erg")
         return energy_erg / self.erg_per_s
@@ -244,8 +226,8 @@ class EnergyScale:
 def quiescent_luminosity(source: Source, distance_pc: float, band: str = "Kepler") -> float:
     """Return the luminosity of a star in a band, erg/s: 4 pi d^2 int R F dlambda, with R's highest value 1.
 
-    Many catalogues give equivalent duration times this as the energy of a flare in the band. It is the energy of light
-    with the star's spectrum, not the flare's.
+    Many catalogues multiply it by the equivalent duration to obtain the energy of a flare in the band. This assumes the
+    spectrum of the star, not that of the flare.
     """
     checked(Distance, "distance_pc", distance_pc)
     source.magnitude(band)
@@ -254,35 +236,35 @@ def quiescent_luminosity(source: Source, distance_pc: float, band: str = "Kepler
 
 
 def equivalent_duration(amplitude: float, half_width_s: float, shape: Shape | str) -> float:
-    """Equivalent duration of a shape, s; `amplitude` is the shape's own, not always its peak."""
+    """Return the equivalent duration of a shape, s; `amplitude` is that of the shape, not always its peak."""
     return amplitude * half_width_s * shape_of(shape).equivalent_duration
 
 
 def amplitude_of(equivalent_duration_s: float, half_width_s: float, shape: Shape | str) -> float:
-    """The shape's amplitude for an equivalent duration."""
+    """Return the amplitude of a shape for an equivalent duration."""
     return equivalent_duration_s / half_width_s / shape_of(shape).equivalent_duration
 
 
 def half_width_of(equivalent_duration_s: float, amplitude: float, shape: Shape | str) -> float:
-    """The half width for an equivalent duration, s."""
+    """Return the half-width for an equivalent duration, s."""
     return equivalent_duration_s / amplitude / shape_of(shape).equivalent_duration
 
 
 def amplitude_of_peak(peak: float, shape: Shape | str) -> float:
-    """The shape's amplitude for its highest value: another one for `tovarmendoza2022`."""
+    """Return the amplitude of a shape for its maximum, which differs from it for `tovarmendoza2022`."""
     return peak / shape_of(shape).peak
 
 
 @lru_cache(1024)
 def in_band(band: str, temperature_k: float, weighted: Weighted = "energy") -> float:
-    """A blackbody's surface flux through a band, erg s-1 cm-2, or times nm for photons; the highest response is 1."""
+    """Return a blackbody's surface flux in a band, erg s-1 cm-2, or times nm for photons; the maximum response is 1."""
     wavelength, response = _response(band)
     weight = response if weighted == "energy" else response * wavelength
     return _integral(wavelength, weight * blackbody(wavelength, temperature_k))
 
 
 def flux_in_band(band: str, flare: FlareSpectrum) -> float:
-    """Return the flux of a flare's spectrum through a band, erg s-1 cm-2; the highest response is 1."""
+    """Return the flux of a flare's spectrum in a band, erg s-1 cm-2; the maximum response is 1."""
     if isinstance(flare, Blackbody):
         return in_band(band, flare.temperature_k)
     wavelength, response = _response(band)
@@ -291,7 +273,7 @@ def flux_in_band(band: str, flare: FlareSpectrum) -> float:
 
 
 def share_within(low_nm: float, high_nm: float, temperature_k: float) -> float:
-    """Share of a blackbody's light between two wavelengths."""
+    """Return the fraction of a blackbody's light between two wavelengths."""
     # 15 / pi^4 times the integral of x^3 / (e^x - 1) over x = h c / (wavelength k T), CODATA 2018.
     from scipy.integrate import quad
 
@@ -306,20 +288,20 @@ def _spectrum(flare_k: float) -> Blackbody:
 
 
 def _response(band: str) -> tuple[Float, Float]:
-    """Wavelengths and response of a band, its highest one."""
+    """Return the wavelengths and the response of a band, with a maximum of 1."""
     bandpass = find_band(band)
     wavelength = np.linspace(bandpass.wavelength_nm[0], bandpass.wavelength_nm[-1], POINTS)
     return wavelength, np.interp(wavelength, bandpass.wavelength_nm, bandpass.throughput / bandpass.throughput.max())
 
 
 def _through(wavelength_nm: Float, flux_flam: Float, band: str) -> float:
-    """Return the flux of a spectrum through a band, erg s-1 cm-2."""
+    """Return the flux of a spectrum in a band, erg s-1 cm-2."""
     wavelength, response = _response(band)
     return _integral(wavelength, response * np.interp(wavelength, wavelength_nm, flux_flam, left=0.0, right=0.0))
 
 
 def _bolometric(wavelength_nm: Float, flux_flam: Float, band: str, photosphere_k: float | None) -> float:
-    """Return the flux of the blackbody of a temperature that has the photons of a spectrum in a band, erg s-1 cm-2."""
+    """Return the bolometric flux of the blackbody with a spectrum's photons in a band, erg s-1 cm-2."""
     assert photosphere_k is not None
     body = photons(wavelength_nm, blackbody(wavelength_nm, photosphere_k), band)
     return photons(wavelength_nm, flux_flam, band) / body * STEFAN_BOLTZMANN * photosphere_k**4

@@ -1,4 +1,4 @@
-"""Flares of a stare: each a shape with an amplitude, a time and a temperature, and what they add to every frame."""
+"""Flares of a stare, and the light that they add to its frames."""
 
 from __future__ import annotations
 
@@ -18,27 +18,20 @@ from mauvecl.schema.physical import Amplitude, Temperature
 
 Float = NDArray[np.float64]
 
-#: Flare spectra that a stare's frames are made of, at most (`components.MOST_FLARES`); the least for flares that cool.
+#: Largest number of flare spectra of a stare (`components.MOST_FLARES`), and the smallest for flares that cool.
 MOST_TEMPERATURES, LEAST_STEPS = 8, 3
-#: Parts with one temperature each of a frame, of the half-width and of the fold of a flare that cools, at least; and
-#: parts of a frame at most.
+#: For a flare that cools: smallest number of steps per frame, half-width and cooling time, and largest per frame.
 PARTS, MOST_PARTS = 16, 512
-#: Temperatures that differ by less are one.
+#: Temperatures that differ by less are treated as equal, K.
 SAME_K = 0.5
-#: Share of a flare's peak and of its fluence below which frames hold none of its light.
+#: Fraction of a flare's peak and of its fluence below which its light in a frame is neglected.
 LEAST_LIGHT = 1e-9
 
 
 @public
 @dataclass(frozen=True)
 class Cooling:
-    """A temperature that falls from the peak on: end + (peak - end) exp(-(t - t_peak) / fold); before it, the peak's.
-
-    Attributes
-    ----------
-    peak_k, end_k : float
-    fold_s : float
-    """
+    """Temperature that is constant before the peak, and end + (peak - end) exp(-(t - t_peak) / fold) after it."""
 
     peak_k: float
     end_k: float
@@ -55,29 +48,29 @@ class Cooling:
             )
 
     def at(self, since_peak_s: Float) -> Float:
-        """Temperature, K, shape of the time."""
+        """Return the temperature at times since the peak, K, shape of the time."""
         cooled = np.exp(-np.maximum(since_peak_s, 0.0) / self.fold_s)
         return np.asarray(self.end_k + (self.peak_k - self.end_k) * cooled)
 
     @property
     def steady(self) -> bool:
-        """Whether it is one temperature in truth."""
+        """True if the temperature hardly changes."""
         return self.peak_k - self.end_k < SAME_K
 
 
 @public
 @dataclass(frozen=True)
 class Event:
-    """One flare.
+    """A flare in a stare.
 
     Attributes
     ----------
     peak_s : float
-        When tau is 0, s from the start of the stare.
+        Time at which tau is 0, from the start of the stare.
     half_width_s : float
         t_1/2 of the shape's publication.
     amplitude : float
-        The factor on the shape: relative rise of the photons in the band in which amplitudes are measured.
+        Factor on the shape: relative rise of the photons in the flare's band.
     temperature : float or Cooling
         K.
     shape : Shape or str
@@ -116,7 +109,7 @@ class Event:
         temperature: float | Cooling = 10_000.0,
         shape: Shape | str = "davenport2014",
     ) -> Self:
-        """Of a highest relative rise, which is not every shape's amplitude."""
+        """Return the flare with a maximum relative rise, which is not the amplitude of every shape."""
         return cls(peak_s, half_width_s, amplitude_of_peak(peak, shape), temperature, shape)
 
     @classmethod
@@ -129,7 +122,7 @@ class Event:
         temperature: float | Cooling = 10_000.0,
         shape: Shape | str = "davenport2014",
     ) -> Self:
-        """Of an equivalent duration in the band, s."""
+        """Return the flare with an equivalent duration in the band."""
         if not 0 < half_width_s < np.inf:
             raise InputError.of("half_width_s", half_width_s, "a time above 0", unit="s")
         return cls(peak_s, half_width_s, amplitude_of(equivalent_duration_s, half_width_s, shape), temperature, shape)
@@ -145,7 +138,7 @@ class Event:
         temperature: float | Cooling = 10_000.0,
         shape: Shape | str = "davenport2014",
     ) -> Self:
-        """Of an energy by the star's `EnergyScale`; for one that cools see `total_energy`."""
+        """Return the flare with an energy; for one that cools see `total_energy`."""
         return cls.of_equivalent_duration(
             scale.equivalent_duration(energy_erg),
             peak_s=peak_s,
@@ -156,17 +149,17 @@ class Event:
 
     @property
     def form(self) -> Shape:
-        """Its shape."""
+        """The shape."""
         return shape_of(self.shape)
 
     @property
     def hottest_k(self) -> float:
-        """Its temperature, or that at its peak, K."""
+        """Temperature at the peak, K."""
         return float(self.temperature.peak_k if isinstance(self.temperature, Cooling) else self.temperature)
 
     @property
     def peak(self) -> float:
-        """Highest relative rise of the band's photons."""
+        """Maximum relative rise of the photons in the band."""
         return self.amplitude * self.form.peak
 
     @property
@@ -175,46 +168,42 @@ class Event:
         return equivalent_duration(self.amplitude, self.half_width_s, self.form)
 
     def energy(self, scale: EnergyScale) -> float:
-        """Energy by a star's scale, erg."""
+        """Return the energy, erg."""
         return scale.energy(self.equivalent_duration_s)
 
     def total_energy(self, scale_of: Callable[[float], EnergyScale], nodes: Float | None = None) -> float:
-        """Return the energy, erg, of a flare that may cool.
+        """Return the energy of a flare that may cool, erg.
 
-        Frames mix the light of a flare that cools from the spectra of a few temperatures. The energy is that of the
-        mixture, so that it is the energy of the light that is drawn.
+        Frames interpolate the light of a flare that cools between the spectra of a few temperatures. The energy is that
+        of the interpolated light, which is the light that is drawn.
 
         Parameters
         ----------
         scale_of : callable
-            A star's scale for flares of a temperature, K.
+            Returns the energy scale for a temperature in K.
         nodes : ndarray, shape (n_temperature,), optional
-            Temperatures, K, from which the flares of the stare are mixed: `temperatures_of` all of them. Those of this
-            flare alone by default.
+            Temperatures of the spectra: `temperatures_of` all flares of the stare; by default of this flare alone.
         """
         cooling = self.temperature
         if not isinstance(cooling, Cooling) or cooling.steady:
             return self.energy(scale_of(self.hottest_k))
         nodes = temperatures_of([self]) if nodes is None else nodes
         tau = np.concatenate([np.linspace(-10.0, 10.0, 2001), np.geomspace(10.0, 1000.0, 1001)[1:]])
-        # Steps as fine as the half-width and as the fold; rounded, lest two of them differ by their last bits.
+        # Steps resolve the half-width and the cooling time; rounding removes duplicates that differ in their last bits.
         fold = np.linspace(0.0, 20.0, 2001) * cooling.fold_s / self.half_width_s
         edges = self.half_width_s * np.unique(np.concatenate([tau, fold[fold < 1000.0]]).round(6))
         light = self.form.mean_over(edges, 0.0, self.half_width_s) * np.diff(edges)
         kelvin = cooling.at((edges[1:] + edges[:-1]) / 2)
         per_s = 0.0
-        for column, share in _mixed(kelvin, nodes):
+        for column, share in _node_weights(kelvin, nodes):
             per_s += float(light @ share) * scale_of(float(nodes[column])).erg_per_s
         return float(self.amplitude * per_s)
 
 
 def check_seen(events: Sequence[Event], start_s: Float, frame_s: float) -> list[str]:
-    """Return a sentence for each flare that peaks outside of the frames but sheds light into them.
+    """Return a message for each flare that peaks outside the frames but contributes light to them.
 
-    Raises
-    ------
-    InputError
-        If none of a flare's light falls into the frames.
+    Raises InputError if a flare contributes no light.
     """
     frames = np.column_stack([start_s, start_s + frame_s])
     sentences = []
@@ -239,14 +228,10 @@ def check_seen(events: Sequence[Event], start_s: Float, frame_s: float) -> list[
 
 
 def temperatures_of(events: Sequence[Event], most: int = MOST_TEMPERATURES) -> Float:
-    """Temperatures whose spectra the events are mixed from, K, ascending, shape (n_temperature,).
+    """Return the temperatures whose spectra represent the events, K, ascending, shape (n_temperature,).
 
-    Each constant temperature is one of them; the rest, evenly spaced in 1 / T, span what flares cool through.
-
-    Raises
-    ------
-    InputError
-        If that takes more than `most`.
+    They are all constant temperatures and, for flares that cool, a grid that is even in 1 / T. Raises InputError if
+    there are more than `most`.
     """
     constant: list[float] = []
     cooling = []
@@ -271,10 +256,10 @@ def temperatures_of(events: Sequence[Event], most: int = MOST_TEMPERATURES) -> F
 
 
 def coefficients(events: Sequence[Event], start_s: Float, frame_s: float, temperatures_k: Float) -> Float:
-    """What the events add to each frame: mean amplitude of each flare spectrum over it.
+    """Return the mean amplitude of each flare spectrum in each frame.
 
-    A flare of constant temperature is integrated exactly. One that cools is mixed from the spectra of the two
-    neighbouring temperatures, linearly in 1 / T, with one temperature in each of several parts of a frame.
+    Flares of constant temperature are integrated exactly. The light of a flare that cools is interpolated linearly in
+    1 / T between the spectra of the two neighbouring temperatures, with a constant temperature in each step of a frame.
 
     Parameters
     ----------
@@ -282,7 +267,7 @@ def coefficients(events: Sequence[Event], start_s: Float, frame_s: float, temper
     start_s : ndarray, shape (n_frame,)
     frame_s : float
     temperatures_k : ndarray, shape (n_temperature,)
-        Ascending: those of `temperatures_of`, or more.
+        Ascending; at least those of `temperatures_of`.
 
     Returns
     -------
@@ -291,7 +276,7 @@ def coefficients(events: Sequence[Event], start_s: Float, frame_s: float, temper
     Raises
     ------
     InputError
-        If a flare has a temperature outside of them.
+        If a flare has a temperature outside the range of `temperatures_k`.
     """
     factors = np.zeros((start_s.size, temperatures_k.size))
     for event in events:
@@ -300,7 +285,7 @@ def coefficients(events: Sequence[Event], start_s: Float, frame_s: float, temper
             continue
         edges = np.column_stack([start_s, start_s + frame_s])
         mean = event.amplitude * event.form.mean_over(edges, event.peak_s, event.half_width_s)
-        for column, share in _mixed(np.array([event.hottest_k]), temperatures_k):
+        for column, share in _node_weights(np.array([event.hottest_k]), temperatures_k):
             factors[:, column] += float(share[0]) * mean
     return factors
 
@@ -315,12 +300,12 @@ def _add_cooling(
         edges = np.column_stack([start, start + frame_s / parts])
         mean = event.amplitude / parts * event.form.mean_over(edges, event.peak_s, event.half_width_s)
         temperature = cooling.at(start + frame_s / parts / 2 - event.peak_s)
-        for column, share in _mixed(temperature, temperatures_k):
+        for column, share in _node_weights(temperature, temperatures_k):
             factors[:, column] += share * mean
 
 
-def _mixed(temperature: Float, nodes: Float) -> list[tuple[int, Float]]:
-    """Share of each node in temperatures, linear in 1 / T."""
+def _node_weights(temperature: Float, nodes: Float) -> list[tuple[int, Float]]:
+    """Return the weights of the nodes for temperatures, linear in 1 / T, by index of the node."""
     if temperature.min() < nodes[0] - SAME_K or temperature.max() > nodes[-1] + SAME_K:
         raise InputError(
             f"a flare of {temperature.min():g} to {temperature.max():g} K",

@@ -1,7 +1,7 @@
-"""How often a star flares: cumulative distributions of energy, of the literature or one's own.
+"""Flare rates of stars: cumulative distributions of energy, published or given by the user.
 
-The convention is AltaiPony's: dN/dE = beta E^-alpha, so that beta / (alpha - 1) E^(1 - alpha) flares a day are of the
-energy E or more.
+The convention is that of AltaiPony: dN/dE = beta E^-alpha, so that beta / (alpha - 1) E^(1 - alpha) flares per day have
+at least the energy E.
 """
 
 from __future__ import annotations
@@ -23,37 +23,35 @@ from mauvecl.schema.physical import Temperature
 from mauvecl.schema.text import shortened
 
 Float = NDArray[np.float64]
-#: What published energies are; see `Rates`.
+#: Definitions of published energies; see `Rates`.
 Definition = Literal["light", "quiescent", "patch"]
 
-#: What an energy may be of beside a band: the whole light of the flare's blackbody.
+#: Name that replaces the band of bolometric energies.
 BOLOMETRIC = "bolometric"
-#: Energies that flares of any star may have, erg.
+#: Range of flare energies of all stars, erg.
 ENERGIES = (1e22, 1e42)
-#: By how much a published relation may miss the rate of a single star, dex (assumption: stars of one mass and age
-#: differ by factors of a few).
+#: Scatter of the rates of single stars about a published relation, dex (assumption: stars of equal mass and age differ
+#: by factors of a few).
 SCATTER_DEX = 0.5
 DAYS_PER_YEAR = 365.25
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rates(ABC):
-    """A cumulative distribution of flare energies.
+    """Cumulative distribution of flare energies.
 
     Attributes
     ----------
     band : str
-        Which light the energies are of: a band's name, or "bolometric".
+        Name of the band of the energies, or "bolometric".
     source : str
-        Where it is from.
     measured_erg : (float, float)
-        Energies between which it was measured; elsewhere it is extrapolated.
+        Range in which it was measured; it is extrapolated outside.
     scatter_dex : float
-        Standard deviation of its rate's logarithm for a single star.
+        Standard deviation of the logarithm of a single star's rate.
     definition : {"light", "quiescent", "patch"}
-        Energy of the flares' light, alike in all directions; equivalent duration times the star's luminosity in the
-        band (Davenport); or the bolometric energy of a blackbody of 10 000 K, a patch seen face on (Shibayama).
-        `of_star` converts to the first.
+        Energy of the flares' isotropic light; equivalent duration times the star's luminosity in the band (Davenport);
+        or the bolometric energy of a patch of 10 000 K seen face-on (Shibayama). `of_light` converts to the first.
     """
 
     band: str = "Kepler"
@@ -71,45 +69,40 @@ class Rates(ABC):
 
     @abstractmethod
     def per_day_above(self, energy_erg: ArrayLike) -> Float:
-        """Flares a day of an energy or more, shape of the energy."""
+        """Return the number of flares per day with at least an energy, shape of the energy."""
 
     @abstractmethod
     def times_energy(self, factor: float) -> Self:
-        """The same flares with energies that are so many times as large."""
+        """Return the rates with all energies multiplied by a factor."""
 
     def in_band(self, band: str, flare_k: float = 10_000.0, flare: FlareSpectrum | None = None) -> Self:
-        """The same flares with their energies in another band, or bolometric ones.
+        """Return the rates with energies in another band, or bolometric energies.
 
         Parameters
         ----------
         band : str
             A name of `host.stars.bands`, or "bolometric".
         flare_k : float
-            Temperature of the flares, blackbodies.
+            Temperature of the flares, which are blackbodies.
         flare : FlareSpectrum, optional
-            Light of the flares in place of those blackbodies.
-
-        Raises
-        ------
-        InputError
-            For an unknown band, or a temperature that no flare has.
+            Spectrum of the flares, instead of blackbodies.
         """
         return replace(self.times_energy(band_factor(self.band, band, flare_k, flare)), band=band)
 
     def of_light(self, erg_per_s: float, luminosity_erg_s: float) -> Self:
-        """Return the same flares by the bolometric energy of their light at one star.
+        """Return the rates by the bolometric energy of the light of one star's flares.
 
         Parameters
         ----------
         erg_per_s : float
-            Bolometric energy per second of equivalent duration in `amplitude_band`: an `EnergyScale`.
+            Bolometric energy per second of equivalent duration in `amplitude_band`; see `EnergyScale`.
         luminosity_erg_s : float
-            The star's in that band, `quiescent_luminosity`.
+            Luminosity of the star in that band; see `quiescent_luminosity`.
 
         Raises
         ------
         InputError
-            If the energies are those of light already; see `in_band`.
+            If the energies are already those of light; see `in_band`.
         """
         if self.definition == "light":
             raise InputError.of("definition", self.definition, "a published definition, not that of light")
@@ -120,22 +113,22 @@ class Rates(ABC):
 
     @property
     def amplitude_band(self) -> str:
-        """Band in which equivalent durations were measured: for bolometric energies Kepler's."""
+        """Band of equivalent durations; Kepler for bolometric energies."""
         return "Kepler" if self.band == BOLOMETRIC else self.band
 
 
 @dataclass(frozen=True, kw_only=True)
 class PowerLaw(Rates):
-    """dN/dE = beta E^-alpha a day.
+    """Power law dN/dE = beta E^-alpha, in flares per day.
 
     Attributes
     ----------
     alpha : float
         Above 1.
     log10_beta : float
-        Of flares a day and erg^(alpha - 1).
+        Logarithm of beta in flares per day and erg^(alpha - 1).
     largest_erg : float
-        No flares beyond; infinite unless given, as in AltaiPony.
+        Largest energy; infinite by default, as in AltaiPony.
 
     Examples
     --------
@@ -159,15 +152,7 @@ class PowerLaw(Rates):
 
     @classmethod
     def through(cls, alpha: float, energy_erg: float, per_day: float, **others: object) -> Self:
-        """By the rate of flares of an energy or more.
-
-        Parameters
-        ----------
-        alpha : float
-        energy_erg, per_day : float
-        **others
-            Attributes of `Rates`, and `largest_erg`.
-        """
+        """Return the power law with a rate of flares above an energy; `others` are attributes of the class."""
         for name, value in (("energy_erg", energy_erg), ("per_day", per_day)):
             if not (np.isfinite(value) and value > 0):
                 raise InputError.of(name, value, "above 0")
@@ -196,20 +181,13 @@ class PowerLaw(Rates):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RateTable(Rates):
-    """A cumulative distribution as a table: a line of logarithms between its rows.
+    """Tabulated cumulative distribution, interpolated linearly in the logarithms.
 
-    Below its first energy nothing is added, beyond its last no flare is counted.
-
-    Attributes
-    ----------
-    energy_erg : ndarray, shape (n,)
-        Ascending.
-    per_day : ndarray, shape (n,)
-        Flares a day of the energy or more; falling.
+    The rate is constant below the first energy and zero above the last.
     """
 
-    energy_erg: Float
-    per_day: Float
+    energy_erg: Float  # ascending, shape (n,)
+    per_day: Float  # flares with at least this energy, not increasing, shape (n,)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -239,13 +217,7 @@ class RateTable(Rates):
 
     @classmethod
     def read(cls, path: str | Path, band: str = "Kepler") -> Self:
-        """From CSV or ECSV with the columns ``energy`` (erg) and ``rate`` (of the energy or more, a day).
-
-        Raises
-        ------
-        InputError
-            If it cannot be read or has no such columns.
-        """
+        """Read CSV or ECSV with the columns ``energy`` (erg) and ``rate`` (flares per day with at least the energy)."""
         path = Path(path)
         table = read_text_table(path, "table of rates")
         missing = next((name for name in ("energy", "rate") if name not in table.colnames), None)
@@ -282,13 +254,7 @@ class RateTable(Rates):
 
 
 def band_factor(old: str, new: str, flare_k: float = 10_000.0, flare: FlareSpectrum | None = None) -> float:
-    """Energy in one band over that in another, of a blackbody or another spectrum; either may be "bolometric".
-
-    Raises
-    ------
-    InputError
-        For an unknown band, or a temperature that no flare has.
-    """
+    """Return the ratio of a flare's energy in a new band to that in an old one; either may be "bolometric"."""
     flare_k = checked(Temperature, "flare_k", flare_k)
     light = Blackbody(flare_k) if flare is None else flare
 
@@ -299,22 +265,17 @@ def band_factor(old: str, new: str, flare_k: float = 10_000.0, flare: FlareSpect
 
 
 def davenport2019(*, mass_msun: float, age_myr: float) -> PowerLaw:
-    """By mass and age: Davenport et al. 2019 (arXiv 1901.00890), energies in the Kepler band.
+    """Return the rates for a mass and an age of Davenport et al. 2019 (arXiv 1901.00890), in the Kepler band.
 
-    log10 nu = a log10 E + b, a = -.07 log10 t + .79 m - 1.06, b = 2.01 log10 t - 25.15 m + 33.99. It gives the Sun more
-    flares than it has.
+    log10 nu = a log10 E + b, a = -.07 log10 t + .79 m - 1.06, b = 2.01 log10 t - 25.15 m + 33.99. The relation
+    overestimates the rate of the Sun.
 
     Parameters
     ----------
     mass_msun : float
-        0.1 to 1.5; fitted to stars of 0.4 to 1.1 or so.
+        0.1 to 1.5; the relation was fitted to stars of about 0.4 to 1.1.
     age_myr : float
         1 to 13 800.
-
-    Raises
-    ------
-    InputError
-        If either is outside.
     """
     for name, value, low, high in (("mass_msun", mass_msun, 0.1, 1.5), ("age_myr", age_myr, 1.0, 13_800.0)):
         if not low <= value <= high:
@@ -341,9 +302,10 @@ def davenport2019(*, mass_msun: float, age_myr: float) -> PowerLaw:
 
 
 def sunlike() -> PowerLaw:
-    """Slowly rotating G dwarfs: 7e33 erg or more once in 3000 years (Okamoto et al. 2021), exponent 2 (Shibayama 2013).
+    """Return the rates of slowly rotating G dwarfs.
 
-    Maehara et al. 2015 have 1e34 erg once in 800 years, others in 5000: hence the scatter.
+    At least 7e33 erg once in 3000 years (Okamoto et al. 2021), with an exponent of 2 (Shibayama et al. 2013). The
+    scatter covers other results: Maehara et al. 2015 find 1e34 erg once in 800 years, others once in 5000.
     """
     return PowerLaw.through(
         2.0, 7e33, 1 / (3000 * DAYS_PER_YEAR), band=BOLOMETRIC,
@@ -353,14 +315,10 @@ def sunlike() -> PowerLaw:
 
 
 def fiducial2018(quiescent_si_iv_erg_s: float) -> PowerLaw:
-    """The fiducial M dwarf of Loyd et al. 2018 (arXiv 1809.07322), by its light in Si IV; bolometric energies.
+    """Return the bolometric rates of the fiducial M dwarf of Loyd et al. 2018 (arXiv 1809.07322), by its Si IV light.
 
-    nu(> delta) = 8 / d (delta / 1000 s)^-0.75 of equivalent durations in Si IV from 1e2 to 1e6 s, and 160 times their
-    energy in the flare's blackbody of 9000 K.
-
-    Parameters
-    ----------
-    quiescent_si_iv_erg_s : float
+    nu(> delta) = 8 / d (delta / 1000 s)^-0.75 for equivalent durations in Si IV from 1e2 to 1e6 s; the blackbody of
+    9000 K has 160 times the energy of Si IV.
     """
     if not (np.isfinite(quiescent_si_iv_erg_s) and quiescent_si_iv_erg_s > 0):
         raise InputError.of("quiescent_si_iv_erg_s", quiescent_si_iv_erg_s, "above 0")
@@ -371,24 +329,20 @@ def fiducial2018(quiescent_si_iv_erg_s: float) -> PowerLaw:
     )  # fmt: skip
 
 
-#: Mass and age that stand for a type where a star's own are not known (assumption).
+#: Typical mass (solar masses) and age (Myr) of a spectral type (assumption).
 TYPICAL = {"G": (0.95, 1000.0), "K": (0.75, 1000.0), "M": (0.4, 1000.0)}
 
 
-#: Exponents for types of which no rate of a single star is to be had: Althukair & Tsiklauri 2023, "Main Sequence Star
+#: Exponents for types without published rates of single stars: Althukair & Tsiklauri 2023, "Main Sequence Star
 #: Super-flare Frequency based on Entire Kepler Data", abstract.
 EXPONENTS = {"A": "1.3", "F": "2.0 to 2.1"}
 
 
 def preset(name: str) -> PowerLaw:
-    """By name: "G", "K" and "M" are Davenport's relation for a typical mass at 1 Gyr, "sunlike" an old, slow G dwarf.
+    """Return published rates: "G", "K" and "M" by `davenport2019` for a typical mass at 1 Gyr, or "sunlike".
 
-    Other work has exponents of about 2: G 1.5 to 2 (Shibayama 2013, Maehara 2015), K and M 2.0 to 2.4 (Ilin 2019).
-
-    Raises
-    ------
-    InputError
-        For another name.
+    Other publications find exponents of about 2: G 1.5 to 2 (Shibayama 2013, Maehara 2015), K and M 2.0 to 2.4 (Ilin
+    2019).
     """
     if name == "sunlike":
         return sunlike()

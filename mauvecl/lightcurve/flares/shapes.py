@@ -1,7 +1,7 @@
-"""Shapes of flares in time, as published: the excess over the quiescent flux for an amplitude of one.
+"""Published shapes of flares in time: the excess over the quiescent flux for unit amplitude.
 
-Times are tau = (t - peak) / half_width, "half width" being the scale t_1/2 of each publication, which is not the
-shape's own width at half of its peak: that is `Shape.width`. Integrals are closed forms.
+Times are tau = (t - peak) / half_width. The half-width is the scale t_1/2 of each publication, which differs from the
+full width at half maximum, `Shape.width`. Integrals are closed forms.
 """
 
 from __future__ import annotations
@@ -24,51 +24,51 @@ Float = NDArray[np.float64]
 
 
 class Shape(ABC):
-    """The course of a flare, in units of amplitude and half width."""
+    """Time profile of a flare, in units of amplitude and half-width."""
 
-    #: As studies and flags have it, and where it was published.
+    #: Name in studies and flags, and publication.
     name: str
     source: str
 
     def __repr__(self) -> str:
-        """The same in every process: requests are told apart by it."""
+        """Return the same text in every process, since requests are identified by it."""
         return f"{type(self).__name__}()"
 
     @abstractmethod
     def at(self, tau: ArrayLike) -> Float:
-        """Its value, shape of tau."""
+        """Return the value, shape of tau."""
 
     @abstractmethod
     def before(self, tau: ArrayLike) -> Float:
-        """Its integral from the beginning, in half widths, shape of tau."""
+        """Return the integral up to tau, in half-widths, shape of tau."""
 
     @abstractmethod
     def after(self, tau: ArrayLike) -> Float:
-        """Its integral to the end, in half widths, shape of tau: keeps its digits where little is left."""
+        """Return the integral from tau to the end, in half-widths, without cancellation; shape of tau."""
 
     @property
     @abstractmethod
     def peak_at(self) -> float:
-        """Where its peak is, tau."""
+        """Position of the maximum, tau."""
 
     @property
     @abstractmethod
     def square_integral(self) -> float:
-        """Integral of the square, in half widths: a matched filter's S/N grows as its root."""
+        """Integral of the square, in half-widths; the S/N of a matched filter is proportional to its root."""
 
     @cached_property
     def peak(self) -> float:
-        """Its highest value; not one where a publication's amplitude is something else."""
+        """Maximum; it differs from one if the publication defines the amplitude differently."""
         return float(self.at(self.peak_at))
 
     @cached_property
     def equivalent_duration(self) -> float:
-        """Its whole integral, in half widths."""
+        """Total integral, in half-widths."""
         return float(self.before(0.0) + self.after(0.0))
 
     @cached_property
     def width(self) -> float:
-        """The time that it is above half of its peak, in half widths."""
+        """Full width at half maximum, in half-widths."""
         half, at = self.peak / 2, self.peak_at
         reach = 1.0
         while float(self.at(at + reach)) > half:
@@ -82,9 +82,9 @@ class Shape(ABC):
         )
 
     def integral(self, first: ArrayLike, last: ArrayLike) -> Float:
-        """Its integral from one tau to another, elementwise, in half widths."""
+        """Return the integral between two values of tau, elementwise, in half-widths."""
         first, last = np.asarray(first, np.float64), np.asarray(last, np.float64)
-        # Of two large integrals the difference has no digits: each side of the peak by what is left on that side.
+        # Differences of large integrals cancel, so each side of the peak uses the integral to its own end.
         late = first > 0
         values = np.where(
             late,
@@ -98,18 +98,18 @@ class Shape(ABC):
                 - self.after(np.maximum(last, 0.0)),
             ),
         )
-        # No shape is below zero: what is left of the difference of two equal integrals is their rounding.
+        # Shapes are not negative; differences of equal integrals may be, by rounding.
         return np.maximum(values, 0.0)
 
     def mean_over(self, edges_s: ArrayLike, peak_s: ArrayLike, t_half_s: ArrayLike) -> Float:
-        """Its mean over each frame, exact.
+        """Return the exact mean over each frame.
 
         Parameters
         ----------
         edges_s : array_like, shape (n_frame + 1,) or (n_frame, 2)
-            Edges of frames that follow each other, or the start and end of each.
+            Edges of consecutive frames, or start and end of each frame.
         peak_s, t_half_s : array_like
-            When tau is 0, and the half width, s; shape (n, 1) gives a row to each.
+            Time at which tau is 0, and half-width, s; shape (n, 1) gives one row for each.
 
         Returns
         -------
@@ -122,16 +122,16 @@ class Shape(ABC):
 
 
 class Davenport2014(Shape):
-    """A polynomial rise within one half width, two exponentials after it.
+    """A polynomial rise within one half-width, followed by two exponentials.
 
-    Davenport et al. 2014, ApJ 797, 122 (doi 10.1088/0004-637X/797/2/122). It begins with a step to 0.005, and steps
-    down by 0.008 at its peak.
+    Davenport et al. 2014, ApJ 797, 122 (doi 10.1088/0004-637X/797/2/122). The published form has a step of
+    0.005 at its start and one of -0.008 at its peak.
     """
 
     name = "davenport2014"
     source = "Davenport et al. 2014, doi 10.1088/0004-637X/797/2/122"
     RISE: ClassVar = np.polynomial.Polynomial([1.0, 1.94053, -0.175084, -2.24588, -1.12498])
-    #: The rise's integral from its beginning.
+    #: Integral of the rise.
     RISEN: ClassVar = RISE.integ(lbnd=-1)
     DECAY: ClassVar = ((0.689008, 1.60053), (0.302963, 0.278318))
 
@@ -153,7 +153,7 @@ class Davenport2014(Shape):
         return np.asarray(rise + sum(a / b * np.exp(-b * late) for a, b in self.DECAY))
 
     def _risen(self, t: Float) -> Float:
-        """The rise's integral up to some tau, by Horner's rule: what a search spends its time in."""
+        """Return the integral of the rise by Horner's rule, which dominates the time of a search."""
         clipped, (*rest, last) = np.clip(t, -1.0, 0.0), self.RISEN.coef.astype(np.float64)
         total = np.asarray(last)
         for coefficient in reversed(rest):
@@ -171,22 +171,22 @@ class Davenport2014(Shape):
 
 
 class TovarMendoza2022(Shape):
-    """A Gaussian convolved with two exponentials, without a kink; its "amplitude" is not its peak.
+    """A Gaussian convolved with two exponentials, which is smooth; its amplitude is not its maximum.
 
-    Tovar Mendoza et al. 2022, AJ 164, 17 (doi 10.3847/1538-3881/ac6fe6). With g' = Gaussian - D g its integral is a
-    closed form.
+    Tovar Mendoza et al. 2022, AJ 164, 17 (doi 10.3847/1538-3881/ac6fe6). Since g' = Gaussian - D g, the integral is
+    a closed form.
     """
 
     name = "tovarmendoza2022"
     source = "Tovar Mendoza et al. 2022, doi 10.3847/1538-3881/ac6fe6"
     A, B, C = 0.9687734504375167, -0.251299705922117, 0.22675974948468916
-    #: Share and rate of each exponential.
+    #: Weight and rate of each exponential.
     DECAY: ClassVar = ((0.12695865022878844, 0.15551880775110513), (1 - 0.12695865022878844, 1.2150539528490194))
-    #: The Gaussian's height: the publication's form has the factor exp((B / C)^2) beside its convolution.
+    #: Height of the Gaussian, which includes the factor exp((B / C)^2) of the publication.
     HEIGHT = A * float(np.exp((B / C) ** 2))
 
     def _part(self, tau: Float, rate: float) -> Float:
-        """The Gaussian convolved with one exponential: the scaled erfcx where the plain product would overflow."""
+        """Return the convolution with one exponential, by the scaled erfcx where the plain product would overflow."""
         z = (self.B - tau) / self.C
         u = z + self.C * rate / 2
         early = np.exp(-(z**2)) * scipy.special.erfcx(np.maximum(u, 0.0))
@@ -195,7 +195,7 @@ class TovarMendoza2022(Shape):
         return np.asarray(np.sqrt(np.pi) / 2 * self.HEIGHT * self.C * np.where(u > 0, early, late))
 
     def _gaussian(self, z: Float) -> Float:
-        """The Gaussian's integral beyond z of its widths."""
+        """Return the integral of the Gaussian beyond z widths."""
         return np.asarray(np.sqrt(np.pi) / 2 * self.HEIGHT * self.C * scipy.special.erfc(z))
 
     def at(self, tau: ArrayLike) -> Float:
@@ -247,21 +247,21 @@ class TovarMendoza2022(Shape):
 
 
 class Fiducial(Shape):
-    """A boxcar of two thirds of the fluence, and an exponential of one third: the fiducial flare of the MUSCLES survey.
+    """The fiducial flare of the MUSCLES survey: a boxcar with 2/3 of the fluence and an exponential with 1/3.
 
-    Loyd et al. 2018, ApJ 867, 71 (doi 10.3847/1538-4357/aae2bd). It rises at tau = 0; its half width is its width at
-    half of its peak. How high and long it is for an equivalent duration is `Fiducial.of`.
+    Loyd et al. 2018, ApJ 867, 71 (doi 10.3847/1538-4357/aae2bd). It rises at tau = 0, and its half-width is its full
+    width at half maximum. `Fiducial.of` relates height and length to the equivalent duration.
     """
 
     name = "fiducial"
     source = "Loyd et al. 2018, doi 10.3847/1538-4357/aae2bd"
-    #: Lengths of boxcar and exponential, in half widths: the exponential's is half of the boxcar's.
+    #: Lengths of boxcar and exponential, in half-widths.
     BOX = 1 / (1 + float(np.log(2)) / 2)
     FOLD = BOX / 2
 
     @classmethod
     def of(cls, equivalent_duration_s: float) -> tuple[float, float]:
-        """Amplitude and half width, s, of the fiducial flare of an equivalent duration, s: height 0.3 (delta/s)^0.6."""
+        """Return amplitude, 0.3 (delta/s)^0.6, and half-width (s) for an equivalent duration delta."""
         if not (np.isfinite(equivalent_duration_s) and equivalent_duration_s > 0):
             raise InputError.of("equivalent_duration_s", equivalent_duration_s, "a time above 0", unit="s")
         height = 0.3 * equivalent_duration_s**0.6
@@ -297,14 +297,14 @@ class Fiducial(Shape):
 @public
 @dataclass(frozen=True, eq=False)
 class TableShape(Shape):
-    """A shape of one's own: linear between its points, zero outside them, scaled to a peak of one.
+    """User-defined shape, linear between its points and zero outside them.
 
     Attributes
     ----------
     tau : ndarray, shape (n,)
-        Ascending; in half widths, or in seconds for a half width of 1 s.
+        Ascending; in half-widths, or in seconds for a half-width of 1 s.
     values : ndarray, shape (n,)
-        At least 0, with one above it; scaled so that the largest is 1.
+        Not negative; scaled to a maximum of 1.
     name, source : str
     """
 
@@ -366,7 +366,7 @@ class TableShape(Shape):
 
     @cached_property
     def width(self) -> float:
-        # Several peaks are above half of the highest several times.
+        # Several peaks may exceed half of the maximum.
         a, b = self.values[:-1] - 0.5, self.values[1:] - 0.5
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.where(a * b < 0, np.maximum(a, b) / np.abs(b - a), (a + b >= 0) & (np.minimum(a, b) >= 0))
@@ -378,13 +378,7 @@ SHAPES: dict[str, Shape] = {shape.name: shape for shape in (Davenport2014(), Tov
 
 
 def shape_of(given: Shape | str) -> Shape:
-    """A shape, by name or as it is.
-
-    Raises
-    ------
-    InputError
-        For a name that is none.
-    """
+    """Return a shape by name; a `Shape` is returned unchanged."""
     if isinstance(given, Shape):
         return given
     check_shape(str(given))
@@ -392,8 +386,8 @@ def shape_of(given: Shape | str) -> Shape:
 
 
 def half_width_of_altaipony(duration: float, shape: Shape | str) -> float:
-    """The half width that AltaiPony's argument ``dur`` means, in the same unit.
+    """Return the half-width for AltaiPony's argument ``dur``, in the same unit.
 
-    Its `davenport2014` takes half of ``dur`` for t_1/2, its `mendoza2022` all of it (AltaiPony 2.1.2).
+    AltaiPony 2.1.2 uses half of ``dur`` as t_1/2 in `davenport2014`, and all of it in `mendoza2022`.
     """
     return duration / 2 if shape_of(shape).name == "davenport2014" else duration

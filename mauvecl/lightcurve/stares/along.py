@@ -1,4 +1,4 @@
-"""A stare as the orbit gives it: frames while the target is seen, the detector's temperature, hits of particles."""
+"""Stares along an orbit: frames while the target is visible, detector temperature, and particle hits."""
 
 from __future__ import annotations
 
@@ -20,38 +20,25 @@ from mauvecl.schema.errors import InputError
 
 Float = NDArray[np.float64]
 
-#: Time constants of the detector's temperature that are followed before the first frame: its start is forgotten.
+#: Time before the first frame for which the detector temperature is computed, in its time constants.
 SETTLING = 8.0
-#: Seconds between the places that are computed for the temperature's past.
+#: Time step before the first frame, s.
 PAST_STEP_S = 30.0
 
 
 @dataclass(frozen=True, eq=False)
 class OrbitStare:
-    """A stare along the orbit, and what else the orbit does to its frames.
+    """A stare along the orbit, with the conditions of its frames."""
 
-    Attributes
-    ----------
-    stare : Stare
-        Its clock starts with the plan; frames in which the target is not seen are absent.
-    hits_per_cm2_s : ndarray, shape (n_frame,)
-        Cosmic rays and trapped protons.
-    in_shadow : ndarray of bool, shape (n_frame,)
-    start : str
-        Of the stare's clock, ISO 8601, UTC.
-    messages : tuple of str
-        What must be told of the orbit.
-    """
-
-    stare: Stare
-    hits_per_cm2_s: Float
-    in_shadow: NDArray[np.bool_]
-    start: str
-    messages: tuple[str, ...]
+    stare: Stare  # without the frames in which the target is not visible
+    hits_per_cm2_s: Float  # cosmic rays and trapped protons, shape (n_frame,)
+    in_shadow: NDArray[np.bool_]  # shape (n_frame,)
+    start: str  # of the stare, ISO 8601, UTC
+    messages: tuple[str, ...]  # about the orbit
 
     @property
     def mean_hits_per_cm2_s(self) -> float:
-        """Over the frames: what `CosmicRays` takes for all of them."""
+        """Mean over the frames, the rate for `CosmicRays`."""
         return float(self.hits_per_cm2_s.mean())
 
 
@@ -67,7 +54,7 @@ def stare_along(
     particles: Particles | None = None,
     **unknowns: Any,
 ) -> OrbitStare:
-    """A stare at a target from the orbit.
+    """Compute the stare at a target along an orbit.
 
     Parameters
     ----------
@@ -77,20 +64,20 @@ def stare_along(
     start : str
         ISO 8601, UTC.
     duration_s : float
-        From the first frame on, seen or not.
+        From the first frame, including times at which the target is not visible.
     frame_s : float
     limits : Limits, optional
-        What must hold for the target to be seen.
+        Conditions for the target to be visible.
     thermal : Thermal, optional
-        How sunlight and shadow move the detector's temperature; assumed unless given.
+        Response of the detector temperature to sunlight and shadow; assumed by default.
     particles : Particles, optional
     **unknowns
-        As `Stare.of` takes them: variability, throughput, sky, jitters, offsets, drifts, cycles.
+        Arguments of `Stare.of`: variability, throughput, sky, jitters, offsets, drifts, cycles.
 
     Raises
     ------
     InputError
-        If the target is never seen, or for anything that cannot be.
+        If the target is never visible.
     """
     for name in ("gaps", "temperature_c", "thermal"):
         if name in unknowns:
@@ -111,7 +98,7 @@ def stare_along(
             key="target",
             value=place.name,
         )
-    # Everything about the frames but the temperature is the whole stare's with frames left out.
+    # All but the temperature follow from a stare without gaps.
     whole = Stare.of(count * frame_s, frame_s=frame_s, **unknowns)
     temperature = _temperature(orbit, track, thermal)
     stare = replace(
@@ -128,14 +115,14 @@ def stare_along(
 
 
 def _temperature(orbit: Orbit, track: Track, thermal: Thermal) -> Float:
-    """Of the detector at each step, deg C, with its past of some time constants before the first."""
+    """Return the detector temperature at each step, deg C, computed from several time constants before the first."""
     times = track.times
     past = TimeGrid(
         times.iso(-SETTLING * thermal.time_constant_s, 3),
         SETTLING * thermal.time_constant_s / DAY_S,
         PAST_STEP_S,
     )
-    # The whole of it by one kind of orbit, whichever the plan has.
+    # The same kind of orbit as that of the plan.
     before = Orbit(orbit.elements, orbit.resolved(times)).track(past)
     first = float(thermal.temperature_c(_light(before), PAST_STEP_S)[-1])
     return thermal.temperature_c(_light(track), times.step_s, first)

@@ -1,8 +1,8 @@
-"""What each frame of a stare is made of: a few spectra, so that no frame needs an expectation of its own.
+"""Components of the frames of a stare: a few spectra, so that no frame needs its own expectation.
 
-Counts are sums of what does not know of each other: the star, the sky, the dark, flares of some temperatures. Whatever
-the frame, each has the same spectrum and only another strength, its coefficient; so the mean and every higher cumulant
-of a pixel, and of a weighted sum of pixels, is linear in a frame's few coefficients.
+Counts are sums of independent components: the star, the sky, the dark current, and flares of several temperatures. The
+spectrum of a component is the same in all frames, and only its strength, its coefficient, changes. The mean and all
+higher cumulants of a pixel, and of a weighted sum of pixels, are therefore linear in the coefficients of a frame.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: What every frame holds; flares, one for each temperature, follow.
+#: Components of every frame; one flare component per temperature follows.
 STEADY = ("star", "sky", "dark")
-#: Temperatures of flares, and weighted sums, that one launch follows.
+#: Largest number of flare temperatures, and of weighted sums.
 MOST_FLARES, MOST_STATISTICS = 8, 8
 #: Fourth cumulant of the rounding error, DN^4; its variance is 1/12.
 ROUNDING_FOURTH = -1.0 / 120.0
@@ -33,24 +33,19 @@ ROUNDING_FOURTH = -1.0 / 120.0
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """The spectra of a stare's frames, and the weights of the sums that are kept of each frame.
+    """Spectra of a stare's frames, and weights of the sums that are computed for each frame.
 
-    A frame's statistics are y_k = sum_p weights_kp (raw_p - mean_raw_p), with the quiescent star's mean raw counts at
-    the expectation's own conditions.
+    The statistics of a frame are y_k = sum_p weights_kp (raw_p - mean_raw_p), with the mean raw counts of the quiescent
+    star at the conditions of its expectation.
 
     Attributes
     ----------
     quiet : Expectation
-        ONE frame of the quiescent star: what coefficients of one stand for.
+        A single frame of the quiescent star, for which the coefficients are one.
     flare_electrons : ndarray, shape (n_flare, n_pixel)
-        Mean electrons per frame of flares of one amplitude, each of another temperature; at most `MOST_FLARES`.
+        Mean electrons per frame of flares of unit amplitude, one per temperature; at most `MOST_FLARES`.
     weights : ndarray, shape (n_statistic, n_pixel)
-        Zero in pixels that saturate; linearly independent.
-
-    Raises
-    ------
-    InputError
-        For shapes that do not belong together, an exposure of several frames, or weights that cannot be used.
+        Linearly independent, and zero in pixels that saturate.
     """
 
     quiet: Expectation
@@ -104,18 +99,18 @@ class Components:
 
     @classmethod
     def of(cls, quiet: Expectation, flares: Sequence[Expectation], weights: Float) -> Self:
-        """From one frame of the quiescent star and of the same star with flares of one amplitude each."""
+        """Return the components from a frame of the quiescent star and frames with flares of unit amplitude."""
         more = [flare.source_electrons - quiet.source_electrons for flare in flares]
         return cls(quiet, np.reshape(more, (len(flares), quiet.wavelength_nm.size)), weights)
 
     @property
     def n_statistics(self) -> int:
-        """Sums that are kept of each frame."""
+        """Number of sums per frame."""
         return len(self.weights)
 
     @property
     def n_flares(self) -> int:
-        """Temperatures."""
+        """Number of flare temperatures."""
         return len(self.flare_electrons)
 
     @cached_property
@@ -128,14 +123,14 @@ class Components:
         return light
 
     def pixel_cumulants(self, order: int) -> tuple[Float, Float]:
-        """Cumulants of order 1 to 5 of each pixel's count.
+        """Return the cumulants of each pixel's count, of order 1 to 5.
 
         Returns
         -------
         constant : ndarray, shape (n_pixel,)
-            Whatever the coefficients: read noise and rounding.
+            Read noise and rounding.
         each : ndarray, shape (3 + n_flare, n_pixel)
-            Of each component at a coefficient of one.
+            Each component at a coefficient of one.
         """
         x = self.quiet
         photon = x.gain_dn_per_electron ** (order - 1)
@@ -151,7 +146,7 @@ class Components:
         return constant, each
 
     def sum_cumulants(self, order: int) -> tuple[Float, Float]:
-        """Joint cumulants of the weighted sums.
+        """Return the joint cumulants of the weighted sums.
 
         Returns
         -------
@@ -171,7 +166,7 @@ class Components:
         return {order: self.sum_cumulants(order) for order in (1, 2, 3, 4)}
 
     def coefficients(self, stare: Stare, flare: Float | None = None) -> Float:
-        """What is known of each frame.
+        """Return the known coefficients of each frame.
 
         Parameters
         ----------
@@ -199,21 +194,21 @@ class Components:
         return factors
 
     def means(self, coefficients: Float) -> Float:
-        """Mean statistics of frames: (..., 3 + n_flare) to (..., n_statistic)."""
+        """Return the mean statistics, (..., n_statistic), for coefficients of shape (..., 3 + n_flare)."""
         reference = np.zeros(len(STEADY) + self.n_flares)
         reference[:3] = 1.0
         return np.asarray((coefficients - reference) @ self._sums[1][1])
 
     def covariance(self, coefficients: Float) -> Float:
-        """Covariances of a frame's statistics: (..., 3 + n_flare) to (..., n_statistic, n_statistic)."""
+        """Return the covariances of the statistics of frames, shape (..., n_statistic, n_statistic)."""
         return self._of(2, coefficients)
 
     def third(self, coefficients: Float) -> Float:
-        """Joint third cumulants: (..., 3 + n_flare) to (..., n_statistic, n_statistic, n_statistic)."""
+        """Return the joint third cumulants of the statistics, shape (..., n_statistic, n_statistic, n_statistic)."""
         return self._of(3, coefficients)
 
     def fourth(self, coefficients: Float) -> Float:
-        """Joint fourth cumulants, as `third` with one axis more."""
+        """Return the joint fourth cumulants of the statistics, with one axis more than those of `third`."""
         return self._of(4, coefficients)
 
     def _of(self, order: int, coefficients: Float) -> Float:
@@ -221,9 +216,9 @@ class Components:
         return np.asarray(constant + np.tensordot(coefficients, each, 1))
 
     def directions(self, coefficients: Float) -> dict[str, Float]:
-        """What a small change moves the mean statistics by, each shape (..., n_statistic).
+        """Return the derivatives of the mean statistics, each of shape (..., n_statistic).
 
-        Of one in the star's level, all light, the sky's level (relative to the frame's own), and of 1 deg C.
+        They are with respect to relative changes of the star, of all light and of the sky, and to the temperature.
         """
         mean = self._sums[1][1]
         light = coefficients[..., [0, 1, *range(3, coefficients.shape[-1])]] @ np.delete(mean, 2, axis=0)

@@ -1,4 +1,4 @@
-"""What changes slowly in a stare: a sinusoid, or a table between whose points it is linear."""
+"""Slow changes during a stare: sinusoids and linearly interpolated tables."""
 
 from __future__ import annotations
 
@@ -17,21 +17,11 @@ Float = NDArray[np.float64]
 @public
 @dataclass(frozen=True)
 class Sinusoid:
-    """amplitude * sin(2 pi t / period + phase).
+    """The curve amplitude * sin(2 pi t / period + phase)."""
 
-    Attributes
-    ----------
-    amplitude : float
-        Half of the way from its lowest to its highest.
-    period_s : float
-        That of the orbit by default.
-    phase : float
-        Radians at the start of the stare.
-    """
-
-    amplitude: float
+    amplitude: float  # half of the range
     period_s: float = ORBIT_S
-    phase: float = 0.0
+    phase: float = 0.0  # radians, at the start of the stare
 
     def __post_init__(self) -> None:
         if not (np.isfinite([self.amplitude, self.period_s, self.phase]).all() and self.period_s > 0):
@@ -43,24 +33,17 @@ class Sinusoid:
             )
 
     def mean_over(self, start_s: Float, frame_s: float) -> Float:
-        """Its mean over each frame, shape (n_frame,)."""
+        """Return the mean over each frame, shape (n_frame,)."""
         angle = 2 * np.pi * (start_s + frame_s / 2) / self.period_s + self.phase
         return np.asarray(self.amplitude * np.sinc(frame_s / self.period_s) * np.sin(angle))
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Values at times, linear between them, level before the first and after the last.
+    """Values at times, interpolated linearly, and constant before the first and after the last time."""
 
-    Attributes
-    ----------
-    time_s : ndarray, shape (n,)
-        Ascending.
-    values : ndarray, shape (n,)
-    """
-
-    time_s: Float
-    values: Float
+    time_s: Float  # ascending, shape (n,)
+    values: Float  # shape (n,)
 
     def __post_init__(self) -> None:
         for name in ("time_s", "values"):
@@ -86,11 +69,11 @@ class Table:
             )
 
     def mean_over(self, start_s: Float, frame_s: float) -> Float:
-        """Its mean over each frame, shape (n_frame,): exact, by the integral of what is linear between points."""
+        """Return the exact mean over each frame, shape (n_frame,)."""
         return np.asarray((self._until(start_s + frame_s) - self._until(start_s)) / frame_s)
 
     def _until(self, t: Float) -> Float:
-        """Integral from the first point to a time, shape of t."""
+        """Return the integral from the first point to a time, shape of t."""
         time, value = self.time_s, self.values
         slope = np.diff(value) / np.diff(time)
         areas = np.concatenate([[0.0], np.cumsum(np.diff(time) * (value[1:] + value[:-1]) / 2)])

@@ -1,4 +1,4 @@
-"""Stares as a request: cut into shards of stares, drawn and reduced by whoever is free, joined exactly."""
+"""Requests for stares, which are split into shards, drawn and reduced by workers, and joined exactly."""
 
 from __future__ import annotations
 
@@ -19,48 +19,47 @@ from mauvecl.results.requests.requests import Countable
 Arrays = dict[str, NDArray[Any]]
 Method = Literal["pixels", "cumulants"]
 
-#: What becomes of a frame of a scenario costs about as much as drawing so many pixels of it: a search by Fourier
-#: transforms.
+#: Approximate cost of reducing a frame of a scenario by Fourier transforms, in draws of a pixel.
 REDUCED = 500
 
 
 class Reduction(Protocol):
-    """What is kept of stares: a frozen dataclass, so that it travels and can be told from others.
+    """Reduction of stares to results: a frozen dataclass, which can be pickled and identified by its content.
 
-    It is called as ``reduction(values, first)``, and gives arrays by name for stares `first` and on, each looked at by
-    itself. ``values`` are float32, (n_stare, n_frame, n_statistic), with scenarios one axis more in front; they are
-    valid during the call. Where the request has `glow` it is called as ``reduction(values, first, glow)``, with another
-    array of the shape (n_stare, n_frame, n_statistic + 1).
+    It is called as ``reduction(values, first)`` and returns arrays by name for stares from `first` on, which do not
+    depend on each other. ``values`` are float32, (n_stare, n_frame, n_statistic), preceded by an
+    axis of scenarios if there are several; they are valid only during the call. If the request has `glow`, it is
+    called as ``reduction(values, first, glow)`` with an array of shape (n_stare, n_frame, n_statistic + 1).
 
     Attributes
     ----------
     adds : bool
-        Whether what is kept are whole numbers that add up over stares; otherwise arrays are joined along their first
-        axis, stares in their order.
+        True if results are integers that are summed over stares. Otherwise, arrays are joined along their first axis,
+        in the order of stares.
     """
 
     adds: ClassVar[bool]
 
     @property
     def __call__(self) -> Callable[..., Mapping[str, NDArray[Any]]]:
-        """See the class."""
+        """Reduce stares; see the class."""
 
 
 @dataclass(frozen=True, eq=False)
 class StaresRequest(Countable):
-    """What `Stares.frames` takes, and what is kept of it; flares and amplitudes as there, for all stares asked for.
+    """Request for stares; flares and amplitudes as for `Stares.frames`.
 
     Attributes
     ----------
     realisations : int
-        Stares.
+        Number of stares.
     start : int
-        Number of the first.
+        Number of the first stare.
     reduction : Reduction, optional
-        By default statistics are kept as they are.
+        By default, statistics are returned as they are.
     glow : bool
-        Whether the reduction also takes what flares put into the frames need: a normal for each statistic, for their
-        own photons, and the factor on all light as drawn, less one.
+        Whether the reduction also receives the draws for flares that it adds: a standard normal per statistic, for
+        their photon noise, and the factor on all light minus one.
     """
 
     components: Components
@@ -74,7 +73,7 @@ class StaresRequest(Countable):
     processes: Processes = NONE
     reduction: Reduction | None = None
     glow: bool = False
-    #: Where rows of flares and amplitudes are counted from, where they differ from stare to stare.
+    #: Number of the stare of the first row of flares and amplitudes, if these differ between stares.
     rows_from: int = field(init=False, default=0)
 
     parts = 1
@@ -86,12 +85,12 @@ class StaresRequest(Countable):
 
     @cached_property
     def flares(self) -> Flares:
-        """Of all its stares."""
+        """Flares of all stares."""
         return Flares.of(self.components, self.stare, self.flare, self.amplitudes, self.realisations)
 
     @property
     def work(self) -> int:
-        """About as many draws of a pixel as one stare costs."""
+        """Approximate cost of a stare, in draws of a pixel."""
         drawn = (
             self.components.quiet.wavelength_nm.size if self.method == "pixels" else 4 * self.components.n_statistics
         )
@@ -99,21 +98,21 @@ class StaresRequest(Countable):
 
 
 @dataclass(frozen=True)
-class Kept:
-    """Statistics as they are."""
+class KeepStatistics:
+    """Reduction that returns the statistics as they are."""
 
     adds: ClassVar[bool] = False
 
     def __call__(self, values: NDArray[np.float32], first: int) -> Arrays:
-        """Rows of ``values``, one to a stare; scenarios come behind."""
+        """Return one row per stare, with scenarios on the second axis."""
         return {"values": np.moveaxis(values, 0, 1).copy() if values.ndim == 4 else values.copy()}
 
 
 class StareSums:
-    """What has come of a request so far."""
+    """Shards of a request that are finished."""
 
     def __init__(self, request: StaresRequest) -> None:
-        self._adds = (request.reduction or Kept()).adds
+        self._adds = (request.reduction or KeepStatistics()).adds
         self._found: dict[int, Arrays] = {}
 
     def add(self, part: int, shard: Arrays) -> None:
@@ -122,11 +121,11 @@ class StareSums:
         self._found[int(rest.pop("start"))] = rest
 
     def answer(self) -> Arrays:
-        """All of it, once all shards have come; stares in their order."""
+        """Return the result of all shards, in the order of stares."""
         return joined([self._found[start] for start in sorted(self._found)], adds=self._adds)
 
 
 def joined(parts: list[Arrays], *, adds: bool) -> Arrays:
-    """Parts of a request, in order, as one."""
+    """Join the parts of a request, which are in order."""
     together = (lambda arrays: np.sum(arrays, axis=0)) if adds else np.concatenate
     return {name: np.asarray(together([part[name] for part in parts])) for name in parts[0]}

@@ -1,4 +1,4 @@
-"""A stare's components and conditions as the arrays that the kernels and their twin read."""
+"""Arrays that the stare kernels and their reference implementation read."""
 
 from __future__ import annotations
 
@@ -25,40 +25,27 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-#: Conditions are held against what can be drawn so many standard deviations from what is known of them.
+#: Deviation of conditions from their known values up to which frames are checked, in standard deviations.
 REACH_SIGMA = 7.0
-#: Unknowns of a stare, and scenarios on common draws, of one launch.
+#: Largest number of unknowns of a stare, and of scenarios on common draws.
 MOST_UNKNOWNS, MOST_SCENARIOS = 32, 16
 #: Largest amplitude of a flare.
 LARGEST = 1e12
-#: Counts further than this from their base are not rounded to whole DN by the device.
+#: Distance of a count from its base up to which the device rounds to whole DN.
 REACH_DN = 2.0**22
 
 
 @dataclass(frozen=True, eq=False)
 class Flares:
-    """Flares put into stares.
+    """Flares that are added to stares."""
 
-    Attributes
-    ----------
-    given : ndarray, shape (n_row, n_frame, n_flare)
-        Amplitude of each flare spectrum in each frame; one row for all stares, or one for each.
-    amplitudes : ndarray of float32, shape (n_scenario, n_amplitude_row)
-        Factors on them.
-    """
-
+    # Amplitude of each flare spectrum in each frame, shape (n_row, n_frame, n_flare), with one row or one per stare.
     given: NDArray[Any]
-    amplitudes: Floats
+    amplitudes: Floats  # factors on `given`, shape (n_scenario, n_amplitude_row)
 
     @classmethod
     def of(cls, components: Components, stare: Stare, flare: Any, amplitudes: Any, count: int) -> Self:
-        """From what `Stares.frames` takes.
-
-        Raises
-        ------
-        InputError
-            For shapes that do not fit, or what is negative or not finite.
-        """
+        """Validate the arguments of `Stares.frames`; raises InputError for wrong shapes and negative values."""
         n_frames, n_flares = stare.n_frames, components.n_flares
         given = np.zeros((1, n_frames, n_flares), np.float32) if flare is None else np.asarray(flare)
         if given.ndim == 2:
@@ -78,7 +65,7 @@ class Flares:
                 key="amplitudes",
                 value=factors.shape,
             )
-        # One that is no number is the least, too.
+        # The minimum of values that include NaN is NaN.
         ends = [("flare coefficients", given.min(initial=0.0)), ("amplitudes", factors.min(initial=0.0))]
         ends += [("flare coefficients", most) for most in _largest(given)] + [("amplitudes", factors.max())]
         for what, end in ends:
@@ -88,73 +75,46 @@ class Flares:
 
     @cached_property
     def rows(self) -> Floats:
-        """As kernels read them, shape (n_row, n_flare, n_padded_frame)."""
+        """Amplitudes for the kernels, shape (n_row, n_flare, n_padded_frame)."""
         n_row, n_frames, n_flares = self.given.shape
         rows = np.zeros((n_row, n_flares, padded_frames(n_frames)), np.float32)
         rows[:, :, :n_frames] = np.moveaxis(self.given, 2, 1)
         return rows
 
     def part(self, first: int, count: int) -> Flares:
-        """Those of some stares."""
+        """Return the flares of some stares."""
         there = slice(first, first + count)
         amplitudes = self.amplitudes if self.amplitudes.shape[1] == 1 else self.amplitudes[:, there]
         return Flares(self.given if len(self.given) == 1 else self.given[there], np.ascontiguousarray(amplitudes))
 
     @cached_property
     def most(self) -> Float:
-        """The largest coefficient of each spectrum, shape (n_flare,)."""
+        """Largest coefficient of each spectrum, shape (n_flare,)."""
         return np.array(_largest(self.given), np.float64) * float(self.amplitudes.max())
 
 
 @dataclass(frozen=True, eq=False)
 class StareScene:
-    """What a launch reads of a stare.
-
-    Attributes
-    ----------
-    components, stare
-        What it is made of.
-    scene : Scene
-        One quiescent frame, for addresses, rails and additive processes.
-    numbers : ndarray of uint32, shape (n_padded_frame,)
-        Frames as the generator counts them, gaps included.
-    known : ndarray of float32, shape (7, n_padded_frame)
-        Rows of `layout.KNOWN_OF_FRAMES`.
-    curves : ndarray of float32, shape (n_unknown, n_padded_frame)
-        Of what is unknown of a stare, times its standard deviation.
-    kinds : ndarray of uint32, shape (n_unknown,)
-        What each is of: rows of `layout.MOVED`.
-    staring : ndarray of layout.STARING, shape ()
-        Without what belongs to flares.
-    mixtures : ndarray of layout.MIXTURE, shape (n_padded,)
-    spectra : ndarray of float32, shape (n_flare, n_padded)
-        DN of flares of one amplitude.
-    weights : ndarray of float32, shape (n_statistic, n_padded)
-    constants : ndarray of float32, shape (n_statistic,)
-        What each sum lacks because the kernels leave whole DN out.
-    """
+    """Arrays of a stare that a launch reads."""
 
     components: Components
     stare: Stare
-    scene: Scene
-    numbers: NDArray[np.uint32]
-    known: Floats
-    curves: Floats
-    kinds: NDArray[np.uint32]
-    staring: NDArray[np.void]
-    mixtures: NDArray[np.void]
-    spectra: Floats
-    weights: Floats
-    constants: Floats
+    scene: Scene  # of one quiescent frame, for addresses, clipping and additive processes
+    numbers: NDArray[np.uint32]  # of frames, including gaps, shape (n_padded_frame,)
+    known: Floats  # rows of `layout.KNOWN_OF_FRAMES`, shape (7, n_padded_frame)
+    curves: Floats  # of the stare's unknowns, times their standard deviations, shape (n_unknown, n_padded_frame)
+    kinds: NDArray[np.uint32]  # rows of `layout.MOVED`, shape (n_unknown,)
+    staring: NDArray[np.void]  # of `layout.STARING`, without the values of flares, shape ()
+    mixtures: NDArray[np.void]  # of `layout.MIXTURE`, shape (n_padded,)
+    spectra: Floats  # DN of flares of unit amplitude, shape (n_flare, n_padded)
+    weights: Floats  # shape (n_statistic, n_padded)
+    constants: Floats  # added to each sum, since kernels omit whole DN, shape (n_statistic,)
 
     @classmethod
     def of(cls, components: Components, stare: Stare, processes: Processes = NONE) -> Self:
-        """Lay out a stare.
+        """Build the arrays.
 
-        Raises
-        ------
-        InputError
-            If the quiescent frame cannot be drawn jointly, or there are more sums or unknowns than a launch follows.
+        Raises InputError if the quiescent frame cannot be drawn jointly, or there are too many sums or unknowns.
         """
         x, n_pixel = components.quiet, components.quiet.wavelength_nm.size
         if abs(stare.frame_s - x.frame_s) > 1e-9 * x.frame_s:
@@ -186,7 +146,7 @@ class StareScene:
             mixtures[name][:n_pixel] = components.mean_dn[row]
         for order, name in ((2, "variance"), (3, "third"), (4, "fourth"), (5, "fifth")):
             constant, each = components.pixel_cumulants(order)
-            # The kernels round: none of it here.
+            # Rounding is done by the kernels.
             constant = constant - {2: 1 / 12, 4: -1 / 120}.get(order, 0.0)
             mixtures[name][:n_pixel] = constant + each[: len(STEADY)].sum(axis=0)
             mixtures[f"dark_{name}"][:n_pixel] = each[2]
@@ -222,24 +182,24 @@ class StareScene:
 
     @property
     def counts(self) -> bool:
-        """Whether photons are Poisson counts, with more than a variance."""
+        """True if photons are Poisson counts."""
         return self.components.quiet.photon_noise == "poisson"
 
-    def staring_of(self, flares: Flares) -> NDArray[np.void]:
-        """With what belongs to flares, shape (1,)."""
+    def stare_struct(self, flares: Flares) -> NDArray[np.void]:
+        """Return the `layout.STARING` structure with the values of flares, shape (1,)."""
         staring = self.staring.copy()
         staring["scenario_count"], staring["amplitude_rows"] = flares.amplitudes.shape
         staring["flare_rows"] = len(flares.given)
         return staring.reshape(1)
 
     def job(self, seed: int) -> NDArray[np.void]:
-        """The frame's job with a seed, shape (1,)."""
+        """Return the job of a frame with a seed, shape (1,)."""
         job = self.scene.job.copy()
         job["seed_low"], job["seed_high"] = seed & 0xFFFFFFFF, seed >> 32
         return job.reshape(1)
 
     def extremes(self, flares: Flares) -> Iterator[tuple[Float, float]]:
-        """Conditions from end to end, neighbours at most a factor of 2 apart.
+        """Yield conditions over their range, in steps of at most a factor of 2.
 
         Yields
         ------
@@ -261,7 +221,7 @@ class StareScene:
 
     @property
     def _ends(self) -> tuple[Float, Float]:
-        """Least and largest factors on star, sky, dark and flares that are met."""
+        """Smallest and largest factors on star, sky, dark and flares."""
         stare, spread = self.stare, self._spreads
         ends = []
         for sign, of in ((-1.0, np.min), (1.0, np.max)):
@@ -274,21 +234,14 @@ class StareScene:
 
     @property
     def _spreads(self) -> dict[str, Float]:
-        """Standard deviation of what is drawn of each frame, shape (n_frame,) each."""
+        """Standard deviations of the conditions that are drawn for each frame, shape (n_frame,) each."""
         variances = {of: np.full(self.stare.n_frames, self.stare.jitters.get(of, 0.0) ** 2) for of in layout.MOVED}
         for unknown in self.stare.unknowns:
             variances[unknown.of] += (unknown.sd * unknown.curve) ** 2
         return {of: np.sqrt(variance) for of, variance in variances.items()}
 
     def check(self, flares: Flares) -> None:
-        """Refuse what cannot be drawn.
-
-        Raises
-        ------
-        InputError
-            Where light could be drawn below zero, counts further than the device rounds, or a pixel's noise not from
-            one normal.
-        """
+        """Raise InputError if light may be negative, counts exceed the range of rounding, or noise is not joint."""
         spread = self._spreads
         for of in ("light", "star", "sky"):
             if (REACH_SIGMA * spread[of] >= 1.0).any():
@@ -321,22 +274,22 @@ class StareScene:
 
 
 def padded_frames(n_frames: int) -> int:
-    """Frames with those that no one asked for."""
+    """Return the number of frames including padding."""
     return -(-n_frames // layout.FRAME_BLOCK) * layout.FRAME_BLOCK
 
 
 def unique(n: int, order: int) -> list[tuple[int, ...]]:
-    """Places of a symmetric tensor that differ, as kernels number them: (0,), or (0, 0), (1, 0), (1, 1), ..."""
+    """Return the unique indices of a symmetric tensor in the order of the kernels: (0, 0), (1, 0), (1, 1), ..."""
     return sorted(tuple(sorted(key, reverse=True)) for key in itertools.combinations_with_replacement(range(n), order))
 
 
 def _largest(given: NDArray[Any]) -> list[float]:
-    """Of each spectrum; over the last axis alone NumPy is slow."""
+    """Return the maximum of each spectrum, one by one since NumPy is slow over the other axes."""
     return [float(given[..., j].max()) for j in range(given.shape[-1])]
 
 
 def _padded(values: NDArray[Any], kind: type) -> NDArray[Any]:
-    """With zeros in frames that no one asked for."""
+    """Pad with zeros to whole blocks of frames."""
     more = padded_frames(values.shape[-1]) - values.shape[-1]
     return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, more)]).astype(kind)
 

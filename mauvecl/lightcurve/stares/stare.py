@@ -1,4 +1,4 @@
-"""A stare at a star: when its frames are, what is known of each, and how far from that it may be. Nothing is drawn."""
+"""Stares: times, known conditions and unknown changes of the frames of a long observation."""
 
 from __future__ import annotations
 
@@ -22,31 +22,21 @@ if TYPE_CHECKING:
     from mauvecl.host.orbit.targets import Target
 
 Float = NDArray[np.float64]
-#: Frames of a stare, at most: twenty years of 5 s, five bytes of a frame number.
+#: Largest number of frames of a stare, twenty years of 5 s.
 MOST_FRAMES = 2**27
-#: Relative changes are of a level that is there: a standard deviation beyond this would reach below zero.
+#: Largest relative standard deviation; with larger ones, levels could be negative.
 LARGEST_SPREAD = 0.2
 HOUR_S = 3600.0
 
 
 @dataclass(frozen=True, eq=False)
 class StareUnknown:
-    """Something that is not known of a whole stare: a normal amplitude times a known curve.
-
-    Attributes
-    ----------
-    name : str
-    of : {"star", "light", "sky", "temperature"}
-    sd : float
-        Standard deviation of the amplitude; relative, or deg C for the temperature.
-    curve : ndarray, shape (n_frame,)
-        What an amplitude of one does to each frame.
-    """
+    """Unknown change of a stare: a normal amplitude times a known curve."""
 
     name: str
     of: Changing
-    sd: float
-    curve: Float
+    sd: float  # standard deviation of the amplitude; relative, or deg C for the temperature
+    curve: Float  # effect of unit amplitude on each frame, shape (n_frame,)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "curve", _kept(self.curve))
@@ -57,31 +47,32 @@ class StareUnknown:
 @public
 @dataclass(frozen=True, eq=False)
 class Stare:
-    """Frames of one star, one after the other with gaps between them; arrays are read-only.
+    """Frames of one star, with gaps; arrays are read-only.
 
     In frame k of stare i, with standard normal z drawn for the stare and e drawn for the frame,
 
     - all light, of star, flare and sky, is multiplied by light_k (1 + sum_u sd_u z_iu curve_uk + light_jitter e_ik);
-    - the star's without its flares by star_k (1 + sum_u ...) too, the sky's by sky_k (1 + sum_u ... + sky_jitter e_ik);
+    - the light of the star without flares is also multiplied by star_k (1 + sum_u ...), and that of the sky by
+      sky_k (1 + sum_u ... + sky_jitter e_ik);
     - the detector's temperature is temperature_c_k + sum_u ... + temperature_jitter_c e_ik.
 
-    Each jitter and each sum has draws of its own.
+    Each jitter and each sum has independent draws.
 
     Attributes
     ----------
     start_s : ndarray, shape (n_frame,)
-        Start of each frame, s from the start of the stare: ascending multiples of `frame_s`; frames in gaps are absent.
+        Start of each frame from the start of the stare: ascending multiples of `frame_s`, without frames in gaps.
     frame_s : float
     star, light, sky : ndarray, shape (n_frame,)
-        Known factors on the expectation's star, on all light, and on its sky.
+        Known factors on the light of the star, on all light, and on the sky.
     temperature_c : ndarray, shape (n_frame,)
-        Known temperature of the detector, deg C.
+        Known detector temperature.
     light_jitter, sky_jitter : float
-        Standard deviation from frame to frame, relative.
+        Relative standard deviation from frame to frame.
     temperature_jitter_c : float
-        The same, deg C.
+        Standard deviation from frame to frame, deg C.
     unknowns : tuple of StareUnknown
-        What differs from stare to stare.
+        Changes that differ between stares.
 
     Examples
     --------
@@ -163,35 +154,35 @@ class Stare:
         drifts: Mapping[Changing, float] | None = None,
         cycles: Mapping[Changing, float] | None = None,
     ) -> Self:
-        """A stare from what an observer would say of it.
+        """Return a stare from its duration, gaps and changes.
 
         Parameters
         ----------
         duration_s : float
-            From the first frame to the end of the last; rounded up to whole frames.
+            From the first frame to the end of the last, rounded up to whole frames.
         frame_s : float
         gaps : sequence of (float, float)
-            Times between which nothing is recorded, s; a frame that a gap touches is lost.
+            Start and end of gaps, s; frames that overlap a gap are lost.
         temperature_c : float
-            Of the detector, about which `thermal` runs; the payload's by default.
+            Mean detector temperature; that of the payload by default.
         thermal : float, Sinusoid or Table, optional
-            deg C on top of it: the half amplitude of a sinusoid of the orbit, or a curve.
+            Change of the temperature, deg C: the amplitude of a sinusoid with the orbital period, or a curve.
         variability : Sinusoid or Table, optional
-            The star's own, relative: 0.01 is 1 % brighter.
+            Relative variability of the star: 0.01 is 1 % brighter.
         throughput, sky : Sinusoid or Table, optional
-            What is known of how all light, and the sky's brightness, change; relative.
+            Known relative changes of all light, and of the sky brightness.
         orbit_s : float
             Period of `thermal` and `cycles`.
         jitters : mapping of {"light", "sky", "temperature"} to float, optional
             Standard deviation from frame to frame.
         offsets, drifts, cycles : mapping of {"star", "light", "sky", "temperature"} to float, optional
-            Standard deviations, over stares, of an unknown level; of an unknown change in an hour, zero in the middle;
-            and of the sine and the cosine of an unknown cycle of the orbit.
+            Standard deviations over stares of an unknown level, of an unknown change per hour that is zero in the
+            middle, and of the sine and cosine of an unknown orbital cycle.
 
         Raises
         ------
         InputError
-            For a length, gap or spread that cannot be, or nothing left between the gaps.
+            If the gaps leave no frame, or for an invalid value.
         """
         if not (np.isfinite(duration_s) and duration_s > 0 and np.isfinite(frame_s) and frame_s > 0):
             raise InputError(
@@ -233,18 +224,7 @@ class Stare:
 
     @classmethod
     def along(cls, orbit: Orbit, target: Target | str, start: str, duration_s: float, **how: Any) -> Stare:
-        """As the orbit gives it: frames while the target is seen, the detector's temperature through sun and shadow.
-
-        Parameters
-        ----------
-        orbit : Orbit
-        target : Target or str
-        start : str
-            ISO 8601, UTC.
-        duration_s : float
-        **how
-            As `along.stare_along`, which also has the rate of particles.
-        """
+        """Return the stare along an orbit; see `along.stare_along`, which also returns the particle rate."""
         from mauvecl.lightcurve.stares.along import stare_along
 
         return stare_along(orbit, target, start, duration_s, **how).stare
@@ -256,12 +236,12 @@ class Stare:
 
     @property
     def n_frames(self) -> int:
-        """Frames that are there."""
+        """Number of frames."""
         return self.start_s.size
 
     @cached_property
     def numbers(self) -> NDArray[np.int64]:
-        """Number of each frame counted from the start of the stare, gaps included, shape (n_frame,)."""
+        """Number of each frame from the start of the stare, counting gaps, shape (n_frame,)."""
         return np.rint(self.start_s / self.frame_s).astype(np.int64)
 
     @property
@@ -294,13 +274,13 @@ class Stare:
 
 
 def _outside(gaps: Sequence[tuple[float, float]], start: Float, frame_s: float) -> NDArray[np.bool_]:
-    """Which frames no gap touches."""
-    # A hair, so that a gap that ends where a frame starts leaves it.
-    kept, hair = np.ones(start.size, np.bool_), 1e-9 * frame_s
+    """Return which frames do not overlap a gap."""
+    # The tolerance keeps a frame that starts at the end of a gap.
+    kept, tolerance = np.ones(start.size, np.bool_), 1e-9 * frame_s
     for first, last in gaps:
         if not (np.isfinite([first, last]).all() and first < last):
             raise InputError.of("gaps", (first, last), "two times, ascending", unit="s")
-        kept &= (start + frame_s <= first + hair) | (start >= last - hair)
+        kept &= (start + frame_s <= first + tolerance) | (start >= last - tolerance)
     return kept
 
 

@@ -1,8 +1,8 @@
-"""A frame's weighted sums without its pixels: their joint cumulants as the table that kernel and twin read.
+"""Joint cumulants of weighted sums of a frame, from which the sums are drawn without drawing pixels.
 
-The cumulants of independent counts add up, so those of the sums are exact. From them a frame is drawn as the sums'
-Cholesky factor times normals, each with a quadratic in all of them that gives every third cumulant its value, and
-where it could be noticed a cubic of its own (Cornish & Fisher 1938, doi 10.2307/1400905, in several dimensions).
+The cumulants of independent counts add up, so those of the sums are exact. A frame is drawn as the Cholesky factor of
+the sums times normals. A quadratic function of all normals is added to each, which reproduces the third cumulants, and
+if needed a cubic function (Cornish & Fisher 1938, doi 10.2307/1400905, in several dimensions).
 """
 
 from __future__ import annotations
@@ -29,29 +29,29 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-#: What is left out of a sum's distribution would show in Pearson's test, at five sigma, after so many frames by the
-#: estimate here: sixteen thousand star-years of 5 s.
+#: Number of frames after which Pearson's test would notice the neglected cumulants at five sigma: sixteen thousand
+#: star-years of 5 s.
 FRAMES_TO_NOTICE = 1e11
-#: Classes of that test: standard deviations that hold all but 1e-14.
+#: Number of classes of that test: range in standard deviations that contains all but 1e-14.
 CLASSES = 15.3
-#: A pixel's mean stays so many standard deviations away from zero and saturation.
+#: Smallest distance of a pixel's mean from zero and saturation, in standard deviations.
 RAIL_SIGMA = 8.0
-#: DN^2 that a frame of a pixel must scatter: with less its rounding is no noise of variance 1/12.
+#: Smallest variance of a pixel, DN^2; below it, rounding is not like noise of variance 1/12.
 LEAST_VARIANCE = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class SumTable:
-    """Cumulants of sums that are independent and of variance one at coefficients of one.
+    """Cumulants of whitened sums, which are independent and have unit variance at coefficients of one.
 
     Attributes
     ----------
     rows : ndarray of float32, shape (4 + n_flare, n)
-        Of everything at coefficients of one, then of star, sky, dark and flares by themselves: means (those of the
-        first are 0), then what differs of the second, third and, where needed, fourth cumulants, in the order of
-        `scene.unique`; fourth ones times how often they occur.
+        Total at coefficients of one, then star, sky, dark and each flare: means (0 for the total), then the unique
+        second, third and, if needed, fourth cumulants, in the order of `scene.unique`; fourth cumulants are multiplied
+        by their multiplicity.
     whole : ndarray of float32, shape (n_statistic * (n_statistic + 1) / 2,)
-        The lower triangle that turns them into the statistics.
+        Lower triangular matrix that converts whitened sums to the statistics.
     fourths : bool
         Whether fourth cumulants are needed.
     """
@@ -62,12 +62,12 @@ class SumTable:
 
     @classmethod
     def of(cls, components: Components) -> Self:
-        """The table of some weights.
+        """Compute the table.
 
         Raises
         ------
         InputError
-            For weights that depend on each other, or so few counts that their distribution could be noticed.
+            If weights are linearly dependent, or counts are too few for the expansion.
         """
         n = components.n_statistics
         constant, each = components.sum_cumulants(2)
@@ -97,17 +97,12 @@ class SumTable:
 
     @property
     def packed(self) -> Floats:
-        """What the kernel reads."""
+        """Array for the kernel."""
         return np.concatenate([self.rows.ravel(), self.whole])
 
 
 def check_sums(scene: StareScene, flares: Flares) -> None:
-    """Refuse what cumulants do not describe: rails, noiseless pixels, rare large hits.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise InputError if cumulants do not describe frames: clipping, pixels without noise, or rare large hits."""
     for name in scene.scene.additive:
         raise InputError(
             f"{ADDITIVE[name].label} with method 'cumulants'", "method 'pixels'", key="method", value="cumulants"
@@ -138,7 +133,7 @@ def check_sums(scene: StareScene, flares: Flares) -> None:
 
 
 def method_for(components: Components, stare: Stare, processes: Processes = NONE) -> Method:
-    """How frames without flares are drawn: by cumulants where these describe them, pixel by pixel elsewhere."""
+    """Return the method for frames without flares: cumulants if these describe them, otherwise pixels."""
     scene = StareScene.of(components, stare, processes)
     try:
         check_sums(scene, Flares.of(components, stare, None, None, 1))
@@ -149,7 +144,7 @@ def method_for(components: Components, stare: Stare, processes: Processes = NONE
 
 
 def _over_sd(components: Components) -> list[Float]:
-    """Third to seventh cumulants of each sum over powers of its standard deviation, shape (n_statistic,) each."""
+    """Return the standardised third to seventh cumulants of each sum, shape (n_statistic,) each."""
     x, w = components.quiet, components.weights
     photons, dark = components.mean_dn[:2].sum(axis=0), components.mean_dn[2]
     sd = np.sqrt(np.sum(w**2 * (x.unsaturated_variance_dn2), axis=1))
@@ -163,12 +158,9 @@ def _over_sd(components: Components) -> list[Float]:
 
 
 def _fourths_are_needed(components: Components) -> bool:
-    """Whether leaving out what follows the third cumulants could be noticed.
+    """Return whether neglecting cumulants beyond the third could be noticed.
 
-    Raises
-    ------
-    InputError
-        If leaving out what follows the fourth could.
+    Raises InputError if neglecting those beyond the fourth could be noticed.
     """
     shapes = _over_sd(components)
     least = 5.0 * np.sqrt(2.0 * CLASSES) / FRAMES_TO_NOTICE

@@ -1,4 +1,4 @@
-"""One stare as an observer sees it: light curves in bands of wavelength, and a spectrum for every frame."""
+"""Observables of a stare: light curves in wavelength bands, and a spectrum of every frame."""
 
 from __future__ import annotations
 
@@ -18,42 +18,31 @@ if TYPE_CHECKING:
     from mauvecl.lightcurve.stares.stare import Stare
 
 Float = NDArray[np.float64]
-#: Draws the sums of a stare's frames: components to an array of shape (n_frame, n_statistic).
+#: Draws the sums of a stare's frames, shape (n_frame, n_statistic), for some components.
 Draw = Callable[[Components], NDArray[Any]]
 
-#: Frames at a time where each pixel of each is looked at.
+#: Number of frames per block of computations by pixel.
 BLOCK = 4096
-#: Bit of a frame's quality whose mean reaches saturation in some pixel.
+#: Quality of a frame in which the mean of a pixel reaches saturation.
 SATURATED = 1
 
 
 @dataclass(frozen=True, eq=False)
 class StareExpectation:
-    """A star, its flares and a stare, before anything is drawn.
+    """Expectation of a stare at a star with flares."""
 
-    Attributes
-    ----------
-    quiet : Expectation
-        One frame without a flare.
-    stare : Stare
-    flare_electrons : ndarray, shape (n_flare, n_pixel)
-        Electrons per frame of flares of one amplitude, each of another temperature.
-    flare : ndarray, shape (n_frame, n_flare)
-        Their mean amplitudes in each frame.
-    """
-
-    quiet: Expectation
+    quiet: Expectation  # one frame without a flare
     stare: Stare
-    flare_electrons: Float
-    flare: Float
+    flare_electrons: Float  # electrons per frame at unit amplitude, one row per temperature, shape (n_flare, n_pixel)
+    flare: Float  # mean amplitudes in each frame, shape (n_frame, n_flare)
 
     def components(self, weights: Float) -> Components:
-        """What its frames are made of, for some sums over pixels."""
+        """Return the components of its frames, for weighted sums over pixels."""
         return Components(self.quiet, self.flare_electrons, weights)
 
     @cached_property
     def coefficients(self) -> Float:
-        """Strengths of star, sky, dark and flares in each frame, as far as known, shape (n_frame, 3 + n_flare)."""
+        """Known coefficients of star, sky, dark and flares in each frame, shape (n_frame, 3 + n_flare)."""
         return self._bare.coefficients(self.stare, self.flare)
 
     @cached_property
@@ -71,7 +60,7 @@ class StareExpectation:
         rise = self._bare.mean_dn[:, self.used]
         room = self.quiet.ceiling_dn - self.quiet.bias_dn[self.used]
         quality = np.zeros(self.stare.n_frames, np.int32)
-        # Most stars are far from it: each component's brightest pixel together is more than any pixel has.
+        # A fast upper bound excludes most frames: the sum of the maxima of all components.
         near = np.flatnonzero(self.coefficients @ rise.max(axis=1) >= room.min())
         for begin in range(0, near.size, BLOCK):
             rows = near[begin : begin + BLOCK]
@@ -79,35 +68,29 @@ class StareExpectation:
         return quality
 
     def snr(self, flare: Float) -> float:
-        """S/N of a flare for one who knows all but whether it is there: frames and pixels weighted by its own shape.
-
-        Parameters
-        ----------
-        flare : ndarray, shape (n_frame, n_flare)
-            Its mean amplitude in each spectrum and frame.
-        """
+        """Return the matched-filter S/N of a flare with mean amplitudes of shape (n_frame, n_flare)."""
         constant, each = self._bare.pixel_cumulants(2)
         variance = (constant + each[:3].sum(axis=0))[self.used]
         spectra = self._bare.mean_dn[3:, self.used]
         return float(np.sqrt(np.einsum("tk,kl,tl->", flare, spectra / variance @ spectra.T, flare, optimize=True)))
 
     def net(self, weights: Float, draw: Draw, kind: type[np.floating[Any]] = np.float64) -> tuple[Any, Any, Any]:
-        """Net light in weighted sums of pixels, DN per second: drawn, its standard deviation, and its mean.
+        """Draw the net light in weighted sums of pixels, and return it with its standard deviation and mean, DN/s.
 
-        Raw counts less bias and the dark at the temperature that is known, and so with the sky.
+        Net light is the raw count minus bias and dark current at the known temperature; it includes the sky.
 
         Parameters
         ----------
         weights : ndarray, shape (n_sum, n_pixel)
-            Zero where `used` is not.
+            Zero in pixels that are not used.
         draw : callable
         kind : type
-            Of what is kept: a few sums at a time are drawn in double precision.
+            Type of the arrays.
 
         Returns
         -------
         net, sd, mean : ndarray of `kind`, shape (n_frame, n_sum)
-            The standard deviation of photons, dark and reading alone: an observer does not know what jitters.
+            The standard deviation is that of photons, dark current and read noise, without jitter.
         """
         frame_s, coefficients = self.stare.frame_s, self.coefficients
         net, sd, mean = (np.empty((self.stare.n_frames, len(weights)), kind) for _ in range(3))
@@ -116,7 +99,7 @@ class StareExpectation:
             rows = weights[there]
             first = self._bare.mean_dn @ rows.T
             drawn = np.asarray(draw(self.components(rows)), np.float64)
-            # The sums are of raw counts less the quiescent star's at the expectation's own temperature.
+            # The sums are relative to the quiescent star at the temperature of its expectation.
             net[:, there] = (drawn + first[0] + first[1] + (1.0 - coefficients[:, 2:3]) * first[2]) / frame_s
             sd[:, there], mean[:, there] = self.expected(rows)
         return net, sd, mean
@@ -136,7 +119,7 @@ class StareExpectation:
         return np.asarray(self.coefficients @ self._bare.mean_dn + self.quiet.bias_dn)
 
     def expected(self, weights: Float) -> tuple[Float, Float]:
-        """Standard deviation and mean of the net light in weighted sums of pixels, DN per second, (n_frame, n_sum)."""
+        """Return standard deviation and mean of the net light in sums of pixels, DN/s, shape (n_frame, n_sum)."""
         frame_s, coefficients = self.stare.frame_s, self.coefficients
         constant, each = self._bare.pixel_cumulants(2)
         squares, light = weights.T**2, np.delete(self._bare.mean_dn, 2, axis=0) @ weights.T
@@ -145,15 +128,15 @@ class StareExpectation:
 
 
 @dataclass(frozen=True, eq=False)
-class Light:
-    """What is seen of one stare, DN per second without bias and dark; arrays of shape (n_frame, ...).
+class LightCurves:
+    """Light curves and spectra of a stare, DN/s without bias and dark current.
 
     Attributes
     ----------
     bands : tuple of str
-        The whole range first.
+        The first is the whole range.
     flux, sd, mean : ndarray, shape (n_frame, n_band)
-        Drawn; standard deviation of its own noise; without any.
+        Drawn light, standard deviation of its noise, and light without noise.
     spectrum, spectrum_sd, spectrum_mean : ndarray of float32, shape (n_frame, n_element)
         The same in resolution elements.
     element_nm : ndarray, shape (n_element,)
@@ -169,21 +152,21 @@ class Light:
     element_nm: Float
 
 
-def seen(staring: StareExpectation, bands_nm: Sequence[tuple[float, float]], draw: Draw) -> Light:
-    """One stare in bands and resolution elements, all from the same draws of pixels.
+def draw_light_curves(staring: StareExpectation, bands_nm: Sequence[tuple[float, float]], draw: Draw) -> LightCurves:
+    """Draw a stare in bands and resolution elements, all from the same pixels.
 
     Parameters
     ----------
     staring : StareExpectation
     bands_nm : sequence of (float, float)
-        From the first wavelength to before the last, nm; pixels that saturate count nowhere.
+        Wavelengths, nm; the upper limit is excluded, and saturated pixels are not used.
     draw : callable
-        Draws the same pixels whatever the sums.
+        Draws the same pixels for all sums.
 
     Raises
     ------
     InputError
-        For a band without a pixel.
+        If a band contains no pixel.
     """
     quiet, used = staring.quiet, staring.used.astype(np.float64)
     rows = []
@@ -195,12 +178,12 @@ def seen(staring: StareExpectation, bands_nm: Sequence[tuple[float, float]], dra
     elements = used * (quiet.element == np.arange(quiet.element_wavelength_nm.size)[:, None])
     filled = np.flatnonzero(elements.any(axis=1))
     spectrum, spectrum_sd, spectrum_mean = staring.net(elements[filled], draw, np.float32)
-    # Elements hold every pixel once, so that their sum is all there is.
+    # Each pixel belongs to one element, so their sum is the whole range.
     whole = spectrum.sum(axis=1, dtype=np.float64), *staring.expected(used[None])
     parts = staring.net(np.array(rows).reshape(len(rows), used.size), draw) if rows else np.zeros((3, len(whole[0]), 0))
     flux, sd, mean = (np.column_stack(both) for both in zip(whole, parts, strict=True))
     low, high = quiet.wavelength_nm[[0, -1]]
-    return Light(
+    return LightCurves(
         (f"{low:.0f}-{high:.0f} nm", *(f"{a:g}-{b:g} nm" for a, b in bands_nm)),
         flux,
         sd,

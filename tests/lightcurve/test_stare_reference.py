@@ -13,7 +13,7 @@ from scenes import instrument, star
 
 from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
-from mauvecl.lightcurve.stares import twin
+from mauvecl.lightcurve.stares import reference
 from mauvecl.lightcurve.stares.components import Components
 from mauvecl.lightcurve.stares.requests import StaresRequest
 from mauvecl.lightcurve.stares.scene import Flares, StareScene
@@ -80,7 +80,7 @@ def test_stares_are_the_twins(stares: Stares, name: str, method: Any) -> None:
     flares = Flares.of(components, stare, flare, amplitudes, COUNT)
     numbers = np.arange(FIRST, FIRST + COUNT, dtype=np.uint64)
     frames = range(0, stare.n_frames, 1 if method == "cumulants" else 6)
-    ours = {"pixels": twin.pixels, "cumulants": twin.sums}[method](scene, flares, numbers, frames, SEED)
+    ours = {"pixels": reference.pixels, "cumulants": reference.sums}[method](scene, flares, numbers, frames, SEED)
     np.testing.assert_array_equal(found[..., list(frames), :], ours if amplitudes is not None else ours[0])
     assert found.std() > 0
     assert SumTable.of(components).fourths == ("fourth" in name)
@@ -135,7 +135,9 @@ def test_what_flares_need_is_the_twins(stares: Stares, name: str, method: Any) -
     )  # fmt: skip
     found = stares.reduced(asked)
     numbers, frames = np.arange(FIRST, FIRST + COUNT, dtype=np.uint64), range(stare.n_frames)
-    np.testing.assert_array_equal(found["glow"], twin.glow(StareScene.of(components, stare), numbers, frames, SEED))
+    np.testing.assert_array_equal(
+        found["glow"], reference.glow(StareScene.of(components, stare), numbers, frames, SEED)
+    )
     whole = stares.frames(components, stare, first=FIRST, count=COUNT, seed=SEED, method=method)
     np.testing.assert_array_equal(found["values"], whole)
     part = stares.reduced(asked, Shard(0, FIRST + 5, 21))

@@ -1,4 +1,4 @@
-"""The slow NumPy twin of the kernels of stares: the same counters, the same arithmetic, the same order of sums."""
+"""NumPy reference implementation of the stare kernels, with the same counters, arithmetic and order of summation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Numbers = NDArray[np.uint64]
 
 
 def exponential_less_one(x: Floats) -> Floats:
-    """exp(x) - 1, for |x| < 80."""
+    """Return exp(x) - 1 for |x| < 80."""
     whole = x * np.float32(layout.LOG2_E) + MAGIC
     n = whole - MAGIC
     r = fma(n, np.float32(-layout.LN2_PARTS[1]), fma(n, np.float32(-layout.LN2_PARTS[0]), x))
@@ -32,7 +32,7 @@ def exponential_less_one(x: Floats) -> Floats:
 
 
 def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int) -> dict[str, Floats]:
-    """What is drawn of one frame of some stares: coefficients of star, sky, dark and the factor on all light, less one.
+    """Draw the coefficients of star, sky and dark and the factor on all light, minus one, of a frame of some stares.
 
     Returns
     -------
@@ -58,7 +58,7 @@ def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int) -> dic
 
 
 def glow(scene: StareScene, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
-    """Beside the statistics of frames: a normal for each, for a flare's own photons; the factor on all light less one.
+    """Draw a normal per statistic, for the photon noise of flares, and the factor on all light minus one.
 
     Returns
     -------
@@ -74,13 +74,13 @@ def glow(scene: StareScene, numbers: Numbers, frames: Iterable[int], seed: int) 
 
 
 def _coefficients(scene: StareScene, flares: Flares, frame: int, scenario: int, light: Floats) -> list[Floats]:
-    """Of the flare spectra, shape (n_stare,) each."""
+    """Return the coefficients of the flare spectra, shape (n_stare,) each."""
     given = flares.rows[:, :, frame] * (scene.known[6, frame] * flares.amplitudes[scenario][:, None])
     return [fma(light, f, f) for f in np.broadcast_to(given, (len(light), given.shape[1])).T]
 
 
 def pixels(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
-    """Statistics by method "pixels".
+    """Draw statistics by the method "pixels".
 
     Returns
     -------
@@ -107,7 +107,7 @@ def pixels(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable
 
 
 def _count(scene: StareScene, p: int, z: Floats, met: dict[str, Floats], flare: list[Floats]) -> Floats:
-    """The count of a pixel above its base before the ADC."""
+    """Return the count of a pixel above its base, before the ADC."""
     m, one = scene.mixtures[p], np.float32(1.0)
     light, dark = fma(met["star"], m["star"], met["sky"] * m["sky"]), met["dark"]
     for coefficient, spectrum in zip(flare, scene.spectra, strict=True):
@@ -135,7 +135,7 @@ def _quartic(zz: Floats, second: float, first: float, constant: float) -> Floats
 
 
 def sums(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
-    """Statistics by method "cumulants".
+    """Draw statistics by the method "cumulants".
 
     Returns
     -------
@@ -157,7 +157,7 @@ def sums(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[i
 
 
 def _chain(terms: Iterable[tuple[Floats, Floats]]) -> Floats:
-    """Products added up, the first one first."""
+    """Return the sum of products, added in order."""
     (a, b), *rest = terms
     total = np.asarray(a * b)
     for a, b in rest:
