@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from mauvecl.lightcurve.flares.energies import EnergyScale
     from mauvecl.lightcurve.flares.events import Cooling, Event
     from mauvecl.lightcurve.flares.shapes import SHAPES, TableShape
+    from mauvecl.lightcurve.stares.cooling_fit import fit_cooling
     from mauvecl.lightcurve.stares.curves import Sinusoid
     from mauvecl.lightcurve.stares.measured import measure_along
     from mauvecl.lightcurve.stares.stare import Stare
@@ -107,6 +108,7 @@ __all__ = [
     "exposure",
     "exposure_for",
     "fit",
+    "fit_cooling",
     "forecast",
     "gaussian",
     "gaussian_report",
@@ -168,6 +170,7 @@ _HOMES = HOMES | {
     "departures": "results.detection.departures",
     "expect": "host.expectation",
     "exposure_for": "answers.signal.exposures",
+    "fit_cooling": "lightcurve.stares.cooling_fit",
     "measure_along": "lightcurve.stares.measured",
     "shortest_exposure": "answers.limits.limits",
     "smallest_amplitude": "answers.limits.limits",

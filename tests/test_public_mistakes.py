@@ -115,6 +115,7 @@ def fitting() -> dict[str, Any]:
         "Instrument.build.values": {}, "model": mauvecl.FlareModel.of(star(), part(), quiet), "kelvin": 9000.0,
         "amplitudes": (0.1,), "continuum": mauvecl.BalmerFlare(9000.0), "frames": flare.recorded_dn[None],
         "measure_along.frames": np.tile(flare.recorded_dn, (3, 1)),
+        "fit_cooling.frames": np.tile(flare.recorded_dn, (3, 1)), "fit_cooling.peak_s": 5.0,
     }  # fmt: skip
 
 

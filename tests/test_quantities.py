@@ -68,6 +68,7 @@ REASONS = {
     "bulk.draw.start": "hands on to Engine.realise, once whole",
     "bulk.draw.count": "hands on to Engine.realise, once whole",
     "measure_along.frames": "raw counts, as fit takes them",
+    "fit_cooling.frames": "raw counts, as fit takes them",
     "FlareModel.of.bands_nm": "pairs of plain numbers, as a study has them",
     "fit.skipped_nm": "pairs of plain numbers, as FlareModel.of takes them",
     "ObservedFlare.wavelength_nm": "as ObservedFlare.from_arrays",

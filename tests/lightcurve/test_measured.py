@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from mauvecl import (
     Event,
     Expectation,
     FlareModel,
+    InputError,
     Instrument,
     Nuisances,
     Sinusoid,
@@ -23,6 +25,7 @@ from mauvecl import (
     Stare,
     expect,
     fit,
+    fit_cooling,
     measure_along,
 )  # fmt: skip
 
@@ -145,6 +148,79 @@ def test_known_conditions_gaps_and_units() -> None:
     # Without the conditions the flare is another.
     wrong = measure_along(frames, quiet(), model())
     assert np.abs(wrong.found.estimates[:, 0] / 9000.0 - 1).max() > 0.02
+
+
+FALLING, TRUTH = Cooling(14_000.0, 7000.0, 80.0), np.array([52.0, 40.0, 1.5, 14_000.0, 7000.0, 80.0])
+START: dict[str, Any] = {"peak_s": 50.0, "half_width_s": 30.0}
+
+
+def test_a_joint_fit_finds_shape_and_cooling_without_noise() -> None:
+    """Known changes of throughput and detector temperature, a gap; constant temperatures where none falls."""
+    how = {"thermal": 3.0, "throughput": Sinusoid(0.2, 300.0), "orbit_s": 400.0}
+    stare = Stare.of(300.0, gaps=[(90.0, 115.0)], **how)  # type: ignore[arg-type]
+    lit, _ = lit_frames(FALLING, stare)
+    frames = np.array([one.recorded_dn for one in lit])
+    found = fit_cooling(frames, quiet(), model(), stare=stare, levels=(), **START)
+    np.testing.assert_allclose(found.estimates[0, :6], TRUTH, rtol=1e-3)
+    assert found.chi2[0] < 0.01
+    assert found.dof < stare.n_frames * 12
+    # The same light without what is known of the conditions is another flare.
+    assert fit_cooling(frames, quiet(), model(), levels=(), **START).p_value[0] < 1e-6
+    steady, _ = lit_frames(STEADY, Stare.of(300.0))
+    frames = np.array([one.recorded_dn for one in steady])
+    found = fit_cooling(frames, quiet(), model(), cooling=False, levels=(), **START)
+    np.testing.assert_allclose(found.estimates[0, :4], [52.0, 40.0, 1.5, 9000.0], rtol=1e-3)
+    # The energy is that of all bins together.
+    along = measure_along(frames, quiet(), model(), snr_per_bin=8.0)
+    energy = along.found.estimates[:, along.found.column("energy bolometric")].sum()
+    whole = found.estimates[0, found.column("energy bolometric")]
+    assert 0.9 * whole < energy < whole * (1 + 1e-6)
+    fluence = found.estimates[0, found.column("fluence bolometric")]
+    assert whole == pytest.approx(fluence * 4 * np.pi * (5.0 * 3.0856775814913674e18) ** 2, rel=1e-9)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("unknown", [None, {"dark": np.inf, "light": 0.02}], ids=["known", "unknown"])
+def test_joint_fits_have_honest_errors(unknown: dict[str, float] | None, engine: Engine) -> None:
+    """Drawn pixels of 20 stares: squared distances from the truth by the covariances are chi-squared of 120.
+
+    False failures: 1e-6 on each side, and as much for chi-squared of the fits.
+    """
+    nuisances = None if unknown is None else Nuisances.of(quiet(), unknown)
+    lit, _ = lit_frames(FALLING, Stare.of(300.0))
+    raw = np.stack([engine.realise(one, count=SEEDS, seed=600 + k) for k, one in enumerate(lit)], axis=1)
+    distance, chi2, dof = 0.0, 0.0, 0
+    for frames in raw:
+        found = fit_cooling(frames, quiet(), model(), nuisances, levels=(), **START)
+        away = found.estimates[0, :6] - TRUTH
+        distance += float(away @ np.linalg.solve(found.covariance[0, :6, :6], away))
+        chi2, dof = chi2 + float(found.chi2[0]), dof + found.dof
+    assert scipy.stats.chi2.ppf(1e-6, 6 * SEEDS) < distance < scipy.stats.chi2.isf(1e-6, 6 * SEEDS)
+    assert scipy.stats.chi2.ppf(1e-6, dof) < chi2 < scipy.stats.chi2.isf(1e-6, dof)
+
+
+@pytest.mark.long
+def test_intervals_of_a_joint_fit_are_near_its_errors() -> None:
+    """Without noise and for a bright flare the likelihood is nearly normal, so that profile and curvature agree."""
+    lit, _ = lit_frames(FALLING, Stare.of(300.0))
+    found = fit_cooling(np.array([one.recorded_dn for one in lit]), quiet(), model(), levels=(0.6827,), **START)
+    low, high = ((ends[0, 0] - found.estimates[0]) / found.errors[0] for ends in (found.low, found.high))
+    np.testing.assert_allclose(-low, 1.0, atol=0.15)
+    np.testing.assert_allclose(high, 1.0, atol=0.15)
+
+
+def test_joint_fits_refuse_what_they_cannot_fit() -> None:
+    frames = np.tile(quiet().recorded_dn, (60, 1))
+    with_jump = FlareModel.of(star(), MAUVE, quiet(), jump=True)
+    for used, how, key in (
+        (with_jump, START, "model"),
+        (model(), START | {"peak_s": 5000.0}, "peak_s"),
+        (model(), START | {"half_width_s": 0.0}, "half_width_s"),
+        (model(), START | {"levels": (2.0,)}, "levels"),
+    ):
+        with pytest.raises(InputError) as error:
+            fit_cooling(frames, quiet(), used, **how)
+        assert error.value.key == key
 
 
 def test_stares_without_a_flare_have_no_bins(engine: Engine) -> None:

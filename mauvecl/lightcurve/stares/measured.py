@@ -144,6 +144,18 @@ def measure_along(
     InputError
         For frames of another shape, an expectation of several frames, or a stare in which no bin reaches the S/N.
     """
+    raw, stare = checked_frames(frames, quiet, stare)
+    if not 0.0 < snr_per_bin < np.inf:
+        raise InputError.of("snr_per_bin", snr_per_bin, "a number above 0")
+    bins = _bins(raw, quiet, model, nuisances, known_strengths(stare, quiet), stare, snr_per_bin)
+    if not bins:
+        raise InputError.of("snr_per_bin", snr_per_bin, "one that some bin of the stare reaches")
+    first, end = np.array(bins).T
+    return fit_bins(raw, quiet, model, nuisances, stare, first, end - first, levels)
+
+
+def checked_frames(frames: ArrayLike, quiet: Expectation, stare: Stare | None) -> tuple[Float, Stare]:
+    """Return raw frames of a stare and the stare; raises InputError unless they and the expectation agree."""
     raw = np.asarray(frames, np.float64)
     if raw.ndim != 2:
         raise InputError(
@@ -166,13 +178,7 @@ def measure_along(
             key="n_frames",
             value=quiet.n_frames,
         )
-    if not 0.0 < snr_per_bin < np.inf:
-        raise InputError.of("snr_per_bin", snr_per_bin, "a number above 0")
-    bins = _bins(raw, quiet, model, nuisances, _known(stare, quiet), stare, snr_per_bin)
-    if not bins:
-        raise InputError.of("snr_per_bin", snr_per_bin, "one that some bin of the stare reaches")
-    first, end = np.array(bins).T
-    return fit_bins(raw, quiet, model, nuisances, stare, first, end - first, levels)
+    return raw, stare
 
 
 def fit_bins(
@@ -186,7 +192,7 @@ def fit_bins(
     levels: Sequence[float] = LEVELS,
 ) -> MeasuredBins:
     """Fit bins of frames; parameters as for `measure_along`, with the first frames of bins and their numbers."""
-    known, end = _known(stare, quiet), first + count
+    known, end = known_strengths(stare, quiet), first + count
     alike: dict[tuple[float, ...], list[int]] = {}
     for k, (a, b) in enumerate(zip(first, end, strict=True)):
         mean = known[a:b].mean(axis=0).round(DIGITS)
@@ -206,7 +212,7 @@ def fit_bins(
     return MeasuredBins(first, count, stare.start_s[first], stare.start_s[end - 1] + stare.frame_s, found)
 
 
-def _known(stare: Stare, quiet: Expectation) -> Float:
+def known_strengths(stare: Stare, quiet: Expectation) -> Float:
     """Return known strengths of star, sky, dark and flare in each frame, shape (n_frame, 4)."""
     return np.column_stack([stare.light * stare.star, stare.light * stare.sky, stare.dark_factor(quiet), stare.light])
 
