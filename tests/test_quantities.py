@@ -114,6 +114,15 @@ def model(**how: Any) -> Any:
     return mauvecl.FlareModel.of(star(), payload(), pair()[0], **how)
 
 
+def fitted(**changed: Any) -> Any:
+    """Return a joint fit to the means of twenty frames with a flare in the middle."""
+    quiet, lit = pair()
+    rise = mauvecl.Event(40.0, 30.0, 2.0).form.mean_over(np.arange(21) * 5.0, 40.0, 30.0)
+    frames = quiet.recorded_dn + rise[:, None] * (lit.recorded_dn - quiet.recorded_dn)
+    how = {"peak_s": 38.0, "half_width_s": 30.0} | changed
+    return mauvecl.fit_cooling(frames, quiet, model(), cooling=False, levels=(), **how).estimates
+
+
 @cache
 def engine() -> Any:
     return mauvecl.Engine()
@@ -242,6 +251,8 @@ CASES: dict[str, Case] = {
     "Cooling.end_k": Case(lambda v: mauvecl.Cooling(20_000.0, v, 300.0).end_k, "K", 4000, 15_000),
     "Cooling.fold_s": Case(lambda v: mauvecl.Cooling(20_000.0, 5000.0, v).fold_s, "s", 10, 5000),
     "Cooling.at.since_peak_s": Case(lambda v: mauvecl.Cooling(20_000.0, 5000.0, 300.0).at(v), "s", 0, 5000),
+    "fit_cooling.peak_s": Case(lambda v: fitted(peak_s=v), "s", 20, 60),
+    "fit_cooling.half_width_s": Case(lambda v: fitted(half_width_s=v), "s", 20, 60),
     "Event.peak_s": Case(lambda v: mauvecl.Event(v, 60.0, 0.1).peak_s, "s", 0, 5000),
     "Event.half_width_s": Case(lambda v: mauvecl.Event(0.0, v, 0.1).half_width_s, "s", 10, 5000),
     "Event.temperature": Case(lambda v: mauvecl.Event(0.0, 60.0, 0.1, v).temperature, "K", 3000, 30_000),
