@@ -86,6 +86,10 @@ class Normal:
                 value=(self.low, self.high),
             )
 
+    def is_wide(self, least_sd: float) -> bool:
+        """Return whether both cuts are at least this many standard deviations from the mean."""
+        return min(self.mean - self.low, self.high - self.mean) >= least_sd * self.sd * (1.0 - 1e-12)
+
     def quantile(self, below: Float, above: Float | None = None) -> Float:
         """Return the quantiles at probabilities `below`.
 

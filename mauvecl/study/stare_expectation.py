@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,15 +13,16 @@ from mauvecl.lightcurve.flares.energies import EnergyScale, Kind, amplitude_of, 
 from mauvecl.lightcurve.flares.events import Cooling, Event, check_seen, coefficients, temperatures_of
 from mauvecl.lightcurve.stares.light_curves import StareExpectation
 from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.noise.unknowns import CHANGING, COURSES, Changing, default_spreads
+from mauvecl.noise.priors import Normal, Prior
+from mauvecl.noise.unknowns import CHANGING, COURSES, PROCESSES, Changing, Course, default_spreads
 from mauvecl.schema.errors import InputError
 from mauvecl.study.stare_section import EventText
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.lightcurve.stares.curves import Curve
-    from mauvecl.noise.processes import Processes
     from mauvecl.study.cases import Case
     from mauvecl.study.stare_section import CurveText
     from mauvecl.study.study import Study
@@ -28,27 +30,62 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 
 
-def refuse_priors(processes: Processes) -> None:
-    """Raise InputError for processes that only apply to single exposures, in questions about stares."""
-    if processes.modulations:
-        name, _ = processes.modulations[0]
-        raise InputError(
-            f"processes.{name} applies to single exposures only",
-            "jitters, offsets, drifts or cycles in [stare]",
-            key=f"processes.{name}",
-        )
+#: Smallest distance of a prior's cuts from its mean, in standard deviations, for a normal distribution to replace it:
+#: 6e-7 of the values lie beyond.
+NEGLIGIBLE_CUT_SD = 5.0
+
+
+@dataclass(frozen=True)
+class StarePrior:
+    """A process of exposures as an unknown of a stare.
+
+    The stare's quiescent level is measured in the stare itself, so the mean of the prior is a known factor or shift.
+    """
+
+    course: Course
+    changes: Changing
+    sd: float  # relative to the mean, or deg C
+    mean: float  # known factor on light or sky, or shift of the temperature in deg C
+
+    @classmethod
+    def of(cls, name: str, prior: Prior, instrument: Instrument) -> Self:
+        """Convert the prior of a process. Raises InputError unless it is normal and cut far from its mean."""
+        if not isinstance(prior, Normal) or not prior.is_wide(NEGLIGIBLE_CUT_SD):
+            raise InputError(
+                f"processes.{name} is drawn from a normal distribution in a stare",
+                f"a normal prior whose cuts are {NEGLIGIBLE_CUT_SD:g} sd or more from its mean, or jitters, offsets, "
+                "drifts or cycles in [stare]",
+                key=f"processes.{name}",
+                value=prior,
+            )
+        process = PROCESSES[name]
+        course: Course = "jitters" if process.when == "frame" else "offsets"
+        if process.of == "dark":
+            return cls(course, "temperature", prior.sd, prior.mean - instrument.temperature_c)
+        at = {"light_loss": instrument.light_loss, "pointing_loss": instrument.pointing_loss}
+        # The factors on light and sky are linear in their values.
+        mean, upper = (1.0 + float(process.change(at, np.array(x))) for x in (prior.mean, prior.mean + prior.sd))
+        return cls(course, process.of, abs(upper - mean) / mean, mean)
+
+    def applied(self, stare: Stare) -> Stare:
+        """Return the stare with the mean of the prior."""
+        if self.changes == "temperature":
+            return replace(stare, temperature_c=stare.temperature_c + self.mean)
+        return replace(stare, **{self.changes: getattr(stare, self.changes) * self.mean})
 
 
 def stare_of(case: Case) -> Stare:
-    """Return the stare of a case.
-
-    Raises InputError if the study has processes that only apply to single exposures.
-    """
+    """Return the stare of a case. Raises InputError if the stare cannot draw one of the study's processes."""
     study, q, instrument = case.study, case.study.stare, case.instrument
-    refuse_priors(study.processes)
-    spreads: dict[str, dict[Changing, float]] = {
-        how: {of: getattr(q, how)[of] for of in CHANGING if of in getattr(q, how)} for how in COURSES
-    }
+    priors = [
+        StarePrior.of(name, getattr(study.processes, name), instrument) for name, _ in study.processes.modulations
+    ]
+    spreads: dict[Course, dict[Changing, float]] = {how: dict(getattr(q, how)) for how in COURSES}
+    for one in priors:
+        # Independent normal amplitudes of one change add up to one.
+        given = spreads[one.course]
+        given[one.changes] = math.hypot(given.get(one.changes, 0.0), one.sd)
+    spreads = {how: {of: given[of] for of in CHANGING if of in given} for how, given in spreads.items()}
     if study.nuisances.usual:
         spreads = {how: documented | spreads[how] for how, documented in default_spreads().items()}
 
@@ -59,15 +96,19 @@ def stare_of(case: Case) -> Stare:
     changes: dict[str, Any] = {name: curve(name) for name in ("variability", "throughput", "sky")} | spreads
     changes["orbit_s"] = q.orbit_s
     if q.along_orbit:
-        return _along_orbit(study, instrument.frame_s, changes)
-    return Stare.of(
-        q.duration_s,
-        frame_s=instrument.frame_s,
-        gaps=q.all_gaps(),
-        temperature_c=instrument.temperature_c,
-        thermal=curve("thermal"),
-        **changes,
-    )
+        stare = _along_orbit(study, instrument.frame_s, changes)
+    else:
+        stare = Stare.of(
+            q.duration_s,
+            frame_s=instrument.frame_s,
+            gaps=q.all_gaps(),
+            temperature_c=instrument.temperature_c,
+            thermal=curve("thermal"),
+            **changes,
+        )
+    for one in priors:
+        stare = one.applied(stare)
+    return stare
 
 
 def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare:

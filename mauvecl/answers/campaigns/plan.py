@@ -31,7 +31,6 @@ from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column, View, number, table_of
 from mauvecl.study.messages import SATURATED, collect_messages
-from mauvecl.study.stare_expectation import refuse_priors
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -313,11 +312,17 @@ def plan(
         raise InputError("the plan has no targets", "some, such as `plan.targets='targets.csv'`", key="plan.targets")
     if study.orbit.targets:
         raise InputError("both orbit.targets and plan.targets are given", "plan.targets alone", key="orbit.targets")
-    refuse_priors(study.processes)
+    completeness = completeness or _completeness(study, engine)
+    closed = completeness is closed_form
+    for name, _ in study.processes.modulations if closed else ():
+        raise InputError(
+            f"processes.{name} with plan.completeness = 'closed form', which takes the stare for known",
+            "'injections'",
+            key=f"processes.{name}",
+        )
     stars = [star_of(text, study.orbit.simbad) for text in study.plan.targets]
     seen = visible(study)
     names, hours = seen.visibility.by_month()
-    completeness = completeness or _completeness(study, engine)
     along = OrbitConditions.along(seen.visibility.track) if study.plan.along_orbit else None
 
     def observations() -> Iterator[tuple[int, TargetObservation]]:
