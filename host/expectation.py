@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import astropy.units as u
 import numpy as np
@@ -16,8 +16,8 @@ from scipy import special
 
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import checked
-from mauvecl.schema.physical import Exposure
+from mauvecl.schema.fields import Unit
+from mauvecl.schema.physical import Duration, Exposure, SkyBrightness
 from mauvecl.schema.tables import Column, table_of
 
 from ..drawable import Drawable
@@ -104,20 +104,20 @@ class Expectation(Drawable, ContentEquality):
         same.
     """
 
-    wavelength_nm: Float
+    wavelength_nm: Annotated[Float, Unit("nm")]
     source_electrons: Float
     sky_electrons: Float
-    dark_dn: Float
+    dark_dn: Annotated[Float, Unit("DN")]
     dark_unit: Literal["DN", "electrons"]
-    bias_dn: Float
-    read_noise_dn: Float
+    bias_dn: Annotated[Float, Unit("DN")]
+    read_noise_dn: Annotated[Float, Unit("DN")]
     gain_dn_per_electron: Float
     n_frames: int
-    frame_s: float
+    frame_s: Duration
     element: NDArray[np.int32]
-    element_wavelength_nm: Float
+    element_wavelength_nm: Annotated[Float, Unit("nm")]
     adc_max_dn: int
-    saturation_dn: float
+    saturation_dn: Annotated[float, Unit("DN")]
     name: str
     instrument: str
     provenance: Mapping[str, str]
@@ -404,8 +404,8 @@ def expect(
     source: Source | str,
     instrument: Instrument | str | Path,
     *,
-    exposure: u.Quantity | float,
-    sky: Sky | u.Quantity | float | None = None,
+    exposure: Exposure,
+    sky: Sky | SkyBrightness | None = None,
     order: Order = "paper",
     signal: Signal = "net",
 ) -> Expectation:
@@ -442,17 +442,15 @@ def expect(
     >>> float(round(quiet.snr().max(), 2)), float(round(quiet.snr_per_element().max(), 1))
     (8.21, 48.5)
     """
-    source, instrument, sky = _source(source), _instrument(instrument), _sky(sky)
-    asked_s = checked(Exposure, "exposure", exposure)
+    from .stars.source import Source
+
+    source = Source.from_library(source) if isinstance(source, str) else source
+    instrument = instrument if isinstance(instrument, Instrument) else Instrument.load(instrument)
+    sky = sky if isinstance(sky, Sky) else Sky.of_brightness(DEFAULT_SKY if sky is None else sky)
     # The margin makes 0.1 + 0.2 s three frames of 0.1 s despite rounding.
-    n_frames = max(1, int(np.ceil(asked_s / instrument.frame_s * (1 - 1e-12))))
+    n_frames = max(1, int(np.ceil(exposure / instrument.frame_s * (1 - 1e-12))))
     if n_frames > MAX_FRAMES:
-        raise InputError(
-            f"exposure = {asked_s:g} s has {n_frames} frames of {instrument.frame_s:g} s",
-            f"at most {MAX_FRAMES}",
-            key="exposure",
-            value=asked_s,
-        )
+        raise InputError.of("exposure", exposure, f"at most {MAX_FRAMES} frames of {instrument.frame_s:g} s", unit="s")
     low, high = instrument.output_min_nm, instrument.output_max_nm
     first, last = source.measured_nm or (float(source.wavelength_nm[0]), float(source.wavelength_nm[-1]))
     check_covers(source.name, (first, last), (low, high), f"{instrument.name}'s output range ")
@@ -509,7 +507,7 @@ def expect(
             "detector temperature": f"{instrument.temperature_c:g} C",
             "order": order,
             "signal": signal,
-            "requested exposure": f"{asked_s:g} s",
+            "requested exposure": f"{exposure:g} s",
             "exposure": f"{n_frames} x {instrument.frame_s:g} s",
         },
     )
@@ -518,9 +516,9 @@ def expect(
     messages += negative_means_message(source, instrument, electrons, drawn, order)
     if signal == "paper" and plain.sky_electrons.any():
         messages.append("S/N counts the zodiacal light as signal, as the MauveSim paper does.")
-    if n_frames * instrument.frame_s > asked_s * (1 + 1e-9):
+    if n_frames * instrument.frame_s > exposure * (1 + 1e-9):
         messages.append(
-            f"The exposure of {asked_s:g} s is rounded up to {plain.exposure_s:g} s, "
+            f"The exposure of {exposure:g} s is rounded up to {plain.exposure_s:g} s, "
             f"{n_frames} frame{'s' if n_frames > 1 else ''} of {instrument.frame_s:g} s."
         )
     if any(note.startswith("dereddened") for note in source.notes) and not any("redden" in h for h in source.history):
@@ -543,30 +541,6 @@ def _continued_to_reach(source: Source, instrument: Instrument) -> Source:
     range_nm = (instrument.output_min_nm, instrument.output_max_nm)
     nm, flux, messages = continued(source.name, nm, source.flux_flam, range_nm, Line.of(instrument))
     return replace(source, wavelength_nm=nm, flux_flam=flux, told=(*source.told, *messages)) if messages else source
-
-
-def _source(given: Any) -> Source:
-    from .stars.source import Source
-
-    if isinstance(given, Source):
-        return given
-    if isinstance(given, str):
-        return Source.from_library(given)
-    raise InputError.of("source", given, "a Source, or a name of the library")
-
-
-def _instrument(given: Any) -> Instrument:
-    if isinstance(given, Instrument):
-        return given
-    if isinstance(given, str | Path):
-        return Instrument.load(given)
-    raise InputError.of("instrument", given, "an Instrument, or its name or file")
-
-
-def _sky(given: Any) -> Sky:
-    if isinstance(given, Sky):
-        return given
-    return Sky.of_brightness(DEFAULT_SKY if given is None else given)
 
 
 def _elements(instrument: Instrument) -> tuple[NDArray[np.int32], Float]:

@@ -13,6 +13,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_
 
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Unit
 from mauvecl.schema.physical import DetectorTemperature
 from mauvecl.schema.quantities import count, is_quantity, number, numbers, unit_of
 from mauvecl.schema.records import Record, input_error
@@ -21,7 +22,6 @@ from .curve import Curve
 from .pixel_map import MAX_PIXELS, PixelMap
 
 if TYPE_CHECKING:
-    import astropy.units as u
     from astropy.table import QTable
 
 #: Energy of a photon times its wavelength, J nm, and the charge of an electron, C (exact SI values).
@@ -55,6 +55,7 @@ Loss = Annotated[float, Field(ge=0, lt=1)]
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=0, le=20)]
+Wavelengths = Annotated[ArrayLike, Unit("nm")]
 
 
 @public
@@ -329,12 +330,12 @@ class Instrument(Record):
         last = min((curve.wavelength_nm[-1] for curve in curves), default=self.output_max_nm)
         return first, last
 
-    def _within(self, wavelength: ArrayLike | u.Quantity) -> Float:
-        """Return wavelengths in nm; raises InputError outside the curves."""
+    def _within(self, wavelength_nm: ArrayLike) -> Float:
+        """Return wavelengths; raises InputError outside the curves."""
         low, high = self.curves_nm
-        return numbers("wavelength", wavelength, "nm", low=low, high=high)
+        return numbers("wavelength_nm", wavelength_nm, "nm", low=low, high=high)
 
-    def efficiency(self, wavelength_nm: ArrayLike | u.Quantity) -> Float:
+    def efficiency(self, wavelength_nm: Wavelengths) -> Float:
         """Return the fraction of the light that reaches the detector, without the quantum efficiency.
 
         This is the paper's efficiency times (1 - pointing_loss).
@@ -366,7 +367,7 @@ class Instrument(Record):
             * self.window_efficiency.at(wavelength_nm)
         )
 
-    def quantum_efficiency(self, wavelength_nm: ArrayLike | u.Quantity) -> Float:
+    def quantum_efficiency(self, wavelength_nm: Wavelengths) -> Float:
         """Return the electrons per photon that reaches the detector.
 
         This is the sensitivity in A/W times the photon's energy divided by the electron's charge. Parameters and errors
@@ -375,7 +376,7 @@ class Instrument(Record):
         nm = self._within(wavelength_nm)
         return np.asarray(self.quantum_efficiency_a_per_w.at(nm) * (HC_J_NM / nm) / ELECTRON_C)
 
-    def throughput(self, wavelength_nm: ArrayLike | u.Quantity) -> Float:
+    def throughput(self, wavelength_nm: Wavelengths) -> Float:
         """Return the end-to-end throughput, electrons per photon, including the quantum efficiency.
 
         Parameters and errors as for `efficiency`.
@@ -390,14 +391,14 @@ class Instrument(Record):
         """
         return self.efficiency(wavelength_nm) * self.quantum_efficiency(wavelength_nm)
 
-    def effective_area_cm2(self, wavelength_nm: ArrayLike | u.Quantity) -> Float:
+    def effective_area_cm2(self, wavelength_nm: Wavelengths) -> Float:
         """Return the effective area, cm^2: collecting area times throughput.
 
         Parameters and errors as for `efficiency`.
         """
         return self.collecting_area_cm2 * self.throughput(wavelength_nm)
 
-    def electrons_per_joule_cm2(self, wavelength_nm: ArrayLike | u.Quantity, *, held: bool = False) -> Float:
+    def electrons_per_joule_cm2(self, wavelength_nm: Wavelengths, *, held: bool = False) -> Float:
         """Return the electrons per fluence at the telescope, e- / (J cm^-2): area * efficiency * QE[A/W] / e.
 
         Parameters and errors as for `efficiency`, and
@@ -407,7 +408,7 @@ class Instrument(Record):
         held : bool
             Whether to extend a curve beyond its ends by its end value (an assumption) instead of raising InputError.
         """
-        nm = numbers("wavelength", wavelength_nm, "nm", low=0.0) if held else self._within(wavelength_nm)
+        nm = numbers("wavelength_nm", wavelength_nm, "nm", low=0.0) if held else self._within(wavelength_nm)
         per_joule = self._optics(nm) * self.quantum_efficiency_a_per_w.at(nm) / ELECTRON_C
         return self.collecting_area_cm2 * per_joule
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import astropy.units as u
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.quantities import count
+from mauvecl.schema.fields import Range, Unit
 
 from ..content import ContentEquality
 from ..files.ecsv import read_numbers
@@ -50,8 +51,8 @@ class PixelMap(ContentEquality):
     response: Float | None = None
     dark: Float | None = None
     gain: Float | None = None
-    bias_dn: Float | None = None
-    read_noise_dn: Float | None = None
+    bias_dn: Annotated[Float, Unit("DN")] | None = None
+    read_noise_dn: Annotated[Float, Unit("DN")] | None = None
     source: str = "A: assumed, no source given"
 
     def __post_init__(self) -> None:
@@ -135,13 +136,13 @@ class PixelMap(ContentEquality):
     @classmethod
     def made_up(
         cls,
-        pixels: int,
+        pixels: Annotated[int, Range(1, MAX_PIXELS)],
         *,
-        seed: int,
-        response_rms: float = 0.03,
-        dark_rms: float = 0.1,
-        hot_share: float = 0.001,
-        hot_dark: float = 10.0,
+        seed: Annotated[int, Range(0)],
+        response_rms: Annotated[float, Range(0)] = 0.03,
+        dark_rms: Annotated[float, Range(0)] = 0.1,
+        hot_share: Annotated[float, Range(0, 1)] = 0.001,
+        hot_dark: Annotated[float, Range(0)] = 10.0,
     ) -> PixelMap:
         """Draw a map with assumed scatter, to test pipelines; it describes no real detector.
 
@@ -153,7 +154,6 @@ class PixelMap(ContentEquality):
         hot_share, hot_dark : float
             Fraction of hot pixels, and the factor on their dark current.
         """
-        pixels, seed = count("pixels", pixels, low=1, high=MAX_PIXELS), count("seed", seed)
         generator = np.random.default_rng(seed)
         response = np.exp(generator.normal(0.0, response_rms, pixels) - response_rms**2 / 2)
         dark = np.exp(generator.normal(0.0, dark_rms, pixels) - dark_rms**2 / 2)

@@ -7,15 +7,12 @@ from functools import lru_cache
 from importlib import resources
 from typing import TYPE_CHECKING, Literal
 
-import astropy.units as u
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import checked
-from mauvecl.schema.physical import SkyBrightness
-from mauvecl.schema.quantities import number
+from mauvecl.schema.physical import SkyBrightness, SolidAngle
 
 from .helioecliptic import HelioEcliptic, helioecliptic
 
@@ -47,7 +44,7 @@ class Sky:
     22.96
     """
 
-    surface_brightness: float | None
+    surface_brightness: SkyBrightness | None
     description: str
 
     @classmethod
@@ -56,7 +53,7 @@ class Sky:
         return cls(None, "no sky")
 
     @classmethod
-    def of_brightness(cls, brightness: u.Quantity | float) -> Sky:
+    def of_brightness(cls, brightness: SkyBrightness) -> Sky:
         """Return a sky of fixed surface brightness.
 
         Parameters
@@ -64,8 +61,7 @@ class Sky:
         brightness : Quantity or float
             V mag arcsec^-2, 5 to 35.
         """
-        value = checked(SkyBrightness, "sky brightness", brightness)
-        return cls(value, f"fixed V = {value:.2f} mag/arcsec2")
+        return cls(brightness, f"fixed V = {brightness:.2f} mag/arcsec2")
 
     @classmethod
     def at(cls, target: SkyCoord | str, time: Time | str, lookup: Lookup = "bilinear") -> Sky:
@@ -88,8 +84,6 @@ class Sky:
         InputError
             If the nearest cell is in the solar avoidance zone.
         """
-        if lookup not in ("bilinear", "nearest"):
-            raise InputError.of("lookup", lookup, "'bilinear' or 'nearest'")
         place = helioecliptic(target, time)
         brightness = zodiacal_brightness(place, lookup)
         return cls(
@@ -99,14 +93,13 @@ class Sky:
             f"{place.separation_deg:.1f} deg from the Sun ({lookup})",
         )
 
-    def total_magnitude(self, field_of_view_arcsec2: u.Quantity | float) -> float | None:
+    def total_magnitude(self, field_of_view_arcsec2: SolidAngle) -> float | None:
         """Return the V magnitude of the whole field of view, or None without a sky."""
-        area = number("field of view", field_of_view_arcsec2, "arcsec2", low=1e-6, high=1e12)
         if self.surface_brightness is None:
             return None
-        return float(self.surface_brightness - 2.5 * np.log10(area))
+        return float(self.surface_brightness - 2.5 * np.log10(field_of_view_arcsec2))
 
-    def spectrum(self, field_of_view_arcsec2: u.Quantity | float) -> Source | None:
+    def spectrum(self, field_of_view_arcsec2: SolidAngle) -> Source | None:
         """Return the spectrum of the whole field of view, or None without a sky.
 
         Zodiacal light is scattered sunlight with little reddening, so the spectrum is that of the Sun (CALSPEC) at the

@@ -10,15 +10,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import checked
-from mauvecl.schema.physical import AreaRatio, BalmerJump, Temperature
+from mauvecl.schema.fields import Range, Unit
+from mauvecl.schema.physical import AreaRatio, BalmerJump, LineFraction, Temperature
 from mauvecl.schema.quantities import number
 
 from ..content import ContentEquality
@@ -28,6 +28,8 @@ from ..spectra.range import NEEDED_NM
 from .flare import blackbody
 
 Float = NDArray[np.float64]
+Wavelengths = Annotated[Float, Unit("nm")]
+LineFlux = Annotated[float, Range(0)]
 
 #: h c / k, nm K, and the Stefan-Boltzmann constant, erg s-1 cm-2 K-4 (CODATA 2018).
 HC_OVER_K_NM_K, STEFAN_BOLTZMANN = 1.438776877e7, 5.670374419e-5
@@ -35,7 +37,6 @@ HC_OVER_K_NM_K, STEFAN_BOLTZMANN = 1.438776877e7, 5.670374419e-5
 SUN_CM, PARSEC_CM = 6.957e10, 3.0856775814913674e18
 #: Balmer edge, nm, and electron temperature of the recombination below it, K (assumed: optically thin hydrogen).
 BALMER_EDGE_NM, ELECTRON_TEMPERATURE_K = 364.6, 10_000.0
-#: Largest Balmer jump ratio; observed ones are 1 to 4 (Kowalski 2024).
 #: Wavelengths closer to each other than this are one, nm.
 SAME_NM = 1e-6
 #: Steps across the Balmer edge are this wide, nm.
@@ -71,6 +72,7 @@ CONTINUED_NM, CONTINUED_RATIO = (50.0, 30_000.0), 1.01
 JOIN_NM, GAP_NM = 20.0, 5.0
 
 
+@public
 class FlareSpectrum:
     """The light of a flare against wavelength, up to a factor.
 
@@ -125,12 +127,9 @@ class FlareSpectrum:
 class Blackbody(FlareSpectrum):
     """A flare that shines as one blackbody."""
 
-    temperature_k: float = 10_000.0
+    temperature_k: Temperature = 10_000.0
 
-    def __post_init__(self) -> None:
-        checked(Temperature, "flare temperature", self.temperature_k)
-
-    def flux(self, wavelength_nm: Float) -> Float:
+    def flux(self, wavelength_nm: Wavelengths) -> Float:
         """Return the surface flux pi B, erg s-1 cm-2 A-1."""
         return blackbody(wavelength_nm, self.temperature_k)
 
@@ -155,16 +154,11 @@ class TwoBlackbodies(FlareSpectrum):
         Area at the second temperature over that at the first.
     """
 
-    temperature_k: float = 10_000.0
-    second_temperature_k: float = 30_000.0
-    second_area: float = 0.05
+    temperature_k: Temperature = 10_000.0
+    second_temperature_k: Temperature = 30_000.0
+    second_area: AreaRatio = 0.05
 
-    def __post_init__(self) -> None:
-        checked(Temperature, "flare temperature", self.temperature_k)
-        checked(Temperature, "second flare temperature", self.second_temperature_k)
-        checked(AreaRatio, "area of the second blackbody over that of the first", self.second_area)
-
-    def flux(self, wavelength_nm: Float) -> Float:
+    def flux(self, wavelength_nm: Wavelengths) -> Float:
         """Return the surface flux of the first blackbody and its share of the second, erg s-1 cm-2 A-1."""
         second = blackbody(wavelength_nm, self.second_temperature_k)
         return np.asarray(blackbody(wavelength_nm, self.temperature_k) + self.second_area * second)
@@ -191,16 +185,11 @@ class BalmerFlare(FlareSpectrum):
     electron_temperature_k : float
     """
 
-    temperature_k: float = 10_000.0
-    jump: float = 2.0
-    electron_temperature_k: float = ELECTRON_TEMPERATURE_K
+    temperature_k: Temperature = 10_000.0
+    jump: BalmerJump = 2.0
+    electron_temperature_k: Temperature = ELECTRON_TEMPERATURE_K
 
-    def __post_init__(self) -> None:
-        checked(Temperature, "flare temperature", self.temperature_k)
-        checked(BalmerJump, "Balmer jump ratio", self.jump)
-        checked(Temperature, "electron temperature", self.electron_temperature_k)
-
-    def flux(self, wavelength_nm: Float) -> Float:
+    def flux(self, wavelength_nm: Wavelengths) -> Float:
         """Return the surface flux of blackbody and Balmer continuum, erg s-1 cm-2 A-1."""
         extra = balmer_continuum(wavelength_nm, self.electron_temperature_k)
         return np.asarray(blackbody(wavelength_nm, self.temperature_k) + self.edge_flux * extra)
@@ -294,13 +283,12 @@ class FlareWithLines(FlareSpectrum):
     """
 
     continuum: FlareSpectrum
-    fractions: Mapping[str, float] = field(default_factory=dict)
-    fluxes_cgs: Mapping[str, float] = field(default_factory=dict)
+    fractions: Mapping[str, LineFraction] = field(default_factory=dict)
+    fluxes_cgs: Mapping[str, LineFlux] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name, value in (*self.fractions.items(), *self.fluxes_cgs.items()):
+        for name in (*self.fractions, *self.fluxes_cgs):
             EmissionLine.named(name)
-            number(f"flux of the line {name!r}", value, low=0.0)
         both = set(self.fractions) & set(self.fluxes_cgs)
         if both:
             raise InputError(
@@ -338,12 +326,12 @@ class FlareWithLines(FlareSpectrum):
         at = self.continuum.grid(np.linspace(*LINE_RANGE_NM, RANGE_POINTS))
         return 10.0 * float(np.trapezoid(self.continuum.flux(at), at))
 
-    def flux(self, wavelength_nm: Float) -> Float:
+    def flux(self, wavelength_nm: Wavelengths) -> Float:
         """Return the flux of the continuum and the lines that scale with it, erg s-1 cm-2 A-1."""
         continuum = self.continuum.flux(wavelength_nm)
         return np.asarray(continuum + self.continuum_flux * _sum_of_lines(self.fractions, wavelength_nm))
 
-    def flux_at_telescope(self, wavelength_nm: Float) -> Float:
+    def flux_at_telescope(self, wavelength_nm: Wavelengths) -> Float:
         """Return the flux of the lines that do not scale with the amplitude, erg s-1 cm-2 A-1."""
         return _sum_of_lines(self.fluxes_cgs, wavelength_nm)
 
@@ -380,10 +368,10 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
     messages : tuple of str
     """
 
-    wavelength_nm: Float
+    wavelength_nm: Wavelengths
     flux_flam: Float
     name: str = "flare"
-    measured_nm: tuple[float, float] = (0.0, 0.0)
+    measured_nm: Annotated[tuple[float, float], Unit("nm")] = (0.0, 0.0)
     messages: tuple[str, ...] = ()
     surface: ClassVar[bool] = False
 
@@ -414,11 +402,11 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
     @classmethod
     def from_arrays(
         cls,
-        wavelength_nm: ArrayLike,
+        wavelength_nm: Annotated[ArrayLike, Unit("nm")],
         flux_flam: ArrayLike,
         *,
         name: str = "flare",
-        continue_at_k: float | None = None,
+        continue_at_k: Temperature | None = None,
         messages: tuple[str, ...] = (),
     ) -> Self:
         """Return a flare from wavelengths, nm, and fluxes, erg s-1 cm-2 A-1, of the flare alone.
@@ -455,7 +443,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         *,
         wavelength_unit: str | None = None,
         flux_unit: str | None = None,
-        continue_at_k: float | None = None,
+        continue_at_k: Temperature | None = None,
     ) -> Self:
         """Read the spectrum of a flare, and subtract its star's quiescent spectrum from it.
 
@@ -500,7 +488,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         """Wavelengths of the spectrum's points, nm."""
         return self.wavelength_nm
 
-    def flux(self, wavelength_nm: Float) -> Float:
+    def flux(self, wavelength_nm: Wavelengths) -> Float:
         """Return the flux as it was observed, erg s-1 cm-2 A-1; zero outside of the spectrum."""
         return np.interp(wavelength_nm, self.wavelength_nm, self.flux_flam, 0.0, 0.0)
 
@@ -515,7 +503,6 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
 
 def _continued(name: str, nm: Float, flux: Float, kelvin: float) -> tuple[Float, Float]:
     """Continue a spectrum at both ends by a blackbody that has the mean flux of the last 20 nm there."""
-    checked(Temperature, "temperature that continues a flare spectrum", kelvin)
     low, high = CONTINUED_NM
     steps = np.log(CONTINUED_RATIO)
     for first in (True, False):

@@ -7,16 +7,15 @@ import html
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import checked
-from mauvecl.schema.physical import BinWidth, Magnitude, Reddening
-from mauvecl.schema.quantities import number
+from mauvecl.schema.fields import AnyUnit, Unit
+from mauvecl.schema.physical import Amplitude, BinWidth, Magnitude, Reddening, Temperature
 
 from ...drawable import Drawable
 from ..content import ContentEquality
@@ -89,7 +88,7 @@ class Source(Drawable, ContentEquality):
     ('scaled to V = 7.4', 'flare of 24 % in Kepler at 10000 K, added')
     """
 
-    wavelength_nm: NDArray[np.float64]
+    wavelength_nm: Annotated[NDArray[np.float64], Unit("nm")]
     flux_flam: NDArray[np.float64]
     name: str
     origin: str
@@ -97,9 +96,9 @@ class Source(Drawable, ContentEquality):
     history: tuple[str, ...] = ()
     scale: str = ""
     told: tuple[str, ...] = ()
-    measured_nm: tuple[float, float] | None = None
+    measured_nm: Annotated[tuple[float, float], Unit("nm")] | None = None
     unscaled: str = ""
-    temperature_k: float | None = None
+    temperature_k: Temperature | None = None
 
     def __post_init__(self) -> None:
         for field in ("wavelength_nm", "flux_flam"):
@@ -221,7 +220,7 @@ class Source(Drawable, ContentEquality):
         sunlike = SUN_V[0] < v < SUN_V[1]
         return "" if v > BRIGHTEST_V or sunlike else f"its flux makes V = {v:.1f}, brighter than any star in the sky"
 
-    def binned(self, width_nm: u.Quantity | float) -> Self:
+    def binned(self, width_nm: BinWidth) -> Self:
         """Return the spectrum averaged over bins from its first wavelength on, which reduces noise.
 
         Parameters
@@ -229,19 +228,18 @@ class Source(Drawable, ContentEquality):
         width_nm : Quantity or float
             Width of the bins, nm, 0.01 to 50.
         """
-        width = checked(BinWidth, "bin", width_nm)
         first, last = self.wavelength_nm[0], self.wavelength_nm[-1]
-        edges = np.append(np.arange(first, last - width / 2, width), last)
+        edges = np.append(np.arange(first, last - width_nm / 2, width_nm), last)
         flux = means(self.wavelength_nm, self.flux_flam, edges)
         nm = np.concatenate([[first], (edges[1:] + edges[:-1]) / 2, [last]])
         flux = np.concatenate([flux[:1], flux, flux[-1:]])
-        return replace(self, wavelength_nm=nm, flux_flam=flux, history=(*self.history, f"binned to {width:g} nm"))
+        return replace(self, wavelength_nm=nm, flux_flam=flux, history=(*self.history, f"binned to {width_nm:g} nm"))
 
     @classmethod
     def from_arrays(
         cls,
-        wavelength: ArrayLike | u.Quantity,
-        flux: ArrayLike | u.Quantity,
+        wavelength: Annotated[ArrayLike, AnyUnit()],
+        flux: Annotated[ArrayLike, AnyUnit()],
         *,
         name: str = "star",
         origin: str = "arrays",
@@ -370,7 +368,7 @@ class Source(Drawable, ContentEquality):
         inside = (self.wavelength_nm >= low) & (self.wavelength_nm <= high)
         return bands.magnitude(self.wavelength_nm[inside], self.flux_flam[inside], band, system)
 
-    def at_magnitude(self, magnitude: u.Quantity | float, band: str = "V", system: bands.System = "catalogue") -> Self:
+    def at_magnitude(self, magnitude: Magnitude, band: str = "V", system: bands.System = "catalogue") -> Self:
         """Return the star scaled to a magnitude: F 10**(-0.4 (m - m0)) (the paper's equation 1).
 
         Parameters
@@ -381,20 +379,19 @@ class Source(Drawable, ContentEquality):
         system : {"catalogue", "vega", "ab"}
             See `magnitude`.
         """
-        magnitude = checked(Magnitude, "magnitude", magnitude)
         factor = 10.0 ** (-0.4 * (magnitude - self.magnitude(band, system)))
         scaled = self._with_flux(self.flux_flam * factor, f"scaled to {bands.band(band).name} = {magnitude:g}")
         return replace(scaled, scale=bands.scale(band, system), unscaled="")
 
     def flaring(
         self,
-        amplitude: u.Quantity | float,
-        temperature: u.Quantity | float = 10_000.0,
+        amplitude: Amplitude,
+        temperature: Temperature = 10_000.0,
         *,
         spectrum: FlareSpectrum | None = None,
         band: str = "Kepler",
         geometry: Geometry = "added",
-        photosphere_temperature: u.Quantity | float | None = None,
+        photosphere_temperature: Temperature | None = None,
     ) -> Self:
         """Return the star with a flare; see `flare.with_flare` for the geometries.
 
@@ -412,11 +409,8 @@ class Source(Drawable, ContentEquality):
         photosphere_temperature : Quantity or float in K, optional
             For ``replaces``; the default is the star's `temperature_k`.
         """
-        amplitude, kelvin = number("flare amplitude", amplitude), number("flare temperature", temperature, "K")
-        light = Blackbody(kelvin) if spectrum is None else spectrum
-        photosphere = self.temperature_k
-        if photosphere_temperature is not None:
-            photosphere = number("photosphere temperature", photosphere_temperature, "K")
+        light = Blackbody(temperature) if spectrum is None else spectrum
+        photosphere = self.temperature_k if photosphere_temperature is None else photosphere_temperature
         nm, flux = with_flare(
             self.wavelength_nm,
             self.flux_flam,
@@ -433,7 +427,7 @@ class Source(Drawable, ContentEquality):
             self, wavelength_nm=nm, flux_flam=flux, history=(*self.history, title), told=(*self.told, *light.messages)
         )
 
-    def reddened(self, ebv: u.Quantity | float, *, rv: float = 3.1, law: str = "G23") -> Self:
+    def reddened(self, ebv: Reddening, *, rv: float = 3.1, law: Literal["G23", "F19", "CCM89"] = "G23") -> Self:
         """Return the star reddened by dust (needs the extra ``extinction``).
 
         Parameters
@@ -458,9 +452,6 @@ class Source(Drawable, ContentEquality):
             ) from error
         import astropy.units as u
 
-        ebv, rv = checked(Reddening, "E(B-V)", ebv), number("R_V", rv)
-        if law not in ("G23", "F19", "CCM89"):
-            raise InputError.of("law", law, "'G23', 'F19' or 'CCM89'")
         try:
             model = getattr(parameter_averages, law)(Rv=rv)
         except ValueError as error:

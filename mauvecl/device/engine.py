@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,13 +29,14 @@ from mauvecl.results.requests.requests import (
     RealiseRequest,
     Shard,
     SnrRequest,
-    check_numbers,
-    expectation_of,
+    check_last,
 )
 from mauvecl.results.snr import Counts, SnrResult, elements, observers
 from mauvecl.results.sums import Arrays, DetectionSums, SnrSums, pack_detection, pack_snr
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import OneOrMore
+from mauvecl.schema.physical import FirstRealisation, Realisations, Seed
 from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.names import DEFAULT_STATISTICS
 from mauvecl.statistics.nuisances import Nuisances, as_nuisances
@@ -117,9 +118,9 @@ class Engine:
         self,
         expectation: Expectation,
         *,
-        start: int = 0,
-        count: int,
-        seed: int,
+        start: FirstRealisation = 0,
+        count: Realisations,
+        seed: Seed,
         out: NDArray[Any] | None = None,
         **drawing: Unpack[DrawingOptions],
     ) -> NDArray[Any]:
@@ -148,9 +149,9 @@ class Engine:
         self,
         expectation: Expectation,
         *,
-        start: int = 0,
-        count: int,
-        seed: int,
+        start: FirstRealisation = 0,
+        count: Realisations,
+        seed: Seed,
         out: NDArray[Any] | None = None,
         **drawing: Unpack[DrawingOptions],
     ) -> tuple[NDArray[Any], NDArray[np.uint32]]:
@@ -163,8 +164,9 @@ class Engine:
         clipped : ndarray of uint32, shape (count,)
             Number of samples (pixels times frames) clipped at zero or saturation.
         """
-        start, count, seed = self._checked(start, count, seed)
-        scene = prepare([expectation_of("what is drawn", expectation)], **drawing)
+        self.open_device.check_process()
+        check_last(start, count)
+        scene = prepare([expectation], **drawing)
         narrow = scene.n_frames == 1 and expectation.adc_max_dn < 2**16
         shape, dtype = (count, scene.n_pixel), np.dtype(np.uint16 if narrow else np.int32)
         if scene.n_frames * expectation.adc_max_dn >= 2**31:
@@ -198,9 +200,9 @@ class Engine:
         self,
         expectation: Expectation,
         *,
-        realisations: int,
-        seed: int,
-        start: int = 0,
+        realisations: Realisations,
+        seed: Seed,
+        start: FirstRealisation = 0,
         **drawing: Unpack[DrawingOptions],
     ) -> SnrResult:
         """Simulate the distributions of S/N per pixel and per resolution element (METHODS section 5).
@@ -266,10 +268,10 @@ class Engine:
         quiet: Expectation,
         flares: Sequence[Expectation] | Expectation,
         *,
-        realisations: int,
-        seed: int,
-        statistics: Sequence[str | Linear] = DEFAULT_STATISTICS,
-        start: int = 0,
+        realisations: Realisations,
+        seed: Seed,
+        statistics: Annotated[Sequence[str | Linear], OneOrMore((str, Linear))] = DEFAULT_STATISTICS,
+        start: FirstRealisation = 0,
         comparison: Comparison = NOISE_FREE,
         tails: Tails = "counted",
         nuisances: Nuisances | Mapping[str, float] | None = None,
@@ -334,10 +336,10 @@ class Engine:
         quiet: Expectation,
         flares: Sequence[Expectation] | Expectation,
         *,
-        start: int = 0,
-        count: int,
-        seed: int,
-        statistics: Sequence[str | Linear] = DEFAULT_STATISTICS,
+        start: FirstRealisation = 0,
+        count: Realisations,
+        seed: Seed,
+        statistics: Annotated[Sequence[str | Linear], OneOrMore((str, Linear))] = DEFAULT_STATISTICS,
         comparison: Comparison = NOISE_FREE,
         nuisances: Nuisances | Mapping[str, float] | None = None,
         **drawing: Unpack[DrawingOptions],
@@ -358,7 +360,8 @@ class Engine:
             of each scenario: ``matched`` (the null's for each flare's template) and the others in the requested order,
             including the sums that a marginalised chi2 subtracts. Finally ``paper``, in the order of ``matched``.
         """
-        start, count, seed = self._checked(start, count, seed)
+        self.open_device.check_process()
+        check_last(start, count)
         # The request validates the arguments and turns a single flare into a sequence.
         request = DetectRequest(quiet, flares, count, seed, statistics)  # type: ignore[arg-type]
         flares, statistics = request.flares, request.statistics
@@ -382,9 +385,3 @@ class Engine:
 
             self._tiles.for_each(start, count, 4 * plan.n_rows, work)
         return out
-
-    def _checked(self, start: int, count: int, seed: int) -> tuple[int, int, int]:
-        """Check the process and return validated integers."""
-        self.open_device.check_process()
-        whole = check_numbers(count, seed, start)
-        return whole["start"], whole["realisations"], whole["seed"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from mauvecl.device.device import Device
 from mauvecl.device.stare_launches import StareLaunches
 from mauvecl.device.tiles import Progress, Tile, Tiles
 from mauvecl.lightcurve.stares.components import Components
-from mauvecl.lightcurve.stares.requests import Arrays, KeepStatistics, Method, StaresRequest, joined
+from mauvecl.lightcurve.stares.requests import Arrays, KeepStatistics, Method, StareNumber, StaresRequest, joined
 from mauvecl.lightcurve.stares.scene import Flares, StareScene, padded_frames
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.stares.sums import check_sums
@@ -20,6 +20,7 @@ from mauvecl.noise.processes import NONE, Processes
 from mauvecl.results.requests.requests import Shard
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import Realisations, Seed
 
 Floats = NDArray[np.float32]
 
@@ -86,9 +87,9 @@ class Stares:
         stare: Stare,
         flare: NDArray[Any] | None = None,
         *,
-        first: int = 0,
-        count: int = 1,
-        seed: int,
+        first: StareNumber = 0,
+        count: Realisations = 1,
+        seed: Seed,
         method: Method = "pixels",
         amplitudes: NDArray[Any] | None = None,
         processes: Processes = NONE,
@@ -118,7 +119,7 @@ class Stares:
             Weighted sums over pixels of raw counts minus the quiescent mean; frames of a statistic are contiguous in
             memory. With `amplitudes`, the shape is (n_scenario, count, n_frame, n_statistic).
         """
-        _check(first, count, seed, method)
+        _check_last(first, count)
         flares = Flares.of(components, stare, flare, amplitudes, count)
         shape = (len(flares.amplitudes), count, components.n_statistics, padded_frames(stare.n_frames))
         out = np.empty(shape, np.float32)
@@ -146,7 +147,7 @@ class Stares:
             Joined results of the request's reduction; for a shard with its ``start``, as `StareSums` requires.
         """
         there = shard or Shard(0, request.start, request.realisations)
-        _check(there.start, there.count, request.seed, request.method)
+        _check_last(there.start, there.count)
         components, stare, reduction = request.components, request.stare, request.reduction or KeepStatistics()
         how = (request.seed, request.method, request.processes)
         scenarios = slice(None) if request.amplitudes is not None else 0
@@ -201,12 +202,7 @@ class Stares:
 _scene_of = lru_cache(maxsize=4)(StareScene.of)
 
 
-def _check(first: int, count: int, seed: int, method: str) -> None:
-    if not (first >= 0 and count >= 1 and first + count <= 2**64):
-        raise InputError(
-            f"{count} stares from number {first}", "at least 1, numbered 0 to 2**64 - 1", key="count", value=count
-        )
-    if not 0 <= seed < 2**64:
-        raise InputError.of("seed", seed, "0 to 2**64 - 1")
-    if method not in get_args(Method):
-        raise InputError.of("method", method, "'pixels' or 'cumulants'")
+def _check_last(first: int, count: int) -> None:
+    """Raise InputError if the last stare has no number of 64 bits."""
+    if first + count > 2**64:
+        raise InputError.of("first", first, f"at most {2**64 - count} for {count} stares")

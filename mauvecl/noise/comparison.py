@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
+from typing import Annotated, Literal, Self
 
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.quantities import count
+from mauvecl.schema.fields import Range
 
 #: Largest number of quiescent exposures in a stack.
 MAX_EXPOSURES = 1000
@@ -26,14 +26,11 @@ class Comparison:
         Whether variances are estimated from the counts, as an observer must, instead of taken from the model.
     """
 
-    exposures: int = 0
+    exposures: Annotated[int, Range(0, MAX_EXPOSURES)] = 0
     estimated: bool = False
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "exposures", count("exposures", self.exposures, high=MAX_EXPOSURES))
-
     @classmethod
-    def of(cls, reference: str = "template", variances: str = "model") -> Self:
+    def of(cls, reference: str = "template", variances: Literal["model", "estimated"] = "model") -> Self:
         """Create a comparison from its names in a study.
 
         Parameters
@@ -42,8 +39,6 @@ class Comparison:
             ``"template"`` for the expectation, ``"exposure"`` for one exposure, ``"stack:n"`` for n exposures.
         variances : {"model", "estimated"}
         """
-        if variances not in ("model", "estimated"):
-            raise InputError.of("variances", variances, "'model' or 'estimated'")
         return cls(_exposures(reference), variances == "estimated")
 
     @property

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, ClassVar, Self
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from mauvecl.noise.additive import NEGLIGIBLE, AdditiveProcess
+from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.quantities import number
+from mauvecl.schema.fields import Range, Unit
 
 if TYPE_CHECKING:
     import numpy as np
@@ -16,10 +17,11 @@ if TYPE_CHECKING:
 
     Float = NDArray[np.float64]
 
-#: Largest accepted rate.
-MOST_PER_CM2_S = 1e6
+#: Rate of hits per area.
+ParticleRate = Annotated[float, Unit("1 / (cm2 s)"), Range(0, 1e6)]
 
 
+@public
 class CosmicRays(AdditiveProcess):
     """Hits by charged particles; the defaults are assumptions (INSTRUMENT.md: outside the South Atlantic Anomaly).
 
@@ -40,22 +42,15 @@ class CosmicRays(AdditiveProcess):
     stream: ClassVar[int] = 3
     label: ClassVar[str] = "cosmic rays"
 
-    rate_per_cm2_s: float = 1.0
-    area_cm2: float = 0.057
-    pixels: Annotated[int, Field(ge=1)] = 2048
+    rate_per_cm2_s: ParticleRate = 1.0
+    area_cm2: Annotated[float, Unit("cm2"), Range(0, 1e4, open_low=True)] = 0.057
+    pixels: Annotated[int, Range(1)] = 2048
     electrons: tuple[float, float] = (500.0, 1000.0)
     weights: tuple[float, ...] | None = None
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
         low, high = self.electrons
-        if not (0 <= self.rate_per_cm2_s <= MOST_PER_CM2_S and 0 < self.area_cm2 < 1e4):
-            raise InputError.of(
-                "rate_per_cm2_s",
-                self.rate_per_cm2_s,
-                f"a rate of 0 to {MOST_PER_CM2_S:g} and an area above 0",
-                where="cosmic rays",
-            )
         if not 1 <= low <= high <= 100_000:
             raise InputError.of("electrons", (low, high), "1 to 100000, ascending", where="cosmic rays")
         if self.weights is not None:
@@ -64,11 +59,10 @@ class CosmicRays(AdditiveProcess):
                 raise InputError.of("weights", self.weights, f"{wanted} of 0 and above", where="cosmic rays")
         return self
 
-    def charge(self, seconds: float) -> Float:
+    def charge(self, seconds: Annotated[float, Unit("s"), Range(0)]) -> Float:
         """Return the distribution of the charge that a pixel collects in a time, a compound Poisson distribution."""
         import numpy as np
 
-        seconds = number("time", seconds, "s", low=0.0)
         low, high = (int(e) for e in self.electrons)
         hits, most = self._hits(seconds), self.most_electrons(seconds)
         size = 1 << (most + 1).bit_length()
@@ -85,11 +79,11 @@ class CosmicRays(AdditiveProcess):
         spectrum = np.exp(hits * (np.fft.rfft(one / one.sum()) - 1.0))
         return np.asarray(np.maximum(np.fft.irfft(spectrum, size)[: most + 1], 0.0))
 
-    def most_electrons(self, seconds: float) -> int:
+    def most_electrons(self, seconds: Annotated[float, Unit("s"), Range(0)]) -> int:
         """Return the charge that a pixel exceeds in a time with a probability of at most `NEGLIGIBLE`."""
         from scipy import special
 
-        hits = self._hits(number("time", seconds, "s", low=0.0))
+        hits = self._hits(seconds)
         most = max(1, int(hits))
         while special.pdtrc(most, hits) > NEGLIGIBLE:
             most += 1
@@ -104,10 +98,9 @@ class CosmicRays(AdditiveProcess):
         """Rate of incident particles."""
         return self.rate_per_cm2_s
 
-    def with_particles(self, rate_per_cm2_s: float) -> Self:
+    def with_particles(self, rate_per_cm2_s: ParticleRate) -> Self:
         """Return the process at another rate of incident particles."""
-        rate = number("rate_per_cm2_s", rate_per_cm2_s, "1 / (cm2 s)", low=0.0, high=MOST_PER_CM2_S)
-        return self.model_copy(update={"rate_per_cm2_s": rate})
+        return self.model_copy(update={"rate_per_cm2_s": rate_per_cm2_s})
 
     @property
     def assumption(self) -> tuple[str, str, str]:

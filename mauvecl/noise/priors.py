@@ -12,12 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import PlainSerializer, PlainValidator, WithJsonSchema
 
+from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.quantities import number
+from mauvecl.schema.fields import Range
+from mauvecl.schema.quantities import is_quantity, without_unit
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+    from pydantic import GetCoreSchemaHandler
+    from pydantic_core import CoreSchema
 
     Float = NDArray[np.float64]
 
@@ -25,26 +29,32 @@ if TYPE_CHECKING:
 MAX_CUT_SD = 1e5
 
 
-def _make_plain(prior: object, *names: str) -> None:
-    """Convert values of a prior with units to plain numbers."""
-    for name in names:
-        value = getattr(prior, name)
-        unit = getattr(value, "unit", None)
-        kind = "deg_C" if unit is not None and unit.physical_type == "temperature" and name != "sd" else ""
-        plain = number(f"{name} of a prior", value, kind, expected="a finite number")
-        if unit is not None:
-            object.__setattr__(prior, name, plain)
+class PriorUnit:
+    """Unit of a value with a prior: deg C of temperatures, none of others."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_before_validator_function(self._plain, handler(source))
+
+    @staticmethod
+    def _plain(value: Any) -> Any:
+        is_temperature = is_quantity(value) and value.unit.physical_type == "temperature"
+        return without_unit(value, "deg_C") if is_temperature else value
 
 
+PriorValue = Annotated[float, PriorUnit(), Range()]
+
+
+@public
 @dataclass(frozen=True)
 class Uniform:
     """Uniform prior between two values; temperatures may be Quantities and are stored in deg C."""
 
-    low: float
-    high: float
+    low: PriorValue
+    high: PriorValue
 
     def __post_init__(self) -> None:
-        _make_plain(self, "low", "high")
         if not self.low <= self.high:
             raise InputError.of("low", self.low, "low <= high")
 
@@ -58,17 +68,17 @@ class Uniform:
         return np.asarray(np.where(below < above, from_low, self.high - (self.high - self.low) * above))
 
 
+@public
 @dataclass(frozen=True)
 class Normal:
     """Normal prior truncated at `low` and `high`; values as for `Uniform`, with a plain `sd` in deg C."""
 
-    mean: float
-    sd: float
-    low: float
-    high: float
+    mean: PriorValue
+    sd: Annotated[float, Range()]
+    low: PriorValue
+    high: PriorValue
 
     def __post_init__(self) -> None:
-        _make_plain(self, "mean", "sd", "low", "high")
         if not (self.sd > 0 and self.low < self.high):
             raise InputError(
                 f"a normal prior of mean {self.mean:g}, sd {self.sd:g}, cut at {self.low:g} and {self.high:g}",

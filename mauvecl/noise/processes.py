@@ -13,6 +13,7 @@ from mauvecl.noise.additive import AdditiveProcess
 from mauvecl.noise.cosmic_rays import CosmicRays
 from mauvecl.noise.priors import Normal, Prior, PriorField, Uniform
 from mauvecl.noise.unknowns import ADDITIVE, PROCESSES, SignalPart
+from mauvecl.schema.calls import public
 from mauvecl.schema.section import Section
 
 __all__ = ["NONE", "CosmicRays", "Normal", "Prior", "Processes", "Uniform"]
@@ -22,6 +23,7 @@ _keys: Any = {name: (kind | None, None) for name, kind in ADDITIVE.items()} | di
 )
 
 
+@public
 class Processes(create_model("_Processes", __base__=Section, **_keys)):  # type: ignore[misc]
     """Optional noise processes, and the study section that enables them; those that are None are disabled.
 

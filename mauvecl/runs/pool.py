@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
 from numpy.typing import NDArray
 
@@ -22,7 +22,8 @@ from mauvecl.results.sums import Arrays, DetectionSums, SnrSums
 from mauvecl.runs.shards import Task, fingerprint, shards
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.quantities import count as whole
+from mauvecl.schema.fields import Range
+from mauvecl.schema.physical import Realisations
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -208,9 +209,9 @@ class Pool:
         self._partly: dict[str, int] = {}
         self._stopping = False
 
-    def expect(self, realisations: int) -> None:
+    def expect(self, realisations: Annotated[int, Range(0)]) -> None:
         """Announce the total number of realisations, for an estimate of the remaining time."""
-        self._expected = self._total + whole("realisations", realisations)
+        self._expected = self._total + realisations
 
     def stop(self) -> None:
         """Stop all work in progress, including that of other threads."""
@@ -256,7 +257,7 @@ class Pool:
         return sums.answer()
 
     def realise(
-        self, expectation: Expectation, *, count: int, out: NDArray[Any] | None = None, **how: Any
+        self, expectation: Expectation, *, count: Realisations, out: NDArray[Any] | None = None, **how: Any
     ) -> NDArray[Any]:
         """Draw raw spectra with one worker; parameters as for `Engine.realise`.
 

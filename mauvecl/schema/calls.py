@@ -1,257 +1,132 @@
-"""What public functions are given: each argument is of the kind that its annotation names, or one sentence says so."""
+"""Validation of the arguments of public functions against their annotations."""
 
 from __future__ import annotations
 
 import ast
-import operator
-import os
-from collections.abc import Callable, Iterable, Mapping
+import inspect
+import re
+import sys
+from collections.abc import Callable
+from contextlib import suppress
 from functools import cache, wraps
-from inspect import Signature, isclass, isfunction, signature
-from typing import Any, NamedTuple, TypeVar, cast
+from itertools import chain, repeat
+from textwrap import dedent
+from types import CodeType, SimpleNamespace
+from typing import Any, TypeVar, cast, get_type_hints
 
+from pydantic_core import ValidationError
+
+from mauvecl.schema.core_schemas import ALTERNATIVE, validator
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.quantities import is_quantity, numbers, unit_of, word_of
+from mauvecl.schema.text import shown
 
-Given = TypeVar("Given", bound=Callable[..., Any])
-
-#: Annotations that stand for one of some words: which, is the function's own matter.
-TEXTS = (
-    "str",
-    "Literal",
-    "System",
-    "Order",
-    "Signal",
-    "Geometry",
-    "Per",
-    "Kind",
-    "Tails",
-    "Weighted",
-    "Lookup",
-    "Method",
-)
-#: Those of one number as well.
-ARRAYS = ("Float", "ArrayLike")
-SEVERAL = ("tuple", "list", "Sequence", "Collection", "Iterable")
-#: Annotations that are short for others.
-SHORT = {"Prior": "Uniform | Normal", "Curve": "Sinusoid | Table", "Progress": "Callable", "CompletenessOf": "Callable"}
-#: Classes that are told apart by their names, since rooms below know none above.
-CLASSES = (
-    "Checkpoint", "Comparison", "Cooling", "CosmicRays", "Detection", "Device", "EnergyScale", "Engine",
-    "Expectation", "FlareModel", "FlareSpectrum", "Linear", "Normal", "Nuisances", "Pool", "Shape", "Sinusoid",
-    "Sky", "Source", "Star", "Stare", "Stares", "Study", "Table", "Tiles", "Uniform",
-)  # fmt: skip
-#: What arguments are called in a sentence where their own names would not tell.
-CALLED = {"quiet": "the quiescent star"}
+Public = TypeVar("Public", bound=Callable[..., Any])
 
 
-class _Kind(NamedTuple):
-    """What a sentence calls it, and what makes one of a value, or raises a TypeError."""
+def public(thing: Public) -> Public:
+    """Validate the arguments of a function, or of a class's constructor and public methods, when they are called.
 
-    words: str
-    take: Callable[[str, Any], Any]
-
-
-def public(thing: Given) -> Given:
-    """Let a function, or a class in its constructor and public methods, take what its annotations say and nothing else.
-
-    Quantities become plain numbers in the unit that a parameter's name means (`quantities.UNITS`), 1e5 a whole number.
-    What an annotation says with a Quantity or a class not in `CLASSES` is the function's own matter; so are ranges.
-
-    Raises
-    ------
-    InputError
-        By what it returns, for an argument of another kind, and for NaN.
+    Arguments are checked against the annotations; `core_schemas` and `fields.Unit` state what is converted. Defaults
+    are not checked. A wrong argument raises InputError.
     """
-    if not isclass(thing):
-        return _taking(thing)
+    if not inspect.isclass(thing):
+        return _validated(thing)
     for name, member in list(vars(thing).items()):
         if name.startswith("_") and name != "__init__":
             continue
         if isinstance(member, classmethod | staticmethod):
-            setattr(thing, name, type(member)(_taking(member.__func__)))
-        elif isfunction(member):
-            setattr(thing, name, _taking(member))
+            setattr(thing, name, type(member)(_validated(member.__func__)))
+        elif inspect.isfunction(member):
+            setattr(thing, name, _validated(member, thing))
     return thing
 
 
-def _taking(function: Given) -> Given:
+def _validated(function: Public, owner: type | None = None) -> Public:
+    parameters = list(inspect.signature(function).parameters.values())
+    in_order = [p.name for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    rest = next((p.name for p in parameters if p.kind is p.VAR_POSITIONAL), "")
+    checks = {p.name: _Parameter(function, p, owner) for p in parameters if p.kind is not p.VAR_KEYWORD}
+
     @wraps(function)
-    def taking(*args: Any, **words: Any) -> Any:
-        known, kinds = _read(function)
-        try:
-            bound = known.bind(*args, **words)
-        except TypeError:
-            # Python's own sentence for too few or too many.
-            return function(*args, **words)
-        for name, value in bound.arguments.items():
-            if name in kinds:
-                bound.arguments[name] = _taken(name, value, kinds[name])
-        return function(*bound.args, **bound.kwargs)
-
-    return cast(Given, taking)
-
-
-@cache
-def _read(function: Callable[..., Any]) -> tuple[Signature, dict[str, tuple[_Kind, ...]]]:
-    """A function's parameters and what they may be, once it is called."""
-    known = signature(function)
-    plain = (one for one in known.parameters.values() if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD))
-    return known, {one.name: kinds for one in plain if (kinds := _kinds(str(one.annotation)))}
-
-
-def _taken(name: str, value: Any, kinds: tuple[_Kind, ...]) -> Any:
-    for kind in kinds:
-        try:
-            return kind.take(name, value)
-        except (TypeError, ValueError, OverflowError) as error:
-            if isinstance(error, InputError):
-                raise
-    expected = " or ".join(
-        dict.fromkeys(kind.words or word_of(unit_of(name)) for kind in kinds if kind.words != "None")
-    )
-    if any(word in expected for word in CLASSES):
-        called = CALLED.get(name, name if name[-1:].isdigit() else f"the {name}")
-        raise InputError(f"{called} is of the type {type(value).__name__}", expected, key=name, value=value)
-    raise InputError.of(name, value, expected)
-
-
-@cache
-def _kinds(annotation: str) -> tuple[_Kind, ...]:
-    """The alternatives of an annotation; none where one of them is not looked at here."""
-    try:
-        tree = ast.parse(annotation, mode="eval").body
-    except SyntaxError:
-        return ()
-    kinds = [_kind(one) for one in _alternatives(tree)]
-    return () if None in kinds else tuple(kind for kind in kinds if kind is not None)
-
-
-def _alternatives(tree: ast.expr) -> Iterable[ast.expr]:
-    if isinstance(tree, ast.BinOp):
-        yield from (*_alternatives(tree.left), *_alternatives(tree.right))
-    elif isinstance(tree, ast.Name) and tree.id in SHORT:
-        yield from _alternatives(ast.parse(SHORT[tree.id], mode="eval").body)
-    else:
-        yield tree
-
-
-def _kind(tree: ast.expr) -> _Kind | None:
-    if isinstance(tree, ast.Constant) and tree.value is None:
-        return _Kind("None", _nothing)
-    inner = tree.slice if isinstance(tree, ast.Subscript) else None
-    plain = tree.value if isinstance(tree, ast.Subscript) else tree
-    name = plain.attr if isinstance(plain, ast.Attribute) else plain.id if isinstance(plain, ast.Name) else ""
-    if name in SEVERAL:
-        each = inner.elts[0] if isinstance(inner, ast.Tuple) else inner
-        kinds = _kinds(ast.unparse(each)) if each is not None else ()
-        words = " or ".join(kind.words for kind in kinds)
-        return _Kind(f"several of {words}" if words else "several", lambda what, value: _several(what, value, kinds))
-    if name in CLASSES:
-        how = ", as `expect(source, instrument)` makes" if name == "Expectation" else ""
-        article = "an" if name[0] in "AEIO" else "a"
-        return _Kind(f"{article} {name}{how}", lambda what, value: _instance(name, value))
-    if name in TEXTS:
-        return _Kind("text", _text)
-    if name in ARRAYS:
-        return _Kind("numbers", _array)
-    if name == "NDArray":
-        return _Kind(
-            "an array of numbers",
-            lambda what, value: _is(bool(getattr(value, "ndim", isinstance(value, list | tuple))), _array(what, value)),
+    def call(*args: Any, **named: Any) -> Any:
+        # Python itself reports missing, unknown and superfluous arguments.
+        names = chain(in_order, repeat(rest))
+        return function(
+            *[checks[name](value) if name else value for name, value in zip(names, args, strict=False)],
+            **{name: checks[name](value) if name in checks else value for name, value in named.items()},
         )
-    kinds_by_name = {
-        "float": _Kind("", _float),
-        "int": _Kind("a whole number", _whole),
-        "bool": _Kind("true or false", _truth),
-        "Path": _Kind("a path", _path),
-        "Mapping": _Kind("a dictionary", _mapping),
-        "dict": _Kind("a dictionary", _mapping),
-        "Callable": _Kind("a function", _callable),
-    }
-    return kinds_by_name.get(name)
+
+    vars(call)["__validated__"] = checks
+    return cast(Public, call)
 
 
-def _is(condition: bool, value: Any) -> Any:
-    if not condition:
-        raise TypeError
-    return value
+class _Parameter:
+    """A parameter, whose annotation is resolved when it is first given an argument."""
+
+    def __init__(self, function: Callable[..., Any], known: inspect.Parameter, owner: type | None) -> None:
+        self.name, self.default = known.name, known.default
+        self.text = known.annotation
+        self.modules = [function.__globals__]
+        if owner is not None and function.__name__ == "__init__":
+            # A dataclass inherits fields, whose annotations belong to the module of the base class.
+            self.modules += [vars(sys.modules[base.__module__]) for base in owner.__mro__[1:-1]]
+        self.validate: Callable[[Any], Any] | None = None
+
+    def __call__(self, value: Any) -> Any:
+        if value is self.default or self.text is inspect.Parameter.empty:
+            return value
+        if self.validate is None:
+            self.validate = validator(self.annotation()).validate_python
+        try:
+            return self.validate(value)
+        except ValidationError as error:
+            raise _input_error(self.name, error) from None
+
+    def annotation(self) -> Any:
+        """Return the resolved annotation; names that modules import for type checkers only are imported now."""
+        text = SimpleNamespace(__annotations__={self.name: self.text})
+        for module in self.modules:
+            with suppress(NameError):
+                return get_type_hints(text, module, _TypeCheckingNames(module), include_extras=True)[self.name]
+        raise TypeError(f"the annotation {self.text} of {self.name} names nothing known")
 
 
-def _nothing(_: str, value: Any) -> Any:
-    return _is(value is None, value)
+def _input_error(name: str, error: ValidationError) -> InputError:
+    """Return the error of the innermost wrong value, with the alternatives that it may be."""
+    faults = [
+        (tuple(part for part in fault["loc"] if part != ALTERNATIVE), fault)
+        for fault in error.errors(include_url=False)
+    ]
+    place, first = max(faults, key=lambda one: len(one[0]))
+    expected = dict.fromkeys(fault["msg"].removeprefix("Input should be ") for at, fault in faults if at == place)
+    where = name + "".join(f"[{part!r}]" for part in place if part != "[key]")
+    return InputError(f"{where} = {shown(first['input'])}", " or ".join(expected), key=name, value=first["input"])
 
 
-def _float(name: str, value: Any) -> Any:
-    if is_quantity(value):
-        plain = numbers(name, value, unit_of(name))
-        return float(_is(plain.ndim == 0, plain))
-    if type(value) not in (float, int):
-        _is(not getattr(value, "ndim", 0) and _dtype(value) in tuple("iuf"), value)
-    # Comparison with itself: no NaN.
-    return _is(value == value, value)
+class _TypeCheckingNames(dict[str, Any]):
+    """Names that a module defines in its block `if TYPE_CHECKING`; each is defined when it is looked up."""
+
+    def __init__(self, module: dict[str, Any]) -> None:
+        super().__init__()
+        self.module = module
+
+    def __missing__(self, name: str) -> Any:
+        if name in self.module:
+            raise KeyError(name)
+        exec(_type_checking_statements(self.module["__name__"])[name], self.module, self)
+        return self[name]
 
 
-def _whole(_: str, value: Any) -> int:
-    _is(not (isinstance(value, str) or _true_or_false(value)), value)
-    try:
-        return operator.index(value)
-    except TypeError:
-        plain = float(value.to_value("") if is_quantity(value) else _is(not getattr(value, "ndim", 0), value))
-        return int(_is(plain.is_integer(), plain))
-
-
-def _truth(_: str, value: Any) -> Any:
-    return _is(_true_or_false(value), value)
-
-
-def _text(_: str, value: Any) -> Any:
-    return _is(isinstance(value, str), value)
-
-
-def _path(_: str, value: Any) -> Any:
-    return _is(isinstance(value, str | os.PathLike), value)
-
-
-def _mapping(_: str, value: Any) -> Any:
-    return _is(isinstance(value, Mapping), value)
-
-
-def _callable(_: str, value: Any) -> Any:
-    return _is(callable(value), value)
-
-
-def _array(name: str, value: Any) -> Any:
-    if is_quantity(value):
-        return numbers(name, value, unit_of(name))
-    return _is(_dtype(value) in tuple("iufb"), value)
-
-
-def _dtype(value: Any) -> str:
-    """NumPy's letter; what is large, or on a disk, is not read for it."""
-    if not hasattr(value, "dtype"):
-        import numpy as np
-
-        value = np.asarray(value)
-    return str(getattr(value.dtype, "kind", ""))
-
-
-def _true_or_false(value: Any) -> bool:
-    # NumPy's own too, which need not be loaded.
-    return type(value).__name__ in ("bool", "bool_")
-
-
-def _several(name: str, value: Any, kinds: tuple[_Kind, ...]) -> Any:
-    if isinstance(value, str) and any(kind.take is _text for kind in kinds):
-        # One word where several may be given.
-        return value
-    if isinstance(value, str | bytes | Mapping) or is_quantity(value):
-        raise TypeError
-    values = value if isinstance(value, list | tuple) or hasattr(value, "dtype") else tuple(value)
-    one = name.removesuffix("s")
-    taken = [_taken(f"{one} {i + 1}", each, kinds) for i, each in enumerate(values)] if kinds else values
-    return values if all(a is b for a, b in zip(taken, values, strict=True)) else type(values)(taken)
-
-
-def _instance(name: str, value: Any) -> Any:
-    return _is(any(one.__name__ == name for one in type(value).__mro__), value)
+@cache
+def _type_checking_statements(module: str) -> dict[str, CodeType]:
+    """Return the statement that defines each name of a module's block `if TYPE_CHECKING`."""
+    source = inspect.getsource(sys.modules[module])
+    block = re.search(r"^if TYPE_CHECKING:\n((?: .*\n|\n)+)", source, re.MULTILINE)
+    statements: dict[str, CodeType] = {}
+    for statement in ast.parse(dedent(block[1])).body if block else ():
+        code = compile(ast.Module([statement], []), module, "exec")
+        if isinstance(statement, ast.Import | ast.ImportFrom):
+            statements |= {one.asname or one.name: code for one in statement.names}
+        elif isinstance(statement, ast.Assign):
+            statements |= {one.id: code for one in statement.targets if isinstance(one, ast.Name)}
+    return statements

@@ -99,6 +99,33 @@ class Range:
         return f"{noun} {' and '.join(ends)}" if ends else noun
 
 
+class AnyUnit:
+    """A number or an array whose Quantities keep their unit, since the function itself converts them."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        from pydantic_core import core_schema
+
+        def keep(value: Any, validate: Any) -> Any:
+            return value if is_quantity(value) else validate(value)
+
+        return core_schema.no_info_wrap_validator_function(keep, handler(source))
+
+
+@dataclass(frozen=True)
+class OneOrMore:
+    """Sequence that may be given as a single item, such as one name or one expectation."""
+
+    item: tuple[type, ...]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_before_validator_function(self._listed, handler(source))
+
+    def _listed(self, value: Any) -> Any:
+        return (value,) if isinstance(value, self.item) else value
+
+
 def _or_error(schema: CoreSchema, words: str, **metadata: str) -> CoreSchema:
     """Replace every error of a schema by the statement of what is accepted."""
     from pydantic_core import core_schema

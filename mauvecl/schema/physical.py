@@ -39,10 +39,18 @@ Probability = Annotated[float, Range(0, 1, open_low=True, open_high=True)]
 Distance = Annotated[float, Unit("pc"), Range(1e-7, 1e6)]
 #: From far below white dwarfs (0.01) to above the largest supergiants (some 1500).
 Radius = Annotated[float, Unit("solRad"), Range(1e-4, 1e4)]
-#: Length of time.
+#: Solid angle of a field of view.
+SolidAngle = Annotated[float, Unit("arcsec2"), Range(1e-6, 1e12)]
+#: Wavelength in vacuum; also a frequency or an energy of photons.
+Wavelength = Annotated[float, Unit("nm"), Range(0, open_low=True)]
+#: Moment, from the start of an observation, and length of time.
+Moment = Annotated[float, Unit("s"), Range()]
 Duration = Annotated[float, Unit("s"), Range(0, open_low=True)]
 #: Energy of a flare.
 Energy = Annotated[float, Unit("erg"), Range(0, open_low=True)]
-#: Wavelengths in vacuum.
-Wavelength = Annotated[float, Unit("nm")]
+#: Seed of a random generator with 64 bits.
+Seed = Annotated[int, Range(0, 2**64 - 1)]
+#: Number of realisations, and that of the first of them.
+Realisations = Annotated[int, Range(1)]
+FirstRealisation = Annotated[int, Range(0, 2**63 - 1)]
 Positive = Annotated[float, Range(0, open_low=True)]

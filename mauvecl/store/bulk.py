@@ -18,7 +18,7 @@ from mauvecl.runs.durable import locked
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.quantities import count as whole
+from mauvecl.schema.physical import FirstRealisation, Realisations
 from mauvecl.store.export import Selection, export
 from mauvecl.store.form import CRC_BYTES, Chunk, Store, StoredScene, crc, digest
 from mauvecl.study.cases import Case
@@ -37,7 +37,12 @@ MAX_MISSING = 100_000
 
 @public
 def draw(
-    study: Study, scene: StoredScene, engine: Engine | Pool, start: int, count: int, out: NDArray[Any] | None = None
+    study: Study,
+    scene: StoredScene,
+    engine: Engine | Pool,
+    start: FirstRealisation,
+    count: Realisations,
+    out: NDArray[Any] | None = None,
 ) -> NDArray[Any]:
     """Draw rows of an array without a store.
 
@@ -57,7 +62,6 @@ def draw(
     ndarray of uint16 or int32, shape (count, n_pixel), or (count, n_frame, n_pixel) if single frames are stored
         Raw DN.
     """
-    start, count = whole("start", start), whole("count", count, low=1)
     how = Case(study).draw_options | {"start": start, "count": count, "seed": study.run.seed}
     if scene.frames is None:
         return engine.realise(scene.expectation, out=out, **how)
@@ -139,6 +143,7 @@ def realise_file(
     return store
 
 
+@public
 def unfinished(file: Path) -> Path:
     """Return the path of the temporary store of a file."""
     return file.with_name(f"{UNFINISHED}{file.name}.zarr")
@@ -264,6 +269,7 @@ class Fault:
     mended: bool
 
 
+@public
 def state(store: Store, chunk: Chunk) -> str:
     """Return ``good``, or the fault of a chunk's file; see `Fault`."""
     try:

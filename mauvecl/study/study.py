@@ -12,6 +12,7 @@ from mauvecl.host.files.parsed import possible, read_text, toml
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import AnyUnit
 from mauvecl.schema.records import input_error
 from mauvecl.schema.text import shortened
 from mauvecl.study.flare_light import drop_default_spectrum, resolve_spectrum_paths
@@ -34,8 +35,6 @@ from mauvecl.study.stare_section import EventText, StareQuestion, drop_default_s
 from mauvecl.study.study_text import locate_files, parse_toml_value, read_embedded_study, set_key, with_file_digests
 
 if TYPE_CHECKING:
-    import astropy.units as u
-
     from mauvecl.host.expectation import Expectation
 
 #: The paper's two stars.
@@ -224,7 +223,7 @@ class Study(Section):
             update["temperature_c"] = None
         return self.model_copy(update={"observation": o.model_copy(update=update)})
 
-    def at(self, quantity: str, value: u.Quantity | float | str) -> Self:
+    def at(self, quantity: str, value: Annotated[float, AnyUnit()] | str) -> Self:
         """Return a copy with another value of one quantity, for all stars.
 
         Parameters

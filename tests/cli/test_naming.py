@@ -73,7 +73,7 @@ STUDY = Study().with_changes({}, [{"library": "G2V", "magnitude": 7.4}])
         (lambda: Source.from_library("G2V").at_magnitude(99.0), "magnitude", None),
         (lambda: Source.from_library("G2V").at_magnitude([7]), "magnitude", [7]),
         (lambda: Engine().detect(1, [], realisations=10, seed=1), "quiet", 1),
-        (lambda: Sky.of_brightness("dark"), "sky_brightness", "dark"),
+        (lambda: Sky.of_brightness("dark"), "brightness", "dark"),
         (lambda: number("flare temperature", 1.0, "K", low=1000.0), "flare_temperature", 1.0),
         (lambda: numbers("wavelengths", np.array([1.0, -1.0]), "nm", low=0.0), "wavelengths", -1.0),
         (lambda: count("frames", 0, low=1), "frames", 0),

@@ -434,7 +434,7 @@ def test_progress_is_reported_and_may_stop(engine: Engine) -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"count": 0, "seed": 1}, ("realisations", "0")),
+        ({"count": 0, "seed": 1}, ("count", "0")),
         ({"count": 1, "seed": -1}, ("seed", "-1")),
         ({"count": 1, "seed": 2**64}, ("seed", "18446744073709551616")),
         ({"count": 1, "seed": 1, "start": -1}, ("start", "-1")),

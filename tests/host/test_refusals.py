@@ -51,28 +51,28 @@ PLACE = "290 -11"
 
 STARS: list[Row] = [
     (lambda: Source.from_library("G3V"), "name", "'G3V'", "G5V"),
-    (lambda: sun().at_magnitude(7.4, "V", "AB"), "system", "'AB'", "catalogue, vega, ab"),  # type: ignore[arg-type]
-    (lambda: sun().reddened(-1), "E(B-V)", "-1"),
+    (lambda: sun().at_magnitude(7.4, "V", "AB"), "system", "'AB'", "'catalogue', 'vega' or 'ab'"),  # type: ignore[arg-type]
+    (lambda: sun().reddened(-1), "ebv", "-1"),
     (lambda: sun().reddened(0.1, law="X"), "law", "'X'"),  # type: ignore[arg-type]
     (lambda: sun().reddened(0.1, rv=99.0), "rv", "99"),
-    (lambda: sun().flaring(-0.1), "flare_amplitude", "-0.1"),
-    (lambda: sun().flaring(NAN), "flare_amplitude", "nan"),
-    (lambda: sun().flaring(0.1, 10.0), "flare_temperature", "10.0"),
-    (lambda: sun().flaring(0.1, 1 * u.m), "flare_temperature", "1.0 m"),
+    (lambda: sun().flaring(-0.1), "amplitude", "-0.1"),
+    (lambda: sun().flaring(NAN), "amplitude", "nan"),
+    (lambda: sun().flaring(0.1, 10.0), "temperature", "10.0"),
+    (lambda: sun().flaring(0.1, 1 * u.m), "temperature", "1.0 m"),
     (lambda: sun().flaring(0.1, band="Q"), "band", "'Q'"),
-    (lambda: sun().flaring(0.1, geometry="sideways"), "flare_geometry", "'sideways'"),  # type: ignore[arg-type]
+    (lambda: sun().flaring(0.1, geometry="sideways"), "geometry", "'sideways'"),  # type: ignore[arg-type]
     (lambda: sun().flaring(0.1, geometry="replaces", photosphere_temperature=2e4), "flare_temperature", "20000"),
     (lambda: sun().flaring(50.0, geometry="replaces", photosphere_temperature=5800), "flare_amplitude", "50"),
     *each(lambda value: sun().at_magnitude(value), "magnitude", "x", None, np.ones(2), np.inf),
-    *each(lambda value: sun().flaring(value), "flare_amplitude", "x", None, np.ones(2)),
-    *each(lambda value: sun().flaring(0.1, value), "flare_temperature", "x", None, np.ones(2)),
-    *each(lambda value: sun().reddened(value), "E(B-V)", "x", None, np.ones(2)),
-    (lambda: Blackbody(10.0), "flare_temperature"),
-    (lambda: TwoBlackbodies(9e3, 1e7, 0.1), "second_flare_temperature"),
-    (lambda: TwoBlackbodies(9e3, 2e4, -1.0), "area_of_the_second_blackbody_over_that_of_the_first"),
-    (lambda: BalmerFlare(9e3, 0.5), "Balmer_jump_ratio"),
+    *each(lambda value: sun().flaring(value), "amplitude", "x", None, np.ones(2)),
+    *each(lambda value: sun().flaring(0.1, value), "temperature", "x", None, np.ones(2)),
+    *each(lambda value: sun().reddened(value), "ebv", "x", None, np.ones(2)),
+    (lambda: Blackbody(10.0), "temperature_k"),
+    (lambda: TwoBlackbodies(9e3, 1e7, 0.1), "second_temperature_k"),
+    (lambda: TwoBlackbodies(9e3, 2e4, -1.0), "second_area"),
+    (lambda: BalmerFlare(9e3, 0.5), "jump"),
     (lambda: FlareWithLines(Blackbody(), {"Fe XXI": 0.1}), "lines", "'Fe XXI'"),
-    (lambda: FlareWithLines(Blackbody(), {"Mg II": -0.1}), "flux_of_the_line_'Mg_II'"),
+    (lambda: FlareWithLines(Blackbody(), {"Mg II": -0.1}), "fractions", "['Mg II']"),
     (lambda: FlareWithLines(Blackbody(), {"Mg II": 0.1}, {"Mg II": 1e-13}), "lines", "'Mg II'"),
     (lambda: FlareWithLines(Blackbody(), {"2800": 0.1}), "wavelength_of_the_line_'2800'"),
 ]
@@ -121,17 +121,19 @@ EXPECTATIONS: list[Row] = [
 ]
 
 SKIES: list[Row] = [
-    *each(Sky.of_brightness, "sky_brightness", NAN, 100.0, "bright", True, 22.1 * u.mag, 3 * u.m, None),
+    *each(Sky.of_brightness, "brightness", NAN, 100.0, "bright", True, 22.1 * u.mag, 3 * u.m, None),
     (lambda: Sky.at(PLACE, DAY, "cubic"), "lookup", "'bilinear' or 'nearest'"),  # type: ignore[arg-type]
     *each(
         lambda target: Sky.at(target, DAY),
         "target",
-        *("18 Sco", "290 -95", "", "nan nan", 12.0, SkyCoord(np.nan * u.deg, 4 * u.deg)),
+        *("18 Sco", "290 -95", "", "nan nan", SkyCoord(np.nan * u.deg, 4 * u.deg)),
         facts=(ICRS,),
     ),
     (lambda: Sky.at("700 10", DAY), "target", "0 to 360 degrees"),
     (lambda: Sky.at(SkyCoord([1, 2] * u.deg, [3, 4] * u.deg), DAY), "target", "2 positions"),
-    *each(lambda time: Sky.at(PLACE, time), "time", "yesterday", "2026-13-01", 2026, facts=(UTC,)),
+    *each(lambda time: Sky.at(PLACE, time), "time", "yesterday", "2026-13-01", facts=(UTC,)),
+    (lambda: Sky.at(12.0, DAY), "target", "a SkyCoord or text"),  # type: ignore[arg-type]
+    (lambda: Sky.at(PLACE, 2026), "time", "a Time or text"),  # type: ignore[arg-type]
     (lambda: Sky.at(PLACE, "1850-01-01"), "time", "1990", "2100"),
     (lambda: Sky.at(PLACE, Time([DAY, "2026-01-02"])), "time", "2 times"),
 ]

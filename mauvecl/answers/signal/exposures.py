@@ -11,8 +11,7 @@ import numpy as np
 from mauvecl.answers.answer import Answer
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.physical import DAY_S
-from mauvecl.schema.quantities import number
+from mauvecl.schema.physical import DAY_S, Wavelength
 from mauvecl.schema.tables import Column, View, table_of
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import star_column
@@ -22,7 +21,6 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    import astropy.units as u
     from astropy.table import QTable, Table
 
     from mauvecl.device.engine import Engine
@@ -191,7 +189,7 @@ def exposure(
 
 @public
 def exposure_for(
-    study: Study, snr: float | None = None, wavelength_nm: u.Quantity | float | None = None, *, per: Per | None = None
+    study: Study, snr: float | None = None, wavelength_nm: Wavelength | None = None, *, per: Per | None = None
 ) -> ExposureResult:
     """Answer `exposure` for an S/N and a wavelength that may be given here.
 
@@ -210,8 +208,6 @@ def exposure_for(
     InputError
         As `exposure`.
     """
-    if wavelength_nm is not None:
-        wavelength_nm = number("wavelength", wavelength_nm, "nm")
     study = study.with_changes({"signal": {"snr": snr, "wavelength_nm": wavelength_nm, "per": per}}, None, "exposure")
     return exposure(study)
 

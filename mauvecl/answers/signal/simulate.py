@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from mauvecl.answers.answer import Answer
 from mauvecl.noise.components import components
 from mauvecl.schema.calls import public
-from mauvecl.schema.quantities import count
+from mauvecl.schema.physical import FirstRealisation
 from mauvecl.schema.tables import Column, View, table_of
 from mauvecl.study.cases import cases
 from mauvecl.study.labels import label
@@ -103,7 +103,7 @@ def simulate(
     engine: Engine | Pool | None = None,
     progress: Callable[[int, int], None] | None = None,
     *,
-    realisation: int = 0,
+    realisation: FirstRealisation = 0,
     flaring: bool = False,
 ) -> SimulateAnswer:
     """One observation of every star of a study, taken apart; with its flares too where asked.
@@ -120,7 +120,6 @@ def simulate(
     flaring : bool
         Whether the flares of the study are observed, too.
     """
-    realisation = count("realisation", realisation)
     observations, everything = [], []
     prepared = cases(study, swept=False)
     for done, case in enumerate(prepared, 1):

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +30,8 @@ from mauvecl.host.stars.flare_spectra import PARSEC_CM, STEFAN_BOLTZMANN, SUN_CM
 from mauvecl.lightcurve.flares.shapes import Shape, shape_of
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import checked
-from mauvecl.schema.physical import Distance, Radius, Temperature
+from mauvecl.schema.fields import Unit
+from mauvecl.schema.physical import Distance, Energy, Radius, Temperature
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
@@ -52,21 +52,21 @@ class EnergyScale:
 
     band: str  # of amplitude and equivalent duration
     kind: Kind  # energy in the band, or at all wavelengths
-    erg_per_s: float
+    erg_per_s: Annotated[float, Unit("erg / s")]
     how: str  # description of star and flare, for tables
 
     @classmethod
     def of_star(
         cls,
         source: Source,
-        distance_pc: float,
+        distance_pc: Distance,
         *,
         band: str = "Kepler",
-        flare_k: float = 10_000.0,
+        flare_k: Temperature = 10_000.0,
         flare: FlareSpectrum | None = None,
         kind: Kind = "bolometric",
         geometry: Geometry = "added",
-        photosphere_k: float | None = None,
+        photosphere_k: Temperature | None = None,
     ) -> Self:
         """Return the scale for a spectrum at a distance: 4 pi d^2 times the flux of the flare.
 
@@ -91,7 +91,6 @@ class EnergyScale:
         InputError
             For an impossible value, a spectrum without a scale, or a band that it does not cover.
         """
-        checked(Distance, "distance_pc", distance_pc)
         if source.unscaled:
             raise InputError(
                 f"the flux of {source.name} is of no scale: {source.unscaled}",
@@ -106,7 +105,7 @@ class EnergyScale:
             sphere_cm2=4 * np.pi * (distance_pc * PARSEC_CM) ** 2,
             star=f"{source.name} at {distance_pc:g} pc",
             band=band,
-            flare=_spectrum(flare_k) if flare is None else flare,
+            flare=Blackbody(flare_k) if flare is None else flare,
             kind=kind,
             geometry=geometry,
             photosphere_k=source.temperature_k if photosphere_k is None else photosphere_k,
@@ -115,15 +114,15 @@ class EnergyScale:
     @classmethod
     def of_blackbody(
         cls,
-        radius_rsun: float,
-        temperature_k: float,
+        radius_rsun: Radius,
+        temperature_k: Temperature,
         *,
         band: str = "Kepler",
-        flare_k: float = 10_000.0,
+        flare_k: Temperature = 10_000.0,
         flare: FlareSpectrum | None = None,
         kind: Kind = "bolometric",
         geometry: Geometry = "added",
-        photosphere_k: float | None = None,
+        photosphere_k: Temperature | None = None,
     ) -> Self:
         """Return the scale for a star that is a blackbody of given radius and temperature.
 
@@ -140,8 +139,6 @@ class EnergyScale:
         InputError
             For an impossible value or an unknown band.
         """
-        checked(Radius, "radius_rsun", radius_rsun)
-        checked(Temperature, "temperature_k", temperature_k)
         wavelength, _ = _response(band)
         return cls._of_light(
             wavelength,
@@ -149,7 +146,7 @@ class EnergyScale:
             sphere_cm2=4 * np.pi * (radius_rsun * SUN_CM) ** 2,
             star=f"a blackbody of {temperature_k:g} K and {radius_rsun:g} solar radii",
             band=band,
-            flare=_spectrum(flare_k) if flare is None else flare,
+            flare=Blackbody(flare_k) if flare is None else flare,
             kind=kind,
             geometry=geometry,
             photosphere_k=temperature_k if photosphere_k is None else photosphere_k,
@@ -157,7 +154,7 @@ class EnergyScale:
 
     @classmethod
     def shibayama2013(
-        cls, radius_rsun: float, temperature_k: float, *, band: str = "Kepler", flare_k: float = 10_000.0
+        cls, radius_rsun: Radius, temperature_k: Temperature, *, band: str = "Kepler", flare_k: Temperature = 10_000.0
     ) -> Self:
         """Return the published scale for bolometric energies, for comparisons with catalogues.
 
@@ -166,9 +163,6 @@ class EnergyScale:
         quarter of the energy of an isotropic source, and the response weights energies although equivalent durations
         count photons.
         """
-        checked(Radius, "radius_rsun", radius_rsun)
-        checked(Temperature, "temperature_k", temperature_k)
-        checked(Temperature, "flare_k", flare_k)
         area = np.pi * (radius_rsun * SUN_CM) ** 2 * in_band(band, temperature_k) / in_band(band, flare_k)
         return cls(
             find_band(band).name,
@@ -212,24 +206,22 @@ class EnergyScale:
             how += f" in place of photosphere of {photosphere_k:g} K"
         return cls(find_band(band).name, kind, sphere_cm2 * (flux - lost), how)
 
-    def energy(self, equivalent_duration_s: float) -> float:
+    def energy(self, equivalent_duration_s: Annotated[float, Unit("s")]) -> float:
         """Return the energy for an equivalent duration, erg."""
         return equivalent_duration_s * self.erg_per_s
 
-    def equivalent_duration(self, energy_erg: float) -> float:
-        """Return the equivalent duration for an energy above 0, s."""
-        if not (np.isfinite(energy_erg) and energy_erg > 0):
-            raise InputError.of("energy", energy_erg, "one above 0", unit="erg")
+    def equivalent_duration(self, energy_erg: Energy) -> float:
+        """Return the equivalent duration for an energy, s."""
         return energy_erg / self.erg_per_s
 
 
-def quiescent_luminosity(source: Source, distance_pc: float, band: str = "Kepler") -> float:
+@public
+def quiescent_luminosity(source: Source, distance_pc: Distance, band: str = "Kepler") -> float:
     """Return the luminosity of a star in a band, erg/s: 4 pi d^2 int R F dlambda, with R's highest value 1.
 
     Many catalogues multiply it by the equivalent duration to obtain the energy of a flare in the band. This assumes the
     spectrum of the star, not that of the flare.
     """
-    checked(Distance, "distance_pc", distance_pc)
     source.magnitude(band)
     sphere = 4 * np.pi * (distance_pc * PARSEC_CM) ** 2
     return sphere * _through(source.wavelength_nm, source.flux_flam, band)
@@ -280,11 +272,6 @@ def share_within(low_nm: float, high_nm: float, temperature_k: float) -> float:
     ends = [1.438776877e7 / (nm * temperature_k) for nm in (high_nm, low_nm)]
     value = quad(lambda x: x**3 / np.expm1(x), ends[0], ends[1], epsabs=0.0, epsrel=1e-12, limit=200)[0]
     return float(15 / np.pi**4 * value)
-
-
-def _spectrum(flare_k: float) -> Blackbody:
-    checked(Temperature, "flare_k", flare_k)
-    return Blackbody(flare_k)
 
 
 def _response(band: str) -> tuple[Float, Float]:

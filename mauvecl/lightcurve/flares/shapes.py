@@ -23,6 +23,7 @@ from mauvecl.schema.text import shortened
 Float = NDArray[np.float64]
 
 
+@public
 class Shape(ABC):
     """Time profile of a flare, in units of amplitude and half-width."""
 

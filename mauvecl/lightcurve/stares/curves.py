@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,8 @@ from numpy.typing import NDArray
 from mauvecl.lightcurve.defaults import ORBIT_S
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Range, Unit
+from mauvecl.schema.physical import Duration
 
 Float = NDArray[np.float64]
 
@@ -19,20 +22,11 @@ Float = NDArray[np.float64]
 class Sinusoid:
     """The curve amplitude * sin(2 pi t / period + phase)."""
 
-    amplitude: float  # half of the range
-    period_s: float = ORBIT_S
-    phase: float = 0.0  # radians, at the start of the stare
+    amplitude: Annotated[float, Range()]  # half of the range
+    period_s: Duration = ORBIT_S
+    phase: Annotated[float, Range()] = 0.0  # radians, at the start of the stare
 
-    def __post_init__(self) -> None:
-        if not (np.isfinite([self.amplitude, self.period_s, self.phase]).all() and self.period_s > 0):
-            raise InputError(
-                f"a sinusoid of amplitude {self.amplitude:g}, period {self.period_s:g} s and phase {self.phase:g}",
-                "finite numbers and a period above 0",
-                key="sinusoid",
-                value=(self.amplitude, self.period_s, self.phase),
-            )
-
-    def mean_over(self, start_s: Float, frame_s: float) -> Float:
+    def mean_over(self, start_s: Annotated[Float, Unit("s")], frame_s: Duration) -> Float:
         """Return the mean over each frame, shape (n_frame,)."""
         angle = 2 * np.pi * (start_s + frame_s / 2) / self.period_s + self.phase
         return np.asarray(self.amplitude * np.sinc(frame_s / self.period_s) * np.sin(angle))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +13,8 @@ from mauvecl.results.measurements.fit import LEVELS, Measurement, fit
 from mauvecl.results.measurements.reduction import Reduction
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Range
+from mauvecl.schema.physical import Probability
 from mauvecl.schema.tables import Column, table_of
 
 if TYPE_CHECKING:
@@ -110,9 +112,9 @@ def measure_along(
     model: FlareModel,
     nuisances: Nuisances | None = None,
     *,
-    snr_per_bin: float = 20.0,
+    snr_per_bin: Annotated[float, Range(0, open_low=True)] = 20.0,
     stare: Stare | None = None,
-    levels: Sequence[float] = LEVELS,
+    levels: Sequence[Probability] = LEVELS,
 ) -> MeasuredBins:
     """Measure a flare against time, in bins of consecutive frames in which it reaches an S/N.
 

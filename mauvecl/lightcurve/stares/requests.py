@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,13 @@ from mauvecl.lightcurve.stares.scene import Flares
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.results.requests.requests import Countable
+from mauvecl.schema.calls import public
+from mauvecl.schema.fields import Range
+from mauvecl.schema.physical import Realisations, Seed
 
 Arrays = dict[str, NDArray[Any]]
 Method = Literal["pixels", "cumulants"]
+StareNumber = Annotated[int, Range(0, 2**64 - 1)]
 
 #: Approximate cost of reducing a frame of a scenario by Fourier transforms, in draws of a pixel.
 REDUCED = 500
@@ -45,6 +49,7 @@ class Reduction(Protocol):
         """Reduce stares; see the class."""
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class StaresRequest(Countable):
     """Request for stares; flares and amplitudes as for `Stares.frames`.
@@ -64,11 +69,11 @@ class StaresRequest(Countable):
 
     components: Components
     stare: Stare
-    realisations: int
-    seed: int
+    realisations: Realisations
+    seed: Seed
     flare: NDArray[Any] | None = None
     amplitudes: NDArray[Any] | None = None
-    start: int = 0
+    start: StareNumber = 0
     method: Method = "cumulants"
     processes: Processes = NONE
     reduction: Reduction | None = None

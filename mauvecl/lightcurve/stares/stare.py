@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from mauvecl.lightcurve.stares.curves import Curve, Sinusoid
 from mauvecl.noise.unknowns import CHANGING, STARE_CHANGES, Changing
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Range, Unit
+from mauvecl.schema.physical import Duration, Moment
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -82,12 +84,12 @@ class Stare:
     (1000, [[0.0, 1000.0], [2000.0, 6000.0]])
     """
 
-    start_s: Float
-    frame_s: float
+    start_s: Annotated[Float, Unit("s")]
+    frame_s: Duration
     star: Float
     light: Float
     sky: Float
-    temperature_c: Float
+    temperature_c: Annotated[Float, Unit("deg_C")]
     light_jitter: float = 0.0
     sky_jitter: float = 0.0
     temperature_jitter_c: float = 0.0
@@ -96,8 +98,6 @@ class Stare:
     def __post_init__(self) -> None:
         for name in ("start_s", "star", "light", "sky", "temperature_c"):
             object.__setattr__(self, name, _kept(getattr(self, name)))
-        if not (np.isfinite(self.frame_s) and self.frame_s > 0):
-            raise InputError.of("frame_s", self.frame_s, "a time above 0")
         n = self.start_s.size
         if not 1 <= n <= MOST_FRAMES:
             raise InputError.of("n_frames", n, f"1 to {MOST_FRAMES}")
@@ -139,16 +139,16 @@ class Stare:
     @classmethod
     def of(
         cls,
-        duration_s: float,
+        duration_s: Duration,
         *,
-        frame_s: float = 5.0,
-        gaps: Sequence[tuple[float, float]] = (),
-        temperature_c: float = 21.0,
+        frame_s: Duration = 5.0,
+        gaps: Sequence[tuple[Moment, Moment]] = (),
+        temperature_c: Annotated[float, Unit("deg_C"), Range()] = 21.0,
         thermal: float | Curve | None = None,
         variability: Curve | None = None,
         throughput: Curve | None = None,
         sky: Curve | None = None,
-        orbit_s: float = ORBIT_S,
+        orbit_s: Duration = ORBIT_S,
         jitters: Mapping[Changing, float] | None = None,
         offsets: Mapping[Changing, float] | None = None,
         drifts: Mapping[Changing, float] | None = None,
@@ -184,18 +184,9 @@ class Stare:
         InputError
             If the gaps leave no frame, or for an invalid value.
         """
-        if not (np.isfinite(duration_s) and duration_s > 0 and np.isfinite(frame_s) and frame_s > 0):
-            raise InputError(
-                f"a stare of {duration_s:g} s in frames of {frame_s:g} s",
-                "times above 0",
-                key="duration_s",
-                value=(duration_s, frame_s),
-            )
         count = np.ceil(duration_s / frame_s * (1 - 1e-12))
         if count > MOST_FRAMES:
             raise InputError.of("duration_s", duration_s, f"at most {MOST_FRAMES} frames", unit="s")
-        if not (np.isfinite(orbit_s) and orbit_s > 0):
-            raise InputError.of("orbit_s", orbit_s, "a period above 0")
         start: Float = np.arange(max(1, int(count)), dtype=np.float64) * float(frame_s)
         start = start[_outside(gaps, start, float(frame_s))]
         if not start.size:
@@ -223,7 +214,7 @@ class Stare:
         )
 
     @classmethod
-    def along(cls, orbit: Orbit, target: Target | str, start: str, duration_s: float, **how: Any) -> Stare:
+    def along(cls, orbit: Orbit, target: Target | str, start: str, duration_s: Duration, **how: Any) -> Stare:
         """Return the stare along an orbit; see `along.stare_along`, which also returns the particle rate."""
         from mauvecl.lightcurve.stares.along import stare_along
 

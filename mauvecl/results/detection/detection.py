@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from mauvecl.results.requests.channels import ChannelPlan, Key
 from mauvecl.results.requests.fap import NoThresholdError, Tails, check_atom, check_fap, countable
 from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.schema.calls import public
-from mauvecl.schema.quantities import count
+from mauvecl.schema.fields import Range
 from mauvecl.schema.tables import INTERVAL, Column, interval, number, table_of
 from mauvecl.statistics.detection_interval import detection_interval
 from mauvecl.statistics.intervals import Interval, central_counts, clopper_pearson
@@ -99,10 +99,10 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         return counted
 
     def histogram(
-        self, statistic: str, flare: int | None = None, *, template: int = 0, bins: int = 200
+        self, statistic: str, flare: int | None = None, *, template: int = 0, bins: Annotated[int, Range(1)] = 200
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return edges and counts for plots; parameters as for `distribution`."""
-        return self.distribution(statistic, flare, template=template).histogram(count("bins", bins, low=1))
+        return self.distribution(statistic, flare, template=template).histogram(bins)
 
     def threshold(self, fap: float = 1e-3, statistic: str = "chi2", *, template: int = 0) -> Interval:
         """Return the threshold at a false-alarm probability.

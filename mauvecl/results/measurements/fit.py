@@ -16,6 +16,7 @@ from mauvecl.results.measurements.profile import Profile, covariance, covariance
 from mauvecl.results.measurements.reduction import Reduction, check_distinct, usable_variance
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import Probability, Temperature, Wavelength
 from mauvecl.statistics.nuisances import Nuisances
 
 if TYPE_CHECKING:
@@ -153,8 +154,8 @@ def fit(
     model: FlareModel,
     nuisances: Nuisances | None = None,
     *,
-    levels: Sequence[float] = LEVELS,
-    skipped_nm: Sequence[tuple[float, float]] = (),
+    levels: Sequence[Probability] = LEVELS,
+    skipped_nm: Sequence[tuple[Wavelength, Wavelength]] = (),
 ) -> Measurement:
     """Fit one flare to each of some exposures.
 
@@ -203,8 +204,8 @@ def fit(
         )
     if not np.isfinite(raw).all():
         raise InputError("frames hold undefined values", "finite numbers", key="frames")
-    if not levels or not all(0.0 < level < 1.0 for level in levels):
-        raise InputError.of("levels", list(levels), "probabilities between 0 and 1")
+    if not levels:
+        raise InputError.of("levels", levels, "at least one probability")
     excess = raw - expectation.recorded_dn
     nm = expectation.wavelength_nm
     left_out = np.zeros(nm.size, np.bool_)
@@ -363,7 +364,7 @@ class Forecast:
 def forecast(
     expectation: Expectation,
     model: FlareModel,
-    temperature_k: float,
+    temperature_k: Temperature,
     amplitudes: Sequence[float] | Float,
     nuisances: Nuisances | None = None,
 ) -> Forecast:

@@ -31,7 +31,7 @@ from mauvecl.host.stars.flare_spectra import (
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import range_of
-from mauvecl.schema.physical import Temperature
+from mauvecl.schema.physical import Distance, Radius, Temperature, Wavelength
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -111,10 +111,10 @@ class FlareModel:
         jump: bool = False,
         lines: Sequence[str] = (),
         band: str = "Kepler",
-        electron_temperature_k: float = ELECTRON_TEMPERATURE_K,
-        distance_pc: float | None = None,
-        radius_rsun: float | None = None,
-        bands_nm: Sequence[tuple[float, float]] = BANDS_NM,
+        electron_temperature_k: Temperature = ELECTRON_TEMPERATURE_K,
+        distance_pc: Distance | None = None,
+        radius_rsun: Radius | None = None,
+        bands_nm: Sequence[tuple[Wavelength, Wavelength]] = BANDS_NM,
         order: Order = "paper",
     ) -> Self:
         """Return the model of a blackbody at a star, with a Balmer continuum and lines if they are asked for.
@@ -148,9 +148,6 @@ class FlareModel:
             For a name or value that cannot be, or a spectrum that does not cover the band.
         """
         chosen = [EmissionLine.named(name) for name in lines]
-        for name, value in (("distance_pc", distance_pc), ("radius_rsun", radius_rsun)):
-            if value is not None and not 0.0 < value < np.inf:
-                raise InputError.of(name, value, "a number above 0")
         for low, high in bands_nm:
             if not GRID_NM[0] <= low < high <= GRID_NM[-1]:
                 raise InputError.of(
@@ -228,19 +225,19 @@ class FlareModel:
         values = [one.factors if one.ratio is None else one.ratio for one in self.derived]
         return tuple(None if value is None else scipy.interpolate.CubicSpline(self.log_k, value) for value in values)
 
-    def counts(self, temperature_k: float, amplitudes: Sequence[float] | Float) -> Float:
+    def counts(self, temperature_k: Temperature, amplitudes: Sequence[float] | Float) -> Float:
         """Return the mean DN that a flare adds to each pixel of the exposure, shape (n_pixel,)."""
         linear = self._checked(temperature_k, amplitudes)
         return np.asarray(linear[0] * self.hot_spline(np.log(temperature_k)) + linear[1:] @ self.fixed)
 
-    def values(self, temperature_k: float, amplitudes: Sequence[float] | Float) -> dict[str, float]:
+    def values(self, temperature_k: Temperature, amplitudes: Sequence[float] | Float) -> dict[str, float]:
         """Return the reported quantities of a flare, by name."""
         linear = self._checked(temperature_k, amplitudes)
         values = derived_values(self, np.array([np.log(temperature_k)]), linear[None])[0]
         return dict(zip(self.names, values.tolist(), strict=True))
 
     def amplitudes(
-        self, temperature_k: float, amplitude: float, *, jump: float = 1.0, lines: Sequence[float] = ()
+        self, temperature_k: Temperature, amplitude: float, *, jump: float = 1.0, lines: Sequence[float] = ()
     ) -> Float:
         """Return the model's amplitudes, shape (n_linear,), for a Balmer jump ratio and line fluxes, erg s-1 cm-2."""
         ratio = next(

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, ClassVar, Protocol, Self
+from typing import Annotated, Any, ClassVar, Protocol, Self
 
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
@@ -18,8 +18,10 @@ from mauvecl.noise.scene import BATCH, Scene, prepare
 from mauvecl.results.requests.channels import ChannelPlan, plan_channels
 from mauvecl.results.requests.fap import Tails
 from mauvecl.results.requests.hypotheses import Hypotheses
+from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.quantities import count
+from mauvecl.schema.fields import OneOrMore
+from mauvecl.schema.physical import FirstRealisation, Realisations, Seed
 from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.names import DEFAULT_STATISTICS
 from mauvecl.statistics.nuisances import Nuisances, as_nuisances
@@ -42,27 +44,10 @@ class Shard:
         return f"realisations {self.start} to {self.start + self.count - 1}"
 
 
-def expectation_of(what: str, given: Any) -> Expectation:
-    """Return an expectation unchanged; raises InputError for other objects."""
-    if not isinstance(given, Expectation):
-        kind = type(given).__name__
-        raise InputError(
-            f"{what} is of the type {kind}",
-            "an Expectation, as `expect(source, instrument)` makes",
-            key=what,
-            value=given,
-        )
-    return given
-
-
-def check_numbers(realisations: Any, seed: Any, start: Any) -> dict[str, int]:
-    """Return the numbers of a request as integers; raises InputError for other or impossible numbers."""
-    number = count("realisations", realisations, low=1)
-    return {
-        "realisations": number,
-        "seed": count("seed", seed, high=2**64 - 1),
-        "start": count("start", start, high=2**63 - 1 - number),
-    }
+def check_last(start: int, realisations: int) -> None:
+    """Raise InputError if the last realisation has no number of 63 bits."""
+    if start + realisations >= 2**63:
+        raise InputError.of("start", start, f"at most {2**63 - 1 - realisations} for {realisations} realisations")
 
 
 class Countable:
@@ -82,42 +67,30 @@ class Countable:
 
 
 class _Drawn(Countable):
-    """Base class of requests for realisations, which validates numbers and expectations."""
+    """Base class of requests for realisations."""
 
     def __post_init__(self) -> None:
-        given = vars(self)
-        for name, value in check_numbers(given["realisations"], given["seed"], given["start"]).items():
-            object.__setattr__(self, name, value)
-        self._check_stars()
-
-    def _check_stars(self) -> None:
-        expectation_of("what is drawn", vars(self)["expectation"])
+        check_last(vars(self)["start"], vars(self)["realisations"])
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class DetectRequest(_Drawn):
     """Arguments of `Engine.detect`."""
 
     quiet: Expectation
-    flares: tuple[Expectation, ...]
-    realisations: int
-    seed: int
-    statistics: Sequence[str | Linear] = DEFAULT_STATISTICS
-    start: int = 0
+    flares: Annotated[tuple[Expectation, ...], OneOrMore((Expectation,))]
+    realisations: Realisations
+    seed: Seed
+    statistics: Annotated[Sequence[str | Linear], OneOrMore((str, Linear))] = DEFAULT_STATISTICS
+    start: FirstRealisation = 0
     drawing: Drawing = AUTOMATIC
     comparison: Comparison = NOISE_FREE
     tails: Tails = "counted"
     nuisances: Nuisances | Mapping[str, float] | None = None
 
-    def _check_stars(self) -> None:
-        # A single flare need not be in a list.
-        flares = (self.flares,) if isinstance(self.flares, Expectation) else tuple(self.flares)
-        expectation_of("the quiescent star", self.quiet)
-        for number, flare in enumerate(flares):
-            expectation_of(f"flare {number + 1}", flare)
-        object.__setattr__(self, "flares", flares)
-        if isinstance(self.statistics, str | Linear):
-            object.__setattr__(self, "statistics", (self.statistics,))
+    def __post_init__(self) -> None:
+        super().__post_init__()
         object.__setattr__(self, "nuisances", as_nuisances(self.nuisances, self.quiet))
 
     @cached_property
@@ -149,14 +122,15 @@ class DetectRequest(_Drawn):
         return self.hypotheses.scene.n_pixel * max(len(scene.levels) for _, scene in self.plans)
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class SnrRequest(_Drawn):
     """Arguments of `Engine.snr`."""
 
     expectation: Expectation
-    realisations: int
-    seed: int
-    start: int = 0
+    realisations: Realisations
+    seed: Seed
+    start: FirstRealisation = 0
     drawing: Drawing = AUTOMATIC
 
     parts = 1
@@ -172,14 +146,15 @@ class SnrRequest(_Drawn):
         return self.scene.n_pixel
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class RealiseRequest(_Drawn):
     """Arguments of `Engine.realise`, computed as a single shard, so callers limit the number of realisations."""
 
     expectation: Expectation
-    realisations: int
-    seed: int
-    start: int = 0
+    realisations: Realisations
+    seed: Seed
+    start: FirstRealisation = 0
     drawing: Drawing = AUTOMATIC
 
 

@@ -1,0 +1,199 @@
+"""Core schemas of annotations, by which pydantic validates the arguments of public functions.
+
+They are stricter than pydantic's own: text, True and NaN are no numbers. They know what astronomers pass: NumPy's
+scalars and arrays, Quantities, and whole numbers such as 1e5. Objects are checked by `isinstance`, never copied.
+"""
+
+from __future__ import annotations
+
+import inspect
+import operator
+import os
+import sys
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from functools import cache, partial
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic_core import CoreSchema, PydanticCustomError, SchemaValidator, core_schema
+
+from mauvecl.schema.quantities import is_quantity, without_unit
+
+#: Place of an error inside an alternative of a union.
+ALTERNATIVE = "|"
+#: Annotations of containers whose items are validated one by one; functions receive a tuple.
+SEQUENCES = (tuple, Sequence, Collection, Iterable)
+
+
+@cache
+def validator(hint: Any) -> SchemaValidator:
+    """Return the validator of an annotation."""
+    return SchemaValidator(schema_of(hint))
+
+
+def schema_of(hint: Any) -> CoreSchema:
+    """Return the core schema of an annotation; raises TypeError if it has none, so that no argument goes unchecked."""
+    origin, args = get_origin(hint) or hint, get_args(hint)
+    if origin is Annotated:
+        schema = schema_of(args[0])
+        for metadata in args[1:]:
+            schema = metadata.__get_pydantic_core_schema__(args[0], lambda _, inner=schema: inner)
+        return schema
+    if _is_array(hint):
+        return _leaf(
+            _array if origin is Union else _real_array, "numbers" if origin is Union else "an array of numbers"
+        )
+    if origin in (Union, UnionType):
+        choices: Any = [(schema_of(one), ALTERNATIVE) for one in args if one is not NoneType]
+        schema = core_schema.union_schema(choices, mode="left_to_right") if len(choices) > 1 else choices[0][0]
+        return core_schema.nullable_schema(schema) if NoneType in args else schema
+    if origin is Literal:
+        return core_schema.literal_schema(list(args))
+    if origin in LEAVES:
+        return _leaf(*LEAVES[origin])
+    if origin in SEQUENCES or origin is list:
+        return _sequence(origin, args)
+    if origin in (dict, Mapping):
+        keys, values = map(schema_of, args)
+        return core_schema.no_info_before_validator_function(_mapping, core_schema.dict_schema(keys, values))
+    if origin in (Any, object):
+        return core_schema.any_schema()
+    if inspect.isclass(origin):
+        return _instance(origin)
+    raise TypeError(f"arguments of the type {hint} cannot be validated")
+
+
+def _leaf(take: Callable[[Any], Any], words: str) -> CoreSchema:
+    """Return the schema of what a function takes; an error states what is accepted."""
+    schema = core_schema.no_info_plain_validator_function(take)
+    return core_schema.custom_error_schema(schema, "expected", custom_error_message=f"Input should be {words}")
+
+
+def _number(value: Any) -> float:
+    if is_quantity(value):
+        value = without_unit(value, "")
+    if type(value) is not float:
+        _require(not getattr(value, "ndim", 0) and _kind(value) in tuple("iuf"))
+    plain = float(value)
+    # NaN differs from itself.
+    _require(plain == plain)
+    return plain
+
+
+def _whole(value: Any) -> int:
+    if is_quantity(value):
+        value = without_unit(value, "")
+    _require(not _is_truth(value) and not getattr(value, "ndim", 0))
+    try:
+        return operator.index(value)
+    except TypeError:
+        _require(isinstance(value, float) or _kind(value) == "f")
+        _require(float(value).is_integer())
+        return int(value)
+
+
+def _truth(value: Any) -> bool:
+    _require(_is_truth(value))
+    return bool(value)
+
+
+def _text(value: Any) -> Any:
+    _require(isinstance(value, str))
+    return value
+
+
+def _path(value: Any) -> Any:
+    _require(isinstance(value, str | os.PathLike))
+    return value
+
+
+def _function(value: Any) -> Any:
+    _require(callable(value))
+    return value
+
+
+def _array(value: Any) -> Any:
+    if is_quantity(value):
+        return without_unit(value, "")
+    _require(_kind(value) in tuple("iufb"))
+    return value
+
+
+def _real_array(value: Any) -> Any:
+    _require(bool(getattr(value, "ndim", isinstance(value, list | tuple))))
+    return _array(value)
+
+
+def _items(value: Any, size: int | None = None) -> Any:
+    one = isinstance(value, str | bytes | Mapping) or not isinstance(value, Iterable) or getattr(value, "ndim", 1) == 0
+    items = () if one else tuple(value)
+    if one or size not in (None, len(items)):
+        raise PydanticCustomError("expected", f"Input should be a sequence{'' if size is None else f' of {size}'}")
+    return items
+
+
+def _mapping(value: Any) -> Any:
+    if not isinstance(value, Mapping):
+        raise PydanticCustomError("expected", "Input should be a dictionary")
+    return value
+
+
+#: Annotations of single values: what takes one, and what an error calls it.
+LEAVES: dict[Any, tuple[Callable[[Any], Any], str]] = {
+    float: (_number, "a number"),
+    int: (_whole, "a whole number"),
+    bool: (_truth, "true or false"),
+    str: (_text, "text"),
+    Path: (_path, "a path"),
+    Callable: (_function, "a function"),
+}
+
+
+def _sequence(origin: Any, args: tuple[Any, ...]) -> CoreSchema:
+    items = [schema_of(one) for one in args if one is not ...]
+    if origin is list:
+        return core_schema.no_info_before_validator_function(_items, core_schema.list_schema(items[0]))
+    if origin is tuple and ... not in args:
+        schema = core_schema.tuple_positional_schema(items)
+        return core_schema.no_info_before_validator_function(partial(_items, size=len(items)), schema)
+    return core_schema.no_info_before_validator_function(_items, core_schema.tuple_variable_schema(items[0]))
+
+
+def _instance(kind: type) -> CoreSchema:
+    if getattr(kind, "_is_protocol", False):
+        # Methods of a protocol are checked when they are called.
+        return core_schema.any_schema()
+    article = "an" if kind.__name__[0] in "AEIOU" else "a"
+    return core_schema.custom_error_schema(
+        core_schema.is_instance_schema(kind),
+        "expected",
+        custom_error_message=f"Input should be {article} {kind.__name__}",
+    )
+
+
+def _is_array(hint: Any) -> bool:
+    """Return whether an annotation is NumPy's array or what NumPy makes one of."""
+    numpy = sys.modules.get("numpy")
+    return numpy is not None and ((get_origin(hint) or hint) is numpy.ndarray or hint == numpy.typing.ArrayLike)
+
+
+def _kind(value: Any) -> str:
+    """Return NumPy's letter for the type of a number or array, without reading what is on a disk."""
+    if type(value) is int:
+        return "i"
+    if not hasattr(value, "dtype"):
+        import numpy as np
+
+        value = np.asarray(value)
+    return str(getattr(value.dtype, "kind", ""))
+
+
+def _is_truth(value: Any) -> bool:
+    # NumPy's own type has this name as well, and need not be loaded.
+    return type(value).__name__ in ("bool", "bool_")
+
+
+def _require(condition: bool) -> None:
+    if not condition:
+        raise ValueError
