@@ -55,9 +55,9 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: Event.of_equivalent_duration(3.0, peak_s=0.0, half_width_s=0.0), "half_width_s"
     ),
     "amplitude": (lambda: Event(0.0, 60.0, -0.1), "amplitude"),
-    "flare temperature": (lambda: Event(0.0, 60.0, 0.1, 10.0), "flare_temperature"),
+    "flare temperature": (lambda: Event(0.0, 60.0, 0.1, 10.0), "temperature"),
     "temperatures": (lambda: temperatures_of([Event(0.0, 60.0, 0.1, 5e3 + k) for k in range(9)]), "events"),
-    "cooling": (lambda: Cooling(6000.0, 9000.0, 60.0), "cooling"),
+    "cooling": (lambda: Cooling(6000.0, 9000.0, 60.0), "end_k"),
     "temperature nodes": (
         lambda: coefficients([Event(0.0, 60.0, 0.1)], START, 5.0, np.array([6000.0])), "temperature"
     ),
@@ -66,7 +66,7 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "flare_k": (lambda: EnergyScale.of_blackbody(1.0, 5778.0, flare_k=10.0), "flare_k"),
     "band": (lambda: EnergyScale.of_blackbody(1.0, 5778.0, band="Q"), "band"),
     "distance": (lambda: EnergyScale.of_star(Source.from_library("G2V"), -1.0), "distance_pc"),
-    "energy": (lambda: EnergyScale.of_blackbody(1.0, 5778.0).equivalent_duration(0.0), "energy"),
+    "energy": (lambda: EnergyScale.of_blackbody(1.0, 5778.0).equivalent_duration(0.0), "energy_erg"),
     "preset": (lambda: preset("B"), "preset"),
     "no false alarms": (lambda: per_day(0.0, "day"), "false_alarms"),
     "undefined false alarms": (lambda: per_day(float("nan"), "year"), "false_alarms"),
@@ -87,9 +87,9 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "jitter of": (lambda: Stare.of(100, jitters={"star": 0.1}), "jitters"),
     "large jitter": (lambda: Stare.of(100, jitters={"light": 0.5}), "light_jitter"),
     "large drift": (lambda: Stare.of(86_400, drifts={"light": 0.05}), "light_drift"),
-    "offset of": (lambda: Stare.of(100, offsets={"dark": 0.1}), "of"),
+    "offset of": (lambda: Stare.of(100, offsets={"dark": 0.1}), "offsets"),
     "orbit": (lambda: Stare.of(100, orbit_s=0.0), "orbit_s"),
-    "period": (lambda: Sinusoid(1.0, -3.0), "sinusoid"),
+    "period": (lambda: Sinusoid(1.0, -3.0), "period_s"),
     "times of a curve": (lambda: Table(np.ones(2), np.zeros(2)), "time_s"),
     "number of values": (lambda: Table(TWO, np.zeros(3)), "values"),
     "undefined value": (lambda: Table(TWO, np.array([0.0, np.nan])), "values"),
