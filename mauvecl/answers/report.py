@@ -226,13 +226,3 @@ def _versions(*names: str) -> dict[str, str]:
     from importlib.metadata import version
 
     return {name: version(name) for name in names}
-
-
-def rows(table: Table) -> list[dict[str, Any]]:
-    """Return a table as rows for JSON; the units are in the table's file."""
-    return [{name: _plain(row[name]) for name in table.colnames} for row in table]
-
-
-def _plain(value: Any) -> Any:
-    value = getattr(value, "value", value)
-    return value.item() if hasattr(value, "item") else value

@@ -118,12 +118,6 @@ class Meter:
             self._bar = None
 
 
-def short(value: Any) -> str:
-    """What a cell of a sweep has, for the terminal, without its unit."""
-    value = getattr(value, "value", value)
-    return value if isinstance(value, str) else f"{value:g}"
-
-
 def show(lines: Sequence[str]) -> None:
     """Plain lines on standard output."""
     from rich.console import Console

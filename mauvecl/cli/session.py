@@ -235,7 +235,7 @@ class Session:
         with self.pool(unit=verb.counts) as engine:
             return verb.ask(study, engine, None if verb.counts == "realisations" else self.meter)
 
-    def answer(self, answer: Answer, show: Callable[[], None] | None = None) -> None:
+    def answer(self, answer: Answer) -> None:
         """Print an answer and write its files."""
         self.say([*answer.messages, answer.assumed])
         with told_of_interrupts(self._written):
@@ -249,11 +249,8 @@ class Session:
             return
         from mauvecl.cli.console import show_view
 
-        if show is not None:
-            show()
-        else:
-            for view in answer.views:
-                show_view(view)
+        for view in answer.views:
+            show_view(view)
         self.say(answer.remarks)
         self.finish()
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import typer.main
+from answers import FEW, QUICK
 
 import mauvecl
 from mauvecl import Study
@@ -14,22 +15,6 @@ from mauvecl.answers.answer import Answer
 from mauvecl.answers.verbs import VERBS
 from mauvecl.cli.app import app
 from mauvecl.device.engine import Engine
-
-FEW = ["run.realisations=2000", "run.fap=0.1", 'run.statistics=["matched"]', 'star=[{library="G2V", magnitude=7.4}]',
-       "flare.amplitudes=[0.24]"]  # fmt: skip
-#: Short questions, one to a verb whose answer takes less than seconds.
-QUICK: dict[str, list[str]] = {
-    "simulate": [],
-    "snr": [],
-    "exposure": ["signal.snr=10", "signal.wavelength_nm=300"],
-    "detect": [],
-    "limit": ["limit.power=0.9"],
-    "gaussian": ['sweep.axes=[{quantity="exposure", values=[50, 300]}]'],
-    "map": ['map.x={quantity="magnitude", start=6, stop=8, steps=2}',
-            'map.y={quantity="amplitude", start=0.1, stop=0.3, steps=2}'],
-    "visible": ['orbit.targets=["eps Eri", "AU Mic"]', "orbit.days=5"],
-    "plan": ["plan.targets=[{name = 'eps Eri'}]", "orbit.days=31", "plan.completeness='closed form'"],
-}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", VERBS)

@@ -36,12 +36,12 @@ def library(context: typer.Context, as_json: JsonFlag = False) -> None:
     """
     if context.invoked_subcommand is not None:
         return
-    from mauvecl.answers.report import rows
     from mauvecl.host.stars.catalogue import library_table
+    from mauvecl.schema.tables import records
 
     table = library_table()
     if as_json:
-        print(json.dumps(rows(table), indent=2))
+        print(json.dumps(records(table), indent=2))
         return
     from mauvecl.cli.console import show_table
 

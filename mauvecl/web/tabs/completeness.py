@@ -11,9 +11,6 @@ from mauvecl.web.figures import Canvas
 from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
 if TYPE_CHECKING:
-    from astropy.table import Table
-
-    from mauvecl.study.study import Study
     from mauvecl.web.closed_forms import ClosedForms
 
 #: Half-widths of the flares: as many as there are lines.
@@ -77,12 +74,5 @@ class Completeness(Tab):
     )
     pictures = (Shares(),)
     simulations = {"completeness": "Inject flares"}  # noqa: RUF012
-    shows, view = "completeness", 1
+    answer, view = "completeness", 1
     files = {"completeness": "completeness", "limits": "completeness"}  # noqa: RUF012
-
-    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
-        return answers["completeness"].tables[name]
-
-    def study(self, name: str, closed: ClosedForms, answers: Answers) -> Study:
-        study: Study = answers["completeness"].study
-        return study

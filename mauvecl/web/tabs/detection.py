@@ -13,8 +13,6 @@ from mauvecl.web.figures import Canvas, strips
 from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
 if TYPE_CHECKING:
-    from astropy.table import Table
-
     from mauvecl.web.closed_forms import ClosedForms
 
 
@@ -169,9 +167,5 @@ class Detection(Tab):
     about = "What the flare adds beside the noise, and how the statistic tells it from none."
     pictures = (Excess(), Distributions(), Trade())
     simulations = {"detection": "Simulate"}  # noqa: RUF012
-    shows = "detection"
+    answer = "detection"
     files = {"detection": "detection", "roc": "detection"}  # noqa: RUF012
-
-    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
-        answer = answers["detection"]
-        return answer.table if name == "detection" else answer.roc

@@ -14,10 +14,7 @@ from mauvecl.web.figures import Canvas
 from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
 if TYPE_CHECKING:
-    from astropy.table import Table
-
     from mauvecl.statistics.statistic import DetectionForms
-    from mauvecl.study.study import Study
     from mauvecl.web.closed_forms import ClosedForms
 
 Float = NDArray[np.float64]
@@ -255,12 +252,5 @@ class Limit(Tab):
     about = "How faint a star and how small a flare one would still see."
     pictures = (Curve(), Map())
     simulations = {"limit": "Simulate the limit", "map": "Simulate the map"}  # noqa: RUF012
-    shows = "limit"
+    answer = "limit"
     files = {"limit": "limit", "map": "map"}  # noqa: RUF012
-
-    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
-        return answers[name].table
-
-    def study(self, name: str, closed: ClosedForms, answers: Answers) -> Study:
-        study: Study = answers[name].study
-        return study

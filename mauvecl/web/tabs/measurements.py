@@ -15,11 +15,8 @@ from mauvecl.web.figures import Canvas
 from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
 if TYPE_CHECKING:
-    from astropy.table import Table
-
     from mauvecl.answers.measurements.expected import ExpectedMeasurement
     from mauvecl.answers.measurements.measure import MeasuredFlare
-    from mauvecl.study.study import Study
     from mauvecl.web.closed_forms import ClosedForms
 
 #: What an observer may not know, by name on the page, as the study's section of nuisances.
@@ -143,13 +140,6 @@ class Measurement(Tab):
     pictures = (Errors(), Region())
     simulations = {"measure": "Simulate fits"}  # noqa: RUF012
     files = {"measure": "measure", "fits": "measure"}  # noqa: RUF012
-
-    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
-        return answers["measure"].tables[name]
-
-    def study(self, name: str, closed: ClosedForms, answers: Answers) -> Study:
-        study: Study = answers["measure"].study
-        return study
 
     def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
         each, fits = expected(closed), simulated(answers)

@@ -11,9 +11,6 @@ from mauvecl.web.figures import Canvas
 from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
 if TYPE_CHECKING:
-    from astropy.table import Table
-
-    from mauvecl.study.study import Study
     from mauvecl.web.closed_forms import ClosedForms
 
 #: Ends of the pictures, erg: they stay, whatever is asked.
@@ -94,13 +91,5 @@ class Plan(Tab):
     )
     pictures = (Recovered(), Expected())
     simulations = {"plan": "Plan"}  # noqa: RUF012
-    shows = "plan"
+    answer = "plan"
     files = dict.fromkeys(("plan", "stars", "energies", "assumptions"), "plan")
-
-    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
-        tables: dict[str, Table] = answers["plan"].tables
-        return tables[name]
-
-    def study(self, name: str, closed: ClosedForms, answers: Answers) -> Study:
-        study: Study = answers["plan"].study
-        return study

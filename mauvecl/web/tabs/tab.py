@@ -89,8 +89,8 @@ class Tab(ABC):
     pictures : tuple of Picture
     simulations : dict of str
         What can be simulated here, with what the button is called.
-    shows : str
-        Name of the answer whose table is shown below the pictures.
+    answer : str
+        Name of the simulated answer whose table stands below the pictures.
     view : int
         Number of that table among the answer's `views`.
     """
@@ -100,22 +100,25 @@ class Tab(ABC):
     about: ClassVar[str]
     pictures: ClassVar[tuple[Picture, ...]] = ()
     simulations: ClassVar[Mapping[str, str]] = {}
-    shows: ClassVar[str] = ""
+    answer: ClassVar[str] = ""
     view: ClassVar[int] = 0
     #: Tables that can be taken along, with the simulation that each needs, or none.
     files: ClassVar[Mapping[str, str | None]] = {}
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
-        """Return the table of one of `files`."""
-        raise NotImplementedError
+        """Return the table of one of `files`: by default that of the answer it needs."""
+        table: Table = answers[str(self.files[name])].tables[name]
+        return table
 
     def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
         """Return a small table as text with a header row; empty if there is nothing to report."""
-        if self.shows not in answers:
+        if self.answer not in answers:
             return []
-        headings, cells = without_empty(*answers[self.shows].views[self.view].texts(FIXED))
+        headings, cells = without_empty(*answers[self.answer].views[self.view].texts(FIXED))
         return [headings, *cells]
 
     def study(self, name: str, closed: ClosedForms, answers: Answers) -> Study:
-        """Return the study that reproduces one of `files`."""
-        return closed.study
+        """Return the study that reproduces one of `files`: by default that of the answer it needs."""
+        needed = self.files[name]
+        study: Study = closed.study if needed is None else answers[needed].study
+        return study

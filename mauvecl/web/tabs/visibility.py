@@ -63,7 +63,7 @@ class Visibility(Tab):
     )
     pictures = (Hours(),)
     simulations = {"visible": "Find when"}  # noqa: RUF012
-    shows, view = "visible", 1
+    answer, view = "visible", 1
     files = {"visible": "visible", "months": "visible", "days": "visible"}  # noqa: RUF012
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
