@@ -27,7 +27,7 @@ SMALL = {
 
 
 def study(**changes):
-    """A small question, some sections changed."""
+    """Return a small question with some sections changed."""
     data = {**SMALL, **{k: {**SMALL.get(k, {}), **v} if isinstance(v, dict) else v for k, v in changes.items()}}
     return Study.build(data, "test")
 

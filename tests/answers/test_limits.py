@@ -22,7 +22,7 @@ STATISTICS = ("chi2", "chi2_element", "matched", "uv_excess")
 
 
 def study(**changes: Any) -> Study:
-    """The paper's G2V star with a 24 % flare, 1e5 realisations at 1e-2."""
+    """Return the paper's G2V star with a 24 % flare, 1e5 realisations at 1e-2."""
     data: dict[str, Any] = {
         "star": [{"library": "G2V", "magnitude": 7.4}],
         "flare": {"amplitudes": [0.24]},

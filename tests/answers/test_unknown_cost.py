@@ -39,7 +39,7 @@ STRAY = "200 1\n450 3\n700 1  # DN\n"
 
 
 def study(**nuisances: Any) -> Study:
-    """The G2V star of METHODS section 7 with its 2 % flare, Vega at V = 0."""
+    """Return the G2V star of METHODS section 7 with its 2 % flare, Vega at V = 0."""
     star = {"library": "G2V", "magnitude": 7.4, "magnitude_system": "vega"}
     run = {"realisations": 100_000, "statistics": ["matched"]}
     return Study.build({"star": [star], "flare": {"amplitudes": [0.02]}, "run": run, "nuisances": nuisances}, "test")

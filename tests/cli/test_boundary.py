@@ -134,7 +134,7 @@ NAMES = [LONG, NOT_TEXT, CONTROL, "a\0b"]
 
 
 def refused(*words: str, folder: Path) -> str:
-    """The one sentence of bad input."""
+    """Run the command, check that it fails with one sentence, and return the sentence."""
     code, _, told = ended(*words, folder=folder)
     assert code == 2, told
     (line,) = told.splitlines()

@@ -27,7 +27,7 @@ from mauvecl.study.study import Study
 
 @pytest.fixture(scope="module")
 def answered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """The default question with fewer realisations."""
+    """Answer the default question with fewer realisations; return the folder and the output."""
     folder = tmp_path_factory.mktemp("detect")
     return folder, started("detect", "-n", "100000", folder=folder).stdout
 

@@ -33,7 +33,7 @@ VERBS = {
 
 
 def full_from(step: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """A disk that is full from the so-many-th file on; the files that were tried."""
+    """Simulate a disk that is full after `step` files; return the names of the files that were tried."""
     tried: list[str] = []
     real = os.fsync
 

@@ -26,7 +26,7 @@ ROOM, SECONDS = 1 << 30, 30.0
 
 
 def many(examples: int):
-    """The same examples in every run, wherever it runs."""
+    """Return settings that give the same examples in every run."""
     return settings(
         max_examples=examples,
         derandomize=True,
@@ -55,7 +55,7 @@ def bounded_memory() -> Iterator[None]:
 
 
 def check(folder: Path, *words: str, **environment: str) -> None:
-    """The command ends as it should."""
+    """Run the command and check its exit code, message, duration and memory."""
     started, before = time.monotonic(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with mock.patch.dict(os.environ, {"MAUVECL_DATA_DIR": str(folder / "data")} | environment):
         code, out, told = ended(*words, folder=folder)
@@ -283,7 +283,7 @@ SPLICES = st.one_of(
 
 
 def spoilt(content: bytes, place: float, splice: bytes, cut: int, pack: bool) -> bytes:
-    """Some bytes of a good file taken out, others put in."""
+    """Replace some bytes of a good file."""
     at = int(place * len(content))
     found = content[:at] + splice + content[at + cut :]
     return gzip.compress(found)[: -1 if cut == 1 else None] if pack else found

@@ -26,7 +26,10 @@ COMMAND = re.compile(r"`(?:mauvecl|wsl) [^`]*`")
 
 def texts(file: Path) -> list[str]:
     """Return the text of every literal of a module except docstrings and the names of flags of fields."""
-    tree = ast.parse(file.read_text(encoding="utf-8"))
+    source = file.read_text(encoding="utf-8")
+    if "--" not in source:
+        return []
+    tree = ast.parse(source)
     documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
     docs = {
         id(node.body[0].value)

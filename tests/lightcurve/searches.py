@@ -31,7 +31,7 @@ def spectra(star, magnitude, kelvin=TEMPERATURES_K, *, part=False):
 
 
 def survey(stare, level, widths, *, star="G2V", magnitude=7.4, more=None, kelvin=10_000.0, part=False):
-    """A star's survey and templates; the only flare spectrum is of `kelvin`."""
+    """Return a star's survey and templates; the only flare spectrum is of `kelvin`."""
     quiet, flares = spectra(star, magnitude, part=part)
     _, one = spectra(star, magnitude, (kelvin,), part=part)
     templates = Templates.of(quiet, flares, TEMPERATURES_K, nuisances=frame_nuisances(quiet, stare, more))

@@ -22,7 +22,7 @@ def known() -> StarSurvey:
 
 
 def drawn(known: StarSurvey, events: list[Event], seed: int) -> np.ndarray:
-    """Sums of normal noise of covariance one, and of flares of the study's temperature."""
+    """Draw sums of normal noise with unit covariance and of flares of the study's temperature."""
     stare = known.survey.stare
     flare = coefficients(events, stare.start_s, stare.frame_s, np.array([10_000.0]))
     coefs = known.survey.components.coefficients(stare, flare)

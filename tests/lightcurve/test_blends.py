@@ -103,7 +103,7 @@ def test_what_leaves_the_stare_or_the_bank_is_not_measured(known):
 
 
 def one_flare(known, seed: int, snr: float) -> tuple[Event, list[Alarm]]:
-    """A random flare of some S/N, and what is found in its stare."""
+    """Return a random flare of the given S/N and the alarms in its stare."""
     rng = np.random.Generator(np.random.Philox([seed, int(snr)]))
     width, peak = 10 ** rng.uniform(np.log10(25), np.log10(250)), rng.uniform(2000, 3500)
     amplitude = snr / known.unit_snr / np.sqrt(0.72148 * width / 5.0)

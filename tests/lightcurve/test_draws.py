@@ -45,7 +45,7 @@ def test_frames_add_up_to_the_engines_exposures(engine: Engine, stares: Stares, 
 
 
 def recipe(components: Components, stare: Stare, flare: np.ndarray, n: int, seed: int) -> np.ndarray:
-    """A stare as one would write it down, by NumPy: the paper's counts (Gaussian photons, Poisson dark in DN)."""
+    """Draw a stare by a plain NumPy recipe: the paper's counts (Gaussian photons, Poisson dark in DN)."""
     x, rng = components.quiet, np.random.default_rng(seed)
     star_off, warm_off, warm_drift = rng.standard_normal((3, n, 1))
     shape = (n, stare.n_frames)

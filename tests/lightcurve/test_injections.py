@@ -31,7 +31,7 @@ TABLE = {10.0: (7.58, 5.43), 30.0: (4.39, 2.66), 60.0: (3.65, 1.90), 300.0: (2.9
 
 @pytest.fixture(scope="module")
 def day():
-    """The bank of the theory's table, from 30 s on, and its threshold at the rate of three points above three sigma."""
+    """Return the bank of the theory's table and its threshold at the rate of three points above three sigma."""
     # A hundred draws: 0.015 of standard error.
     bank = Bank(tuple(30.0 * 2**k for k in range(8)), ONE, DAVENPORT, 5.0, KNOWN)
     return bank, sample_rate(Search(bank, Stare.of(86_400.0)), seed=1, draws=100).threshold(
@@ -92,7 +92,7 @@ def injections():
 
 
 def pixel_injection(one, half_width, amplitude, peaks, rng, rays):
-    """Sums of frames with a flare, drawn pixel by pixel from the instrument's own means: NumPy alone."""
+    """Draw sums of frames with a flare pixel by pixel from the instrument's means, with NumPy alone."""
     quiet, (flare,) = spectra("G2V", 7.4, (10_000.0,), part=True)
     edges = np.column_stack([STARE.start_s, STARE.start_s + 5])
     shape = (STARE.n_frames, quiet.dark_dn.size)
@@ -213,7 +213,7 @@ class Kept:
 
 
 def drawn_at(injections, stares, position):
-    """What comes of a position's stares, and what was drawn of them."""
+    """Return the outcome of a position's stares and their draws."""
     asked = injections.request(position)
     held = stares.reduced(replace(asked, reduction=Kept()))
     return asked.reduction, asked.reduction.drawn(held["values"], held["glow"])

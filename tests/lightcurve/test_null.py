@@ -67,7 +67,7 @@ def test_counted_null_by_inversion():
 
 @pytest.fixture(scope="module")
 def short():
-    """A search of two sums over a stare with a gap, and its null by importance sampling."""
+    """Return a search of two sums over a stare with a gap, and its null by importance sampling."""
     stare = Stare.of(9000.0, gaps=[(4000, 5000)])
     bank = Bank((20.0, 60.0, 180.0), np.array([[1.0, 0.0], [0.8, 0.6]]), DAVENPORT, 5.0, Level(window_s=900.0))
     search = Search(bank, stare)
@@ -133,7 +133,7 @@ class TestSampled:
 
 
 def random_stare(rng):
-    """A stare with gaps, drift, jitter, a thermal cycle and variability, all drawn; and how it is searched."""
+    """Return a stare with gaps, drift, jitter, a thermal cycle and variability, all drawn, and its search."""
     duration = rng.uniform(4000, 6500)
     starts = rng.uniform(0, duration, rng.integers(0, 3))
     known_cycle = bool(rng.integers(2))

@@ -103,7 +103,7 @@ def test_bank_loses_little_in_time(level):
 
 @pytest.fixture(scope="module")
 def day():
-    """A day, and eight filters from 30 s on, a factor of two apart: the bank of the theory's table."""
+    """Return a day and the bank of the theory's table: eight filters from 30 s on, a factor of two apart."""
     return Search(Bank(tuple(30.0 * 2**k for k in range(8)), ONE, DAVENPORT, 5.0, KNOWN), Stare.of(86_400.0))
 
 

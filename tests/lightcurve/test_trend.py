@@ -112,7 +112,7 @@ def test_thresholds_allow_for_what_is_left_in():
 
 @pytest.fixture(scope="module")
 def drifting():
-    """A star whose detector warms by an unknown 0.3 deg C per hour, and its templates."""
+    """Return a star whose detector warms by an unknown 0.3 deg C per hour, and its templates."""
     stare = Stare.of(11_360.0, drifts={"temperature": 0.3})
     return survey(stare, Level(), (25.0, 60.0, 120.0), star="K2.5V", magnitude=5.0)
 

@@ -6,13 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from refusals import refused
 
+import mauvecl
 from mauvecl.answers.detection.detect import detect
-from mauvecl.cli.app import app
 from mauvecl.device.engine import Engine
 from mauvecl.host.stars.source import Source
-from mauvecl.schema.errors import InputError
 from mauvecl.study.cases import cases
 from mauvecl.study.study import Study
 
@@ -71,15 +70,14 @@ def test_the_sky_is_common_to_both_hypotheses(engine: Engine) -> None:
 
 
 @pytest.mark.parametrize("verb", ["snr", "detect", "simulate", "exposure"])
-def test_star_without_magnitude_raises(verb: str, tmp_path: Any) -> None:
-    words = ["--snr", "10", "--at", "310"] if verb == "exposure" else []
-    done = CliRunner().invoke(app, [verb, "--star", "G2V", *words, "--no-pictures", "-o", str(tmp_path / "out")])
-    message = done.stderr or str(done.exception)
-    assert done.exit_code == 2 or isinstance(done.exception, InputError)
-    assert "the library keeps it at V = 0, expected a magnitude" in message
+def test_star_without_magnitude_raises(verb: str) -> None:
+    asked = Study.build({"star": [{"library": "G2V"}], "signal": {"snr": 10, "wavelength_nm": 310}}, "test")
+    with refused("magnitude"):
+        getattr(mauvecl, verb)(asked)
 
 
-def test_limiting_magnitude_needs_no_magnitude(tmp_path: Any) -> None:
-    words = ["--star", "G2V", "-a", "0.3", "-n", "20000", "--fap", "0.01", "--statistic", "matched", "--no-pictures"]
-    done = CliRunner().invoke(app, ["limit", *words, "-o", str(tmp_path / "out"), "--json"])
-    assert done.exit_code == 0, done.output
+def test_limiting_magnitude_needs_no_magnitude(engine: Engine) -> None:
+    run = {"realisations": 20_000, "fap": 0.01, "statistics": ["matched"]}
+    asked = Study.build({"star": [{"library": "G2V"}], "flare": {"amplitudes": [0.3]}, "run": run}, "test")
+    (limit,) = mauvecl.limit(asked, engine).limits
+    assert limit.value.low < limit.value.value < limit.value.high

@@ -65,7 +65,7 @@ VERBS: dict[str, tuple[Messages, dict[str, Any]]] = {
 
 
 def question(magnitude: float, changes: dict[str, float], **sections: Any) -> Study:
-    """A hot star on a part of the pixels."""
+    """Return a study of a hot star on part of the pixels."""
     data: dict[str, Any] = {
         "star": [{"library": "A0V", "magnitude": magnitude, "distance_pc": 7.7}],
         "flare": {"amplitudes": [0.01]},
