@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.limits.assumptions import what_matters
     from mauvecl.answers.limits.limits import limit, limiting_magnitude, shortest_exposure, smallest_amplitude
     from mauvecl.answers.measurements.measure import measure
+    from mauvecl.answers.observations.analyse import analyse
     from mauvecl.answers.signal.exposures import exposure, exposure_for
     from mauvecl.answers.signal.simulate import simulate
     from mauvecl.answers.signal.snr import snr
@@ -50,6 +51,8 @@ if TYPE_CHECKING:
     from mauvecl.noise.comparison import Comparison
     from mauvecl.noise.priors import Normal, Uniform
     from mauvecl.noise.processes import CosmicRays, Processes
+    from mauvecl.observations.frames import Frames
+    from mauvecl.observations.reading import read_frames
     from mauvecl.results.detection.departures import departures
     from mauvecl.results.detection.detection import Detection
     from mauvecl.results.measurements.fit import fit, forecast
@@ -81,6 +84,7 @@ __all__ = [
     "Expectation",
     "FlareModel",
     "FlareWithLines",
+    "Frames",
     "InputError",
     "Instrument",
     "Linear",
@@ -100,6 +104,7 @@ __all__ = [
     "TableShape",
     "TwoBlackbodies",
     "Uniform",
+    "analyse",
     "bulk",
     "departures",
     "detect",
@@ -119,6 +124,7 @@ __all__ = [
     "measure",
     "measure_along",
     "plan",
+    "read_frames",
     "shortest_exposure",
     "simulate",
     "smallest_amplitude",
@@ -147,6 +153,8 @@ _HOMES = HOMES | {
     "Engine": "device.engine",
     "Event": "lightcurve.flares.events",
     "Expectation": "host.expectation",
+    "Frames": "observations.frames",
+    "read_frames": "observations.reading",
     "InputError": "schema.errors",
     "Instrument": "host.instrument.instrument",
     "Linear": "statistics.linear",

@@ -51,6 +51,7 @@ VERBS: dict[str, Verb] = {
         Verb("measure", "measurements.measure", "flares"),
         Verb("stare", "stares.stare", "stares"),
         Verb("inject", "stares.inject", "injections"),
+        Verb("analyse", "observations.analyse"),
         Verb("visible", "campaigns.visible"),
         Verb("plan", "campaigns.plan", "targets"),
     )

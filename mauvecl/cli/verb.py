@@ -95,6 +95,12 @@ def takes_study(
             given = {key: values.pop(key, None) for key in (*flags, "set")}
             if "targets" in flags and study_file is not None and not holds_study(study_file):
                 given["targets"], study_file = study_file, None
+            if "data" in flags and study_file is not None and study_file.suffix.lower() != ".toml":
+                if given["data"] is not None:
+                    raise InputError(
+                        f"{str(study_file)!r} and --data are both observed frames", "one of them", key="data"
+                    )
+                given["data"], study_file = study_file, None
             if "star" in flags and study_file is not None and is_star(study_file):
                 if given["star"]:
                     raise InputError(

@@ -12,14 +12,17 @@ from mauvecl.lightcurve.defaults import Per, per_day
 from mauvecl.lightcurve.flares.shapes import shape_of
 from mauvecl.lightcurve.search.importance_sampling import SampledRate
 from mauvecl.observations.completeness import Completeness, inject
-from mauvecl.observations.events import Event, detect_events, measure_event
+from mauvecl.observations.events import ObservedEvent, detect_events, measure_events
 from mauvecl.observations.frames import DAY_S, Frames
-from mauvecl.observations.level import Level, quiescent_level
+from mauvecl.observations.level import QuiescentLevel, quiescent_level
 from mauvecl.observations.noise import Scatter, binned_scatter
 from mauvecl.observations.search import MeasuredRate, SeriesSurvey
 from mauvecl.schema.errors import InputError
 
 Float = NDArray[np.float64]
+
+#: False alarms per star-day above which events are candidates.
+CANDIDATES = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +34,7 @@ class Analysis:
     frames : Frames
     flux, error : ndarray, shape (n_frame,)
         The light curve that was searched; of spectra, the sum over wavelength.
-    level : Level
+    level : QuiescentLevel
     survey : SeriesSurvey
     wanted : float
         Wanted false alarms per star-day.
@@ -40,9 +43,11 @@ class Analysis:
     measured : MeasuredRate
         False-alarm rate in noise resampled from quiescent frames.
     threshold : float
-        The higher of the thresholds of both.
-    events : list of Event
-        Events above the threshold, in order of time.
+        Threshold for the wanted rate: the higher of the thresholds of both.
+    candidates : float
+        Threshold for candidates.
+    events : list of ObservedEvent
+        Events above the threshold of candidates, in order of time.
     completeness : Completeness
         Share of flares that the search detects in these frames.
     scatter : list of Scatter
@@ -51,13 +56,14 @@ class Analysis:
     frames: Frames
     flux: Float
     error: Float | None
-    level: Level
+    level: QuiescentLevel
     survey: SeriesSurvey
     wanted: float
     normal: SampledRate
     measured: MeasuredRate
     threshold: float
-    events: list[Event]
+    candidates: float
+    events: list[ObservedEvent]
     completeness: Completeness
     scatter: list[Scatter]
 
@@ -66,7 +72,7 @@ class Analysis:
         """Star-days of the searched frames."""
         return self.survey.stare.observed_s / DAY_S
 
-    def false_alarms(self, event: Event) -> tuple[float, float]:
+    def false_alarms(self, event: ObservedEvent) -> tuple[float, float]:
         """Return the false alarms per star-day at an event's statistic: in normal noise, and in noise as measured."""
         try:
             normal = self.normal.rate(event.value).value
@@ -120,21 +126,32 @@ def analyse_frames(
     flux, error = white_light(frames)
     level = quiescent_level(frames, flux, error)
     survey = SeriesSurvey.of(frames, flux, error, level, shape_of(shape))
-    normal = survey.normal_rate(seed)
-    first = normal.threshold(wanted).value
+    frequent = max(wanted, CANDIDATES)
+    normal = survey.normal_rate(frequent, seed)
+    first = _threshold(normal, frequent)
     # Real flares are no noise: what exceeds the threshold of normal noise is left out of the resampled light curves.
     _, taken = detect_events(survey, first)
     measured = survey.measured_rate(level.quiet[level.used] & ~taken, wanted, seed)
-    threshold = max(first, measured.threshold(wanted))
-    detected, taken = detect_events(survey, threshold)
-    events = [measure_event(survey, taken, threshold, one) for one in detected]
+    threshold = max(_threshold(normal, wanted), measured.threshold(wanted))
+    candidates = min(max(first, measured.threshold(frequent)), threshold)
+    detected, taken = detect_events(survey, candidates)
+    events = measure_events(survey, taken, candidates, detected)
     quiet = level.quiet[level.used] & ~taken
     residual = survey.sums[:, 0] / np.sqrt(survey.variance)
     return Analysis(
-        frames, flux, error, level, survey, wanted, normal, measured, threshold, events,
+        frames, flux, error, level, survey, wanted, normal, measured, threshold, candidates, events,
         inject(survey, ~taken, threshold, seed),
         binned_scatter(survey.stare.numbers[quiet], residual[quiet]),
     )  # fmt: skip
+
+
+def _threshold(normal: SampledRate, rate: float) -> float:
+    """Return the threshold for a rate in normal noise, and the lowest that is sampled if the rate is reached there.
+
+    Few frames a day give few false alarms at any sensible threshold.
+    """
+    lowest = float(normal.thresholds[0])
+    return lowest if rate >= normal.rate(lowest).value else normal.threshold(rate).value
 
 
 def white_light(frames: Frames) -> tuple[Float, Float | None]:

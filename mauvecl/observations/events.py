@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.lightcurve.search.alarms import Alarm, alarms
+from mauvecl.lightcurve.search.bank import TAIL
 from mauvecl.observations.search import SeriesSurvey
 
 Float = NDArray[np.float64]
@@ -16,6 +17,8 @@ Kind = Literal["flare", "step"]
 
 #: Number of consecutive frames below one standard deviation that end an event.
 END_FRAMES = 3
+#: Flux of a template, in standard deviations of a frame, to which its tail belongs to the event.
+FAINT = 0.2
 #: Largest number of events, after which the light curve is declared too variable for a search.
 MAX_EVENTS = 500
 #: Share of the best template's statistic above which templates belong to the same event.
@@ -27,7 +30,7 @@ STEP_GAIN = 9.0
 
 
 @dataclass(frozen=True, eq=False)
-class Event:
+class ObservedEvent:
     """A detected event; frames are counted among the searched ones.
 
     Attributes
@@ -90,15 +93,17 @@ def detect_events(survey: SeriesSurvey, threshold: float) -> tuple[list[Detectio
         new = _search_once(survey, taken, threshold)
         if new is None:
             break
-        value, half_width, peak = new
-        first, last = _extent(survey, taken, peak, half_width)
+        value, half_width, peak, amplitude = new
+        first, last = _extent(survey, taken, peak, half_width, amplitude)
         found.append(Detection(value, half_width, first, last))
         taken[first : last + 1] = True
     return sorted(found, key=lambda one: one.first), taken
 
 
-def _search_once(survey: SeriesSurvey, taken: NDArray[np.bool_], threshold: float) -> tuple[float, float, int] | None:
-    """Return statistic, half-width and brightest frame of the best template among frames that are left."""
+def _search_once(
+    survey: SeriesSurvey, taken: NDArray[np.bool_], threshold: float
+) -> tuple[float, float, int, float] | None:
+    """Return statistic, half-width, brightest frame and amplitude of the best template among frames that are left."""
     left = np.flatnonzero(~taken)
     if left.size < 3:
         return None
@@ -111,21 +116,27 @@ def _search_once(survey: SeriesSurvey, taken: NDArray[np.bool_], threshold: floa
     near = np.flatnonzero(np.abs(part.stare.middle_s - best.peak_s[0]) <= half_width + part.stare.frame_s)
     if not near.size:
         near = np.array([int(np.argmin(np.abs(part.stare.middle_s - best.peak_s[0])))])
-    return value, half_width, int(left[near[np.argmax(part.sums[near, 0])]])
+    return value, half_width, int(left[near[np.argmax(part.sums[near, 0])]]), float(best.amplitude[0])
 
 
-def _extent(survey: SeriesSurvey, taken: NDArray[np.bool_], peak: int, half_width: float) -> tuple[int, int]:
+def _extent(
+    survey: SeriesSurvey, taken: NDArray[np.bool_], peak: int, half_width: float, amplitude: float
+) -> tuple[int, int]:
     """Return the first and last frame of an event.
 
-    It includes half of a half-width of the best template before the brightest frame and a whole one after it, and ends
-    where the flux stays within the noise for several frames, at a gap, or at another event.
+    It includes half of a half-width of the best template before the brightest frame, and after it at least a whole one
+    and the tail of the template above `FAINT` standard deviations. It ends where the flux stays within the noise for
+    several frames, at a gap, or at another event.
     """
     sigma = survey.sums[:, 0] / np.sqrt(survey.variance)
     numbers = survey.stare.numbers
     frames = half_width / survey.stare.frame_s
+    tau = np.linspace(0.0, TAIL, 400)
+    bright = tau[amplitude * survey.bank.shape.at(tau) > FAINT * np.sqrt(survey.variance[peak])]
+    tail = max(1.0, float(bright[-1]) if bright.size else 0.0)
 
     def end(step: int) -> int:
-        least = frames if step > 0 else frames / 2
+        least = frames * tail if step > 0 else frames / 2
         last, quiet, at = peak, 0, peak + step
         while 0 <= at < sigma.size and not taken[at]:
             inside = abs(int(numbers[at]) - int(numbers[peak])) <= least
@@ -142,7 +153,23 @@ def _extent(survey: SeriesSurvey, taken: NDArray[np.bool_], peak: int, half_widt
     return end(-1), end(1)
 
 
-def measure_event(survey: SeriesSurvey, taken: NDArray[np.bool_], threshold: float, found: Detection) -> Event:
+def measure_events(
+    survey: SeriesSurvey, taken: NDArray[np.bool_], threshold: float, found: list[Detection]
+) -> list[ObservedEvent]:
+    """Measure detected events in order of time; `taken` are their frames.
+
+    The level follows a step with a delay: what adjoins a step and is weaker belongs to it.
+    """
+    events = [measure_event(survey, taken, threshold, one) for one in found]
+    for k, event in enumerate(events):
+        ends = (event.first - 1, event.last + 1)
+        sides = [each for each in events[max(0, k - 1) : k + 2] if each.last == ends[0] or each.first == ends[1]]
+        if any(each.kind == "step" and each.value > event.value for each in sides):
+            events[k] = replace(event, kind="step", components=[])
+    return events
+
+
+def measure_event(survey: SeriesSurvey, taken: NDArray[np.bool_], threshold: float, found: Detection) -> ObservedEvent:
     """Measure a detected event; `taken` are the frames of all events."""
     value, half_width, first, last = found.value, found.half_width_s, found.first, found.last
     rows = slice(first, last + 1)
@@ -173,7 +200,7 @@ def measure_event(survey: SeriesSurvey, taken: NDArray[np.bool_], threshold: flo
         for c in components
         if c.measured and middle[0] - half_width <= c.recovered.peak_s[0] <= middle[1] + half_width
     ]
-    return Event(
+    return ObservedEvent(
         value, first, last, brightest, half_width, float(flux.max()) / survey.level, total, error, missing, cut, kind,
         inside,
     )  # fmt: skip

@@ -28,7 +28,7 @@ MEDIAN_S = 0.3 * DAY_S
 
 
 @dataclass(frozen=True, eq=False)
-class Level:
+class QuiescentLevel:
     """Quiescent level and noise of a light curve.
 
     Attributes
@@ -58,7 +58,7 @@ class Level:
         return np.asarray(self.reasons == 0)
 
 
-def quiescent_level(frames: Frames, flux: Float, error: Float | None, median_s: float = MEDIAN_S) -> Level:
+def quiescent_level(frames: Frames, flux: Float, error: Float | None, median_s: float = MEDIAN_S) -> QuiescentLevel:
     """Estimate level and noise of a light curve, and flag frames that cannot be part of a flare.
 
     Parameters
@@ -99,7 +99,7 @@ def quiescent_level(frames: Frames, flux: Float, error: Float | None, median_s: 
     reasons |= np.where(finite & (np.where(finite, flux, 0.0) - level < -FAR * noise), Reason.BELOW, 0)
     fine = reasons == 0
     reasons |= np.where(_spikes(frames, sigmas, fine, flux, level), Reason.SPIKE, 0)
-    return Level(level, noise, excess, quiet & (reasons == 0), reasons)
+    return QuiescentLevel(level, noise, excess, quiet & (reasons == 0), reasons)
 
 
 def _running(frames: Frames, values: Float, chosen: NDArray[np.bool_], width: int) -> Float:
@@ -107,7 +107,7 @@ def _running(frames: Frames, values: Float, chosen: NDArray[np.bool_], width: in
     at = np.flatnonzero(chosen)
     if at.size <= width:
         return np.full(values.size, float(np.median(values[at])))
-    smooth = scipy.ndimage.median_filter(values[at], size=width, mode="nearest")
+    smooth = scipy.ndimage.median_filter(values[at], size=width, mode="reflect")
     return np.asarray(np.interp(frames.time_s, frames.time_s[at], smooth))
 
 

@@ -19,7 +19,7 @@ from mauvecl.lightcurve.stares.stare import Stare
 if TYPE_CHECKING:
     from mauvecl.lightcurve.flares.shapes import Shape
     from mauvecl.observations.frames import Frames
-    from mauvecl.observations.level import Level as QuiescentLevel
+    from mauvecl.observations.level import QuiescentLevel
 
 Float = NDArray[np.float64]
 
@@ -33,6 +33,9 @@ WINDOW_FRAMES, WINDOW_S = 120, 1800.0
 MIN_ALARMS, MAX_RESAMPLED = 30, 20_000
 #: Largest number of values in all resampled light curves.
 MAX_VALUES = 2**26
+#: Expected number of false alarms at the largest rate of interest in the part of the light curve that importance
+#: sampling uses, and the smallest number of its frames.
+SAMPLED_ALARMS, MIN_SAMPLED = 0.6, 200
 #: Temperature that stands for flares in a light curve without colour, K.
 NO_COLOUR_K = 10_000.0
 #: Smallest number of quiescent frames of a window whose residuals are resampled.
@@ -173,9 +176,18 @@ class SeriesSurvey:
         part = replace(stare, **{name: getattr(stare, name)[kept] for name in names})
         return replace(self, stare=part, sums=self.sums[kept], variance=self.variance[kept], time_s=self.time_s[kept])
 
-    def normal_rate(self, seed: int) -> SampledRate:
-        """Return the false-alarm rate in normal noise of the measured variance."""
-        return sample_rate(self.search, seed=seed)
+    def normal_rate(self, rate: float, seed: int) -> SampledRate:
+        """Return the false-alarm rate in normal noise of the measured variance.
+
+        Parameters
+        ----------
+        rate : float
+            Largest rate of interest, false alarms per star-day: importance sampling uses a part of the light curve
+            that is short enough for it.
+        seed : int
+        """
+        count = max(MIN_SAMPLED, int(SAMPLED_ALARMS / rate * DAY_S / self.stare.frame_s))
+        return sample_rate(self.frames(np.arange(self.stare.n_frames) < count).search, seed=seed)
 
     def measured_rate(self, quiet: NDArray[np.bool_], rate: float, seed: int) -> MeasuredRate:
         """Return the false-alarm rate in light curves resampled from quiescent residuals.

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 #: Parts of a study that answers use.
-Use = Literal["instrument", "sky", "flare", "orbit", "unknowns", "seed"]
+Use = Literal["instrument", "sky", "flare", "orbit", "unknowns", "templates", "seed"]
 
 
 def assumption_line(study: Study, uses: Collection[Use], varied: Collection[str] = ()) -> str:
@@ -30,6 +30,7 @@ def assumption_line(study: Study, uses: Collection[Use], varied: Collection[str]
         "flare": lambda: _flare(study, swept),
         "orbit": lambda: _orbit(study),
         "unknowns": lambda: _unknowns(study),
+        "templates": lambda: f"flares of the shape {study.search.shape}; noise as measured",
         "seed": lambda: f"seed {study.run.seed}",
     }
     return f"Assumed: {'; '.join(words[use]() for use in words if use in uses)}."

@@ -15,6 +15,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import AnyUnit
 from mauvecl.schema.records import input_error
 from mauvecl.schema.text import shortened
+from mauvecl.study.data import DataChoice, drop_default_data, resolve_data_paths
 from mauvecl.study.flare_light import drop_default_spectrum, resolve_spectrum_paths
 from mauvecl.study.measurements import MeasureQuestion, drop_default_measure
 from mauvecl.study.nuisances import NuisanceChoice
@@ -77,6 +78,7 @@ class Study(Section):
     orbit: OrbitQuestion = OrbitQuestion()
     plan: PlanQuestion = PlanQuestion()
     measure: MeasureQuestion = MeasureQuestion()
+    data: DataChoice = DataChoice()
 
     @model_validator(mode="after")
     def _one_photosphere(self) -> Self:
@@ -120,6 +122,7 @@ class Study(Section):
                 one["file"] = str(path.parent / one["file"])
         resolve_stare_paths(data, path.parent)
         resolve_plan_paths(data, path.parent)
+        resolve_data_paths(data, path.parent)
         resolve_spectrum_paths(data, path.parent)
         return cls.build(data, path.name)
 
@@ -187,6 +190,7 @@ class Study(Section):
         drop_default_search(data, self)
         drop_default_plan(data, self)
         drop_default_measure(data, self.measure)
+        drop_default_data(data, self)
         drop_default_spectrum(data, self.flare.spectrum)
         for section in ("processes", "campaign"):
             if not data[section]:

@@ -7,6 +7,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from commands import run
 from marks import long_but
@@ -37,6 +38,7 @@ ASKED = {
     "plan": ("targets.csv --days 3 --completeness 'closed form' --report html",
              "instrument mauve, detector at 21 deg C; " + FLARE + "orbit of embedded elements; "
              "least angles: Earth's limb 25 deg, Sun 46 deg, Moon 25 deg; seed 1"),
+    "analyse": ("frames.csv --mapping mapping.toml", "flares of the shape davenport2014; noise as measured; seed 1"),
     "measure": ("--star G2V -m 7.4 --set measure.fits=100", USUAL + FLARE + REST),
     "realise": ("--star G2V -m 7.4 -n 10 --output r.zarr", USUAL + FLARE + REST),
 }  # fmt: skip
@@ -52,6 +54,9 @@ def verbs() -> list[str]:
 def test_every_verb_says_what_it_assumed(verb: str, tmp_path: Path) -> None:
     flags, expected = ASKED[verb]
     (tmp_path / "targets.csv").write_text("name\neps Eri\n")
+    light = np.random.default_rng(1).normal(100, 1, 200)
+    (tmp_path / "frames.csv").write_text("t,f\n" + "".join(f"{600 * k},{f:.3f}\n" for k, f in enumerate(light)))
+    (tmp_path / "mapping.toml").write_text('time = "t"\ntime_unit = "s"\nflux = "f"\n')
     pictures = () if verb == "realise" else ("--no-pictures",)
     words = (verb, *shlex.split(flags), *pictures)
     lines = run(*words, folder=tmp_path).stdout.splitlines()

@@ -1,0 +1,1 @@
+"""What observed frames hold: flares, their false alarms, and what is excluded."""

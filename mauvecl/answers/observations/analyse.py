@@ -1,0 +1,285 @@
+"""The flares in observed frames, with their false-alarm rates and what is excluded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from mauvecl.answers.answer import Answer
+from mauvecl.observations.analysis import Analysis, analyse_frames
+from mauvecl.observations.events import ObservedEvent
+from mauvecl.observations.frames import DAY_S, Frames, Reason
+from mauvecl.observations.reading import read_frames
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import Column, View, interval, number, percent, table_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from astropy.table import QTable, Table
+
+    from mauvecl.device.engine import Engine
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.runs.pool import Pool
+    from mauvecl.study.assumptions import Use
+    from mauvecl.study.study import Study
+
+
+@dataclass(frozen=True, eq=False)
+class EventRow:
+    """An event with the analysis that it belongs to."""
+
+    analysis: Analysis
+    event: ObservedEvent
+
+    def time_d(self, frame: int) -> float:
+        """Return the time of a searched frame, in days."""
+        return float(self.analysis.survey.time_s[frame]) / DAY_S
+
+    @property
+    def date(self) -> str:
+        """Date of the brightest frame."""
+        return self.analysis.frames.date(float(self.analysis.survey.time_s[self.event.brightest]))
+
+    @property
+    def duration_d(self) -> float:
+        """Time from the start of the first frame to the end of the last."""
+        first, last = (self.time_d(k) for k in (self.event.first, self.event.last))
+        return last - first + self.analysis.frames.cadence_s / DAY_S
+
+    @property
+    def significant(self) -> bool:
+        """True if noise reaches the statistic at most as often as the study allows."""
+        return self.event.value >= self.analysis.threshold
+
+    @property
+    def rates(self) -> tuple[float, float]:
+        """False alarms per star-day, in normal noise and in noise as measured."""
+        return self.analysis.false_alarms(self.event)
+
+    @property
+    def probability(self) -> float:
+        """Probability of such an event from noise anywhere in the searched frames."""
+        return float(-np.expm1(-max(self.rates) * self.analysis.days))
+
+    @property
+    def half_width_s(self) -> float:
+        """Half-width of the largest fitted flare; NaN if none is measured."""
+        found = self.event.components
+        return float(found[0].recovered.half_width_s[0]) if found else float("nan")
+
+    @property
+    def fitted_s(self) -> tuple[float, float, float]:
+        """Equivalent duration of the fitted flares, and the ends of its 68 % interval if there is a single one."""
+        found = self.event.components
+        if not found:
+            return (float("nan"),) * 3
+        total = float(sum(one.recovered.equivalent_duration_s[0] for one in found))
+        return (total, *(found[0].intervals["equivalent_duration_s"] if len(found) == 1 else (float("nan"),) * 2))
+
+    @property
+    def note(self) -> str:
+        """Statements about the event that a reader must know."""
+        event = self.event
+        notes = [] if event.kind == "flare" else ["a step of the level fits better than a flare"]
+        notes += ["it begins before or ends after the frames"] if event.cut else []
+        frames = "1 missing frame is" if event.missing == 1 else f"{event.missing} missing frames are"
+        notes += [f"{frames} interpolated"] if event.missing else []
+        if event.components and event.components[0].p_value < 1e-3:
+            notes.append("the shape of the templates does not fit it")
+        return "; ".join(notes)
+
+
+def _rate(value: float) -> str:
+    return f"{value:.1e}" if value < 0.01 else f"{value:.2g}"
+
+
+#: Columns of the table of events; names as in AltaiPony's flare tables where it has the quantity.
+EVENTS = (
+    Column("date", description="of the brightest frame, in the time scale of the file", heading="brightest at",
+           format=lambda text: text[:22], kind=str),
+    Column("tstart", lambda row: row.time_d(row.event.first), "d", "middle of the first frame, from time zero"),
+    Column("tpeak", lambda row: row.time_d(row.event.brightest), "d", "middle of the brightest frame"),
+    Column("tstop", lambda row: row.time_d(row.event.last), "d", "middle of the last frame"),
+    Column("istart", lambda row: row.event.first, "", "first frame, counted among the searched frames", kind=int),
+    Column("istop", lambda row: row.event.last, "", "last frame, inclusive", kind=int),
+    Column("dur", "duration_d", "d", "from the start of the first frame to the end of the last", "duration (min)",
+           lambda days: f"{1440 * days:.3g}"),
+    Column("ampl_rec", "event.amplitude", "", "largest flux above the level, relative to the level", "peak",
+           percent(".3g")),
+    Column("ed_rec", "event.equivalent_duration_s", "s", "equivalent duration: sum of the flux above the level over "
+           "the event, relative to the level; misses the faint tail of a flare", "ED (s)", number(".4g")),
+    Column("ed_rec_err", "event.equivalent_duration_error_s", "s", "its standard error", "error (s)", number(".2g")),
+    Column("ed_fit", lambda row: row.fitted_s[0], "s", "equivalent duration of the flares fitted to it; nan: none",
+           "ED by fit (s)", number(".4g")),
+    Column("ed_fit_low", lambda row: row.fitted_s[1], "s", "lower end of its 68 % interval; nan: several flares"),
+    Column("ed_fit_high", lambda row: row.fitted_s[2], "s", "upper end"),
+    Column("half_width", "half_width_s", "s", "t_1/2 of the largest flare fitted to it; nan: none", "half-width (s)",
+           number(".3g")),
+    Column("components", lambda row: len(row.event.components), "", "flares fitted together", kind=int),
+    Column("value", "event.value", "", "statistic of the search: S/N of the best template", "S/N", number(".4g")),
+    Column("rate_normal", lambda row: row.rates[0], "1 / d", "false alarms per star-day above this statistic in "
+           "normal noise"),
+    Column("rate_measured", lambda row: row.rates[1], "1 / d", "the same in noise resampled from quiescent frames; an "
+           "upper limit if none reaches it"),
+    Column("probability", "probability", "", "probability of such an event from noise anywhere in these frames, by "
+           "the larger rate", "from noise", _rate),
+    Column("significant", "significant", "", "whether the rate is at most the wanted one", "detected",
+           lambda value: "yes" if value else "candidate", kind=bool),
+    Column("kind", "event.kind", "", "flare, or step of the level", "kind", kind=str),
+    Column("note", "note", "", "what is special", kind=str),
+)  # fmt: skip
+#: Columns of the table of frames, one row for all frames of an analysis.
+FRAMES = (
+    Column("time", lambda one: one.frames.time_s / DAY_S, "d", "middle of the frame, from time zero"),
+    Column("flux", "flux", "", "light in the unit of the file; of spectra, the sum over wavelength"),
+    Column("level", "level.level", "", "quiescent level"),
+    Column("error", "level.error", "", "standard deviation of a quiescent frame"),
+    Column("reason", lambda one: np.array([Reason.words(int(value)) for value in one.level.reasons]), "",
+           "why the frame is not searched; empty if it is"),
+)  # fmt: skip
+#: Columns of the completeness, one row per half-width and equivalent duration.
+COMPLETENESS = (
+    Column("half_width", lambda one: np.repeat(one.completeness.half_widths_s, one.completeness.detected.shape[1]), "s",
+           "t_1/2 of the injected flares"),
+    Column("equivalent_duration", lambda one: one.completeness.equivalent_durations_s.ravel(), "s",
+           "of the injected flares"),
+    Column("injected", lambda one: one.completeness.injected, "", "number of injections"),
+    Column("detected", lambda one: one.completeness.detected.ravel(), "", "number that the search detects"),
+)  # fmt: skip
+#: Columns of the limits, one row per half-width.
+LIMITS = (
+    Column("half_width", lambda one: one.completeness.half_widths_s, "s", "t_1/2 of the flares", "half-width (s)",
+           number(".3g")),
+    Column("limit", lambda one: np.array([one.completeness.limit(k) for k in range(len(one.completeness.detected))]),
+           "s", "equivalent duration of flares that are detected with a probability of 90 %; nan: above the largest "
+           "injected", "ED detected at 90 % (s)", number(".4g", "not reached")),
+)  # fmt: skip
+#: Columns of the noise, one row per number of frames.
+NOISE = (
+    Column("frames", "frames", "", "frames in a mean", "frames in a mean", kind=int),
+    Column("count", "count", "", "number of means", "means", kind=int),
+    Column("measured", "measured", "", "standard deviation of the means, in units of the noise of one frame",
+           "scatter", number(".3g")),
+    Column("white", "white", "", "the same for independent frames", "independent", number(".3g")),
+    Column("low", "low", "", "lower end of the range of 95 % of light curves of independent frames",
+           "95 % of independent", interval(".3g"), ("high",)),
+    Column("high", "high", "", "upper end"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class AnalyseAnswer(Answer):
+    """Answer of `analyse`.
+
+    Attributes
+    ----------
+    study : Study
+        Its sections `data` and `search`.
+    analysis : Analysis
+    """
+
+    USES: ClassVar[tuple[Use, ...]] = ("templates", "seed")
+    JSON: ClassVar = {"events": "events", "limits": "limits", "noise": "noise"}
+
+    study: Study
+    analysis: Analysis
+
+    @property
+    def messages(self) -> list[str]:
+        return self.analysis.messages
+
+    @cached_property
+    def events(self) -> QTable:
+        """One row per event, in order of time."""
+        frames = self.analysis.frames
+        about = {"star": frames.name, "time_scale": frames.scale, "position": frames.position, "unit": frames.unit,
+                 "time_zero_mjd": frames.reference_mjd, "threshold": self.analysis.threshold}  # fmt: skip
+        rows = [EventRow(self.analysis, event) for event in self.analysis.events]
+        return table_of(EVENTS, rows, study=self.study.text(), **about)
+
+    @property
+    def frames(self) -> QTable:
+        """One row per frame: flux, level, noise, and why it is not searched."""
+        return table_of(FRAMES, [self.analysis], star=self.analysis.frames.name, unit=self.analysis.frames.unit)
+
+    @property
+    def completeness(self) -> QTable:
+        """One row per half-width and size of injected flares."""
+        return table_of(COMPLETENESS, [self.analysis], threshold=self.analysis.threshold)
+
+    @property
+    def limits(self) -> QTable:
+        """One row per half-width: the smallest flare that the search detects with a probability of 90 %."""
+        return table_of(LIMITS, [self.analysis])
+
+    @property
+    def noise(self) -> QTable:
+        """One row per number of frames: scatter of their means."""
+        return table_of(NOISE, self.analysis.scatter)
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """Events, frames, completeness, limits and noise."""
+        return {"events": self.events, "frames": self.frames, "completeness": self.completeness,
+                "limits": self.limits, "noise": self.noise}  # fmt: skip
+
+    @property
+    def views(self) -> list[View]:
+        one = self.analysis
+        wanted = f"{one.wanted:.3g} false alarms per star-day"
+        title = (
+            f"Events in {one.days:.3g} star-days of {one.frames.name}; detected above {one.threshold:.2f} ({wanted}), "
+            f"candidates above {one.candidates:.2f}"
+        )
+        nothing = f"Nothing above {one.candidates:.2f} in {one.days:.3g} star-days of {one.frames.name} ({wanted})."
+        return [
+            View(title, EVENTS, self.events) if one.events else View(nothing),
+            View("Smallest flares that would have been detected, by injecting into these frames", LIMITS, self.limits),
+            View("Noise of quiescent frames", NOISE, self.noise),
+        ]
+
+    @property
+    def remarks(self) -> list[str]:
+        rows = [EventRow(self.analysis, event) for event in self.analysis.events]
+        return [f"{row.date[:19]}: {row.note}." for row in rows if row.note]
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        """No expectations: the noise is measured."""
+        return []
+
+
+@public
+def analyse(
+    study: Study,
+    engine: Engine | Pool | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    frames: Frames | None = None,
+) -> AnalyseAnswer:
+    """Find the flares in observed frames, with false-alarm rates from the noise as measured.
+
+    Parameters
+    ----------
+    study : Study
+        Its sections `data` and `search`: `data.file` is read, `search.false_alarms` are allowed for a detection.
+        Fainter events are candidates, down to one false alarm per star-day.
+    engine, progress : optional
+        Not used: nothing is drawn on a device.
+    frames : Frames, optional
+        Frames in memory, in place of the file.
+    """
+    if frames is None:
+        if study.data.file is None:
+            raise InputError("no observed frames are given", "data.file, or frames", key="data.file")
+        frames = read_frames(study.data.file, study.data.mapping)
+    search = study.search
+    analysis = analyse_frames(
+        frames, false_alarms=search.false_alarms, per=search.per, shape=search.shape, seed=study.run.seed
+    )
+    return AnalyseAnswer(study, analysis)

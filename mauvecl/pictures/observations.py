@@ -1,0 +1,71 @@
+"""Pictures of observed frames: the light curve with its events, and the noise."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mauvecl.pictures.registry import picture_of
+from mauvecl.pictures.style import COLOURS, NULL, headline, styled_picture
+
+if TYPE_CHECKING:
+    from mauvecl.answers.observations.analyse import AnalyseAnswer
+
+#: Flux in standard deviations above which the light curve has a second panel near the level.
+BRIGHT = 30.0
+
+
+@picture_of("AnalyseAnswer", "light-curve")
+@styled_picture
+def observed_light_curve(plt: Any, answer: AnalyseAnswer) -> Any:
+    """Plot the observed light curve with its level, events, and frames that are not searched.
+
+    If there are bright events, a second panel shows the part near the level.
+    """
+    one = answer.analysis
+    time = (one.frames.time_s - one.frames.time_s[0]) / 60.0
+    used = one.level.used
+    finite = np.isfinite(one.flux)
+    bright = bool((one.survey.sums > BRIGHT).any())
+    figure, axes = plt.subplots(1 + bright, 1, figsize=(7.2, 2.9 + 1.8 * bright), sharex=True, squeeze=False)
+    for axis in axes[:, 0]:
+        axis.plot(time[used], one.flux[used], ".", markersize=3, color="black", alpha=0.7)
+        axis.plot(time, one.level.level, color=NULL, linewidth=0.8)
+        left_out = ~used & finite
+        axis.plot(time[left_out], one.flux[left_out], "x", markersize=5, color=COLOURS[1])
+        for event in one.events:
+            found = event.value >= one.threshold
+            first, last = ((one.survey.time_s[k] - one.frames.time_s[0]) / 60.0 for k in (event.first, event.last))
+            axis.axvspan(first, last, color=COLOURS[0] if found else NULL, alpha=0.2, linewidth=0)
+        axis.set_ylabel(f"flux ({one.frames.unit})" if one.frames.unit else "flux")
+    if bright:
+        axes[1, 0].set_ylim(
+            float(np.min((one.level.level - 6 * one.level.error)[used])),
+            float(np.max((one.level.level + BRIGHT / 2 * one.level.error)[used])),
+        )
+    else:
+        axes[0, 0].set_ylim(
+            float(np.min(one.flux[used] - one.level.error[used])), float(np.max(one.flux[used] + one.level.error[used]))
+        )
+    axes[-1, 0].set_xlabel(f"time (min) from {one.frames.date(float(one.frames.time_s[0]))[:19]}")
+    headline(figure, f"{one.frames.name}: events above {one.threshold:.2f} (blue) and candidates (grey)")
+    return figure
+
+
+@picture_of("AnalyseAnswer", "noise", when=lambda answer: len(answer.analysis.scatter) > 1)
+@styled_picture
+def observed_noise(plt: Any, answer: AnalyseAnswer) -> Any:
+    """Plot the scatter of means of quiescent frames against their number, and that of independent frames."""
+    rows = answer.analysis.scatter
+    figure, axis = plt.subplots(figsize=(4.6, 3.2))
+    frames = np.array([row.frames for row in rows])
+    axis.fill_between(frames, [row.low for row in rows], [row.high for row in rows], color=NULL, alpha=0.4, linewidth=0)
+    axis.plot(frames, [row.white for row in rows], color=NULL)
+    axis.plot(frames, [row.measured for row in rows], "o-", color=COLOURS[0], markersize=4)
+    axis.set_xscale("log", base=2)
+    axis.set_yscale("log")
+    axis.set_xlabel("frames in a mean")
+    axis.set_ylabel("scatter (noise of one frame)")
+    headline(figure, f"{answer.analysis.frames.name}: quiescent frames; grey: independent, 95 %")
+    return figure
