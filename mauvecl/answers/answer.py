@@ -1,4 +1,4 @@
-"""What all answers have in common: study, messages, inputs, tables, pictures, files."""
+"""Base class of answers: study, messages, inputs, tables, pictures and files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class InCell:
-    """One star in one cell of the sweep."""
+    """A star in a cell of the sweep."""
 
     label: str
     at: Mapping[str, float | str]
@@ -51,11 +51,11 @@ class Answer(Drawable, ContentEquality, ABC):
 
         @property
         def study(self) -> Study:
-            """The study that gives it again."""
+            """The study that was asked."""
 
         @property
         def messages(self) -> Sequence[str]:
-            """What the reader must be told, worst first."""
+            """Messages for the reader, the most severe first."""
 
     @property
     @abstractmethod
@@ -65,11 +65,11 @@ class Answer(Drawable, ContentEquality, ABC):
     @property
     @abstractmethod
     def inputs(self) -> list[Expectation]:
-        """Expectations that it rests on, for the record of a run."""
+        """Expectations on which the answer rests, for the run record."""
 
     @property
     def assumed(self) -> str:
-        """One line with what the study assumes of the parts that the answer uses."""
+        """One line with the study's assumptions about the parts that the answer uses."""
         from mauvecl.study.assumptions import assumption_line
 
         return assumption_line(self.study, self.USES)
@@ -81,7 +81,7 @@ class Answer(Drawable, ContentEquality, ABC):
 
     @property
     def remarks(self) -> list[str]:
-        """What is said below the tables."""
+        """Remarks below the tables."""
         return []
 
     def _line(self) -> str:
@@ -97,12 +97,9 @@ class Answer(Drawable, ContentEquality, ABC):
         return {"messages": list(self.messages)} | {key: records(table) for key, table in found.items()}
 
     def write(self, folder: str | Path) -> list[Path]:
-        """Every table, and the study that gives them again.
+        """Write every table and the study, and return their paths.
 
-        Raises
-        ------
-        InputError
-            If one cannot be written; what was at its place is still there.
+        Raises InputError if a file cannot be written; an earlier file of that name is then unchanged.
         """
         from mauvecl.answers.report import make_folder, write_document, write_study, write_table
 

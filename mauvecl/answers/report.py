@@ -98,7 +98,7 @@ def _words(column: Any) -> list[str] | None:
 
 
 def _quoted(word: str) -> str:
-    """In quotes where a row would be read otherwise, as `csv` does it."""
+    """Quote a word if necessary, by the rules of `csv`."""
     line = io.StringIO()
     csv.writer(line, delimiter=" ", lineterminator="").writerow([word, "end"])
     return line.getvalue().removesuffix(" end") or '""'
@@ -193,7 +193,7 @@ def write_record(
 
 
 def _left_by_another(folder: Path) -> list[Path]:
-    """Files that the record in a folder names, as they were written then."""
+    """Return the files of the record in a folder that are unchanged."""
     try:
         named = json.loads(read_text(folder / RECORD, "run record")).get("files", {})
         files = [(folder / name, digest) for name, digest in named.items() if Path(name).name == name]
@@ -204,13 +204,13 @@ def _left_by_another(folder: Path) -> list[Path]:
 
 
 def write_json(content: Any, path: Path) -> Path:
-    """Anything plain as JSON; errors as `write_table`."""
+    """Write plain data as JSON; errors as for `write_table`."""
     write_whole(path, (json_text(content) + "\n").encode())
     return path
 
 
 def json_text(content: Any) -> str:
-    """Anything plain as JSON: null where there is no number, for JSON has none that is not one."""
+    """Return plain data as JSON text, with null for NaN and infinity."""
     return json.dumps(_finite(content), indent=2, default=str, allow_nan=False)
 
 

@@ -28,7 +28,7 @@ def light_curves(plt: Any, one: StarStare) -> Any:
 
     Dotted lines are injected flares, triangles detections.
     """
-    from mauvecl.answers.stares.stare import Searched
+    from mauvecl.answers.stares.stare import SearchResult
 
     stare, light = one.staring.stare, one.light
     scale, unit = _time(stare.duration_s)
@@ -47,8 +47,8 @@ def light_curves(plt: Any, one: StarStare) -> Any:
             axis.plot(time / scale, mean / level[k], color=NULL, linewidth=0.8)
         for flare in one.flares:
             axis.axvline(flare.event.peak_s / scale, color=NULL, linewidth=0.5, linestyle=":")
-        if isinstance(one.searched, Searched):
-            peaks = [float(alarm.recovered.peak_s[0]) / scale for alarm in one.searched.alarms if alarm.measured]
+        if isinstance(one.search, SearchResult):
+            peaks = [float(alarm.recovered.peak_s[0]) / scale for alarm in one.search.alarms if alarm.measured]
             top = [1.0] * len(peaks)
             axis.plot(peaks, top, "v", color=COLOURS[4], markersize=4, transform=axis.get_xaxis_transform())
         axis.set_title(light.bands[k])

@@ -20,7 +20,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Protocol, Self
 
 import numpy as np
 
@@ -34,7 +34,6 @@ from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.results.sums import Arrays
-    from mauvecl.study.study import Study
 
 FOLDER, MANIFEST = "checkpoint", "manifest.json"
 #: Names of shards: fingerprint, part, start, count.
@@ -42,6 +41,13 @@ SHARD_NAME = re.compile(r"[0-9a-f]{32}-[0-9]+-[0-9]+-[0-9]+\.npz")
 #: Time before the first shard is written, s, so that short runs write no files.
 PATIENCE_S = 20.0
 DIGEST_BYTES = 32
+
+
+class Question(Protocol):
+    """What a checkpoint needs of a study."""
+
+    def toml(self) -> str:
+        """Return the study as TOML."""
 
 
 class Checkpoint:
@@ -74,7 +80,7 @@ class Checkpoint:
         self,
         folder: Path,
         verb: str,
-        study: Study,
+        study: Question,
         *,
         resume: bool = False,
         restart: bool = False,

@@ -23,7 +23,6 @@ from mauvecl.store.form import Store, StoredScene
 if TYPE_CHECKING:
     from astropy.io.fits import BinTableHDU, HDUList, ImageHDU
 
-    from mauvecl.study.study import Study
 
 #: Largest size of the spectra in a file, bytes; larger sets belong in a store.
 MAX_BYTES = 4 * 2**30
@@ -151,15 +150,15 @@ def _fits(selection: Selection) -> HDUList:
         here = [scene for scene in selection.scenes if scene.group == group]
         table = _calibration(here[0])
         parts += [*(_image(selection, scene, table.name) for scene in here), table]
-    return fits.HDUList([primary, *parts, _study(store.study)])
+    return fits.HDUList([primary, *parts, _study(store.study.toml())])
 
 
-def _study(study: Study) -> BinTableHDU:
+def _study(text: str) -> BinTableHDU:
     """Make a table of a study's lines, which may exceed the 72 characters of a FITS card."""
     from astropy.io import fits
 
     # FITS is restricted to ASCII; TOML strings accept escapes of other characters.
-    lines = [re.sub(r"[^\x00-\x7f]", _escaped, line) for line in study.toml().splitlines()]
+    lines = [re.sub(r"[^\x00-\x7f]", _escaped, line) for line in text.splitlines()]
     column = fits.Column("LINE", f"{max(map(len, lines))}A", array=lines)
     return fits.BinTableHDU.from_columns([column], name="STUDY")
 

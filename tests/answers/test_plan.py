@@ -13,7 +13,7 @@ from mauvecl import Study, plan
 from mauvecl.answers.campaigns.plan import PlanAnswer
 from mauvecl.answers.campaigns.plan_text import target_lines
 from mauvecl.answers.campaigns.planned import TargetObservation
-from mauvecl.answers.campaigns.planned_injections import question_of
+from mauvecl.answers.campaigns.planned_injections import injection_case
 from mauvecl.answers.report import write_study, write_table
 from mauvecl.lightcurve.flares.energies import EnergyScale, quiescent_luminosity
 from mauvecl.lightcurve.flares.rates import davenport2019
@@ -219,7 +219,7 @@ def test_conditions_are_those_of_stares_along_the_orbit() -> None:
     assert observed.conditions.temperature_c == pytest.approx(along.stare.temperature_c.mean(), abs=0.2)
     assert observed.hits_per_cm2_s == pytest.approx(along.mean_hits_per_cm2_s, rel=1e-9)
     assert observed.quiet.conditions["temperature_c"] == observed.conditions.temperature_c
-    injected = question_of(observed)
+    injected = injection_case(observed).study
     stare = Case(injected).stare
     assert 13 < stare.temperature_c.min() < stare.temperature_c.mean() - 0.5 < stare.temperature_c.max() - 1 < 20
     assert injected.processes.cosmic_rays.rate_per_cm2_s == observed.hits_per_cm2_s

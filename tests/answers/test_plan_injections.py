@@ -6,7 +6,7 @@ import pytest
 from mauvecl import Study
 from mauvecl.answers.campaigns.plan import plan
 from mauvecl.answers.campaigns.planned import TargetObservation, closed_form
-from mauvecl.answers.campaigns.planned_injections import found_by_energy, question_of
+from mauvecl.answers.campaigns.planned_injections import found_by_energy, injection_case
 from mauvecl.answers.stares.inject import inject
 from mauvecl.lightcurve.flares.rates import PowerLaw
 from mauvecl.lightcurve.search.completeness import Completeness, DurationLaw
@@ -34,7 +34,7 @@ def test_stretches_are_the_targets() -> None:
         return closed_form(observed)
 
     plan(study, completeness=kept)
-    asked = question_of(seen[0])
+    asked = injection_case(seen[0]).study
     orbit = study.orbit.orbit().elements.period_s
     assert asked.stare.orbit_s - asked.stare.orbit_gap_s == pytest.approx(seen[0].window_s)
     assert asked.stare.orbit_s == pytest.approx(orbit)
@@ -63,7 +63,7 @@ def test_campaigns_close_through_the_search() -> None:
 
     form = plan(study, completeness=kept).planned[0].completeness
     assert form is not None
-    star, law = inject(question_of(seen[0])).stars[0], study.plan.law()
+    star, law = inject(injection_case(seen[0]).study).stars[0], study.plan.law()
     widths = np.array(star.injected.half_widths_s)
     first, second = (star.injected.critical[:, :, k::2].reshape(widths.size, -1) for k in (0, 1))
     energy = 10 ** np.arange(28.0, 38.0, 0.05)

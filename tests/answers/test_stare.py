@@ -146,7 +146,7 @@ def test_the_search_finds_what_was_put_in_and_nothing_else(stares):
     answer = stare(study, stares)
     one, found = answer.stares[0], answer.found
     assert found["event"].tolist()[:3] == [4, 3, 2]
-    assert (found["value"] >= one.searched.threshold).all()
+    assert (found["value"] >= one.search.threshold).all()
     assert set(found["event"]) <= {1, 2, 3, 4}
     put_in = answer.events[found["event"] - 1]
     # Within five standard errors: beyond that once in 2e6 for a normal error, of 15 looked at.

@@ -17,7 +17,7 @@ from mauvecl.lightcurve.search.bank import Bank, Level
 from mauvecl.lightcurve.search.counted_rate import consecutive_alarm_rate, consecutive_alarms
 from mauvecl.lightcurve.search.flare_fit import Fit
 from mauvecl.lightcurve.search.importance_sampling import sample_rate
-from mauvecl.lightcurve.search.injection_sites import OVERLAP, places_of
+from mauvecl.lightcurve.search.injection_sites import OVERLAP, sites_of
 from mauvecl.lightcurve.search.injections import Injections
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.stares.stare import Stare
@@ -189,17 +189,17 @@ def test_places_are_those_of_each_flare_alone_and_of_part_of_the_stare(injection
     rng = np.random.default_rng([26, seed])
     widths = tuple(np.sort(10 ** rng.uniform(0.8, 2.5, 4)))
     peak = float(rng.uniform(-50.0, 950.0))
-    together = places_of(injections.survey, widths, peak, injections.response)
+    together = sites_of(injections.survey, widths, peak, injections.response)
     monkeypatch.setattr(injection_sites, "WHOLE", 0)
-    for width, place in zip(widths, together, strict=True):
-        (alone,) = places_of(injections.survey, (width,), peak, injections.response)
-        assert (place.half_width_s, place.peak_s, place.first) == (width, peak, alone.first)
-        np.testing.assert_array_equal(place.counts, alone.counts)
-        np.testing.assert_array_equal(place.widths_s, alone.widths_s)
-        np.testing.assert_array_equal(place.peaks_s, alone.peaks_s)
-        np.testing.assert_array_equal(place.mean, alone.mean)
+    for width, site in zip(widths, together, strict=True):
+        (alone,) = sites_of(injections.survey, (width,), peak, injections.response)
+        assert (site.half_width_s, site.peak_s, site.first) == (width, peak, alone.first)
+        np.testing.assert_array_equal(site.counts, alone.counts)
+        np.testing.assert_array_equal(site.widths_s, alone.widths_s)
+        np.testing.assert_array_equal(site.peaks_s, alone.peaks_s)
+        np.testing.assert_array_equal(site.mean, alone.mean)
         # Filters are rounded to multiples of a step: sums in another order may round one to the next.
-        np.testing.assert_allclose(place.filters, alone.filters, rtol=0, atol=1.01 * injection_sites.STEP)
+        np.testing.assert_allclose(site.filters, alone.filters, rtol=0, atol=1.01 * injection_sites.STEP)
 
 
 @dataclass(frozen=True)
@@ -216,27 +216,27 @@ def drawn_at(injections, stares, position):
     """Return the outcome of a position's stares and their draws."""
     asked = injections.request(position)
     held = stares.reduced(replace(asked, reduction=Kept()))
-    return asked.reduction, asked.reduction.drawn(held["values"], held["glow"])
+    return asked.reduction, asked.reduction.frame_noise(held["values"], held["glow"])
 
 
 def test_critical_amplitude_is_where_the_search_finds(injections, stares):
     """A hair above it the largest value among the templates reaches the threshold, a hair below it does not."""
     injecting, drawn = drawn_at(injections, stares, 11)
     critical = stares.reduced(injections.request(11))["critical"].T
-    for place, roots in zip(injecting.places, critical, strict=True):
+    for site, roots in zip(injecting.sites, critical, strict=True):
         for k, root in enumerate(roots):
-            above, below = (injecting.best(place, drawn, np.array([root * f]))[0][0, k] for f in (1.001, 0.999))
+            above, below = (injecting.best(site, drawn, np.array([root * f]))[0][0, k] for f in (1.001, 0.999))
             assert (above >= injections.threshold > below) or root == 0
 
 
 def test_sums_hold_what_the_values_say(injections, stares):
     """The frames that fits see give the values that the search has."""
     injecting, drawn = drawn_at(injections, stares, 7)
-    place, amplitudes = injecting.places[1], np.array([0.01, 0.03])
-    value, direction, template = injecting.best(place, drawn, amplitudes)
-    sums = injecting.sums(place, drawn, amplitudes)
-    again = np.einsum("ft,antk,dk->andf", place.filters, sums, injecting.directions, optimize=True)
-    rows = np.take_along_axis(again.reshape(2, DRAWS, -1), (direction * len(place.filters) + template)[:, :, None], 2)
+    site, amplitudes = injecting.sites[1], np.array([0.01, 0.03])
+    value, direction, template = injecting.best(site, drawn, amplitudes)
+    sums = injecting.sums(site, drawn, amplitudes)
+    again = np.einsum("ft,antk,dk->andf", site.filters, sums, injecting.directions, optimize=True)
+    rows = np.take_along_axis(again.reshape(2, DRAWS, -1), (direction * len(site.filters) + template)[:, :, None], 2)
     assert np.abs(rows[:, :, 0] - value).max() < 2e-3
 
 
@@ -251,16 +251,16 @@ def test_flares_are_those_that_the_engine_draws(injections, stares):
     injecting, drawn = drawn_at(injections, stares, 20)
     window = slice(*np.searchsorted(STARE.start_s, [injecting.start_s[0], injecting.start_s[-1] + 1]))
     edges = np.column_stack([injecting.start_s, injecting.start_s + 5])
-    for place in injecting.places:
-        course = amplitude * DAVENPORT.mean_over(edges, place.peak_s, place.half_width_s)
+    for site in injecting.sites:
+        course = amplitude * DAVENPORT.mean_over(edges, site.peak_s, site.half_width_s)
         asked = injections.request(20)
         sums = stares.frames(
             one.components, asked.stare, course[:, None], first=asked.start, count=400, seed=3, method="pixels"
         )
-        net = (sums - one.known[window])[:, place.frames]
-        a, b, c = injecting.values(place, drawn)
+        net = (sums - one.known[window])[:, site.frames]
+        a, b, c = injecting.values(site, drawn)
         ours = (a + amplitude * b + np.sqrt(amplitude) * c)[1]
-        theirs = np.einsum("ft,ntk,k->nf", place.filters, net, one.bank.directions[1], optimize=True)
+        theirs = np.einsum("ft,ntk,k->nf", site.filters, net, one.bank.directions[1], optimize=True)
         best = int(b[1].mean(axis=0).argmax())
         x, y = ours[:, best], theirs[:, best]
         assert abs(x.mean() - y.mean()) < 4 * np.sqrt((x.var() + y.var()) / 400)
@@ -271,15 +271,15 @@ def test_flares_are_those_that_the_engine_draws(injections, stares):
 def test_sums_over_frames_are_exact(injections, stares):
     """In float64 nothing is rounded, so that no processor's order of adding them up shows in what is found."""
     injecting, drawn = drawn_at(injections, stares, 30)
-    for place in injecting.places:
-        filters = place.filters.T.astype(np.float64)
-        values = drawn.noise[:, :, place.frames].astype(np.float64)
+    for site in injecting.sites:
+        filters = site.filters.T.astype(np.float64)
+        values = drawn.noise[:, :, site.frames].astype(np.float64)
         forth, back = values @ filters, values[:, :, ::-1] @ filters[::-1]
         assert len(filters) > 50
         np.testing.assert_array_equal(forth, back)
         rounded = (
-            values.astype(np.float32) @ place.filters.T,
-            values.astype(np.float32)[:, :, ::-1] @ place.filters.T[::-1],
+            values.astype(np.float32) @ site.filters.T,
+            values.astype(np.float32)[:, :, ::-1] @ site.filters.T[::-1],
         )
         assert (rounded[0] != rounded[1]).any()
 

@@ -73,7 +73,7 @@ def _text(value: str) -> str:
 
 
 def _folded(line: str) -> str:
-    """Lines of at most 75 bytes, the rest on lines that begin with a blank."""
+    """Fold a line to at most 75 bytes; continuation lines begin with a space."""
     parts: list[str] = []
     part = ""
     for character in line:

@@ -30,6 +30,7 @@ from mauvecl.runs.pool import map_in_order
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column, View, number, table_of
+from mauvecl.study.cases import Case
 from mauvecl.study.messages import SATURATED, collect_messages
 from mauvecl.study.study import Study
 
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use
+    from mauvecl.study.orbits import PlanQuestion
 
 
 def _interval(low: int | None, high: int | None) -> str:
@@ -109,7 +111,7 @@ ENERGY_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class PlanAnswer(Answer):
-    """What `plan` answers.
+    """The answer of `plan`.
 
     Attributes
     ----------
@@ -312,7 +314,7 @@ def plan(
         raise InputError("the plan has no targets", "some, such as `plan.targets='targets.csv'`", key="plan.targets")
     if study.orbit.targets:
         raise InputError("both orbit.targets and plan.targets are given", "plan.targets alone", key="orbit.targets")
-    completeness = completeness or _completeness(study, engine)
+    completeness = completeness or _completeness(study.plan, engine)
     closed = completeness is closed_form
     for name, _ in study.processes.modulations if closed else ():
         raise InputError(
@@ -325,9 +327,11 @@ def plan(
     names, hours = seen.visibility.by_month()
     along = OrbitConditions.along(seen.visibility.track) if study.plan.along_orbit else None
 
+    base = Case(study)
+
     def observations() -> Iterator[tuple[int, TargetObservation]]:
         for k, (text, star) in enumerate(zip(study.plan.targets, stars, strict=True)):
-            yield k, observe(study, text, star, seen, k, along)
+            yield k, observe(base, text, star, seen, k, along)
 
     def planned_for(item: tuple[int, TargetObservation]) -> Planned:
         k, one = item
@@ -356,9 +360,9 @@ def plan(
     return PlanAnswer(study, seen, tuple(planned))
 
 
-def _completeness(study: Study, engine: Stares | Pool | None) -> CompletenessOf:
-    """Return the function for the completeness that a study asks for."""
-    if study.plan.completeness == "closed form":
+def _completeness(question: PlanQuestion, engine: Stares | Pool | None) -> CompletenessOf:
+    """Return the function for the completeness that a plan asks for."""
+    if question.completeness == "closed form":
         return closed_form
     from mauvecl.answers.campaigns.planned_injections import inject_target
 

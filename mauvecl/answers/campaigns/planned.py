@@ -25,7 +25,6 @@ from mauvecl.study.stare_expectation import energy_scale
 if TYPE_CHECKING:
     from mauvecl.answers.campaigns.visible import VisibleAnswer
     from mauvecl.host.expectation import Expectation
-    from mauvecl.study.study import Study
 
 #: Amplitude of the flare from which the signal per amplitude follows; its own photon noise is neglected.
 SMALL = 0.01
@@ -165,16 +164,16 @@ def star_of(text: PlanTarget, simbad: bool) -> Star:
 
 
 def observe(
-    study: Study, text: PlanTarget, star: Star, seen: VisibleAnswer, k: int, along: OrbitConditions | None = None
+    case: Case, text: PlanTarget, star: Star, seen: VisibleAnswer, k: int, along: OrbitConditions | None = None
 ) -> TargetObservation:
     """Return the observation of target `k`, with the sky behind it and the conditions along the orbit."""
-    target = seen.targets[k]
+    target, study = seen.targets[k], case.study
     if text.spectral_type is not None:
         target = replace(target, spectral_type=text.spectral_type)
     conditions = None if along is None else along.of(seen.visibility, k, study.orbit.orbit().elements.period_s)
     lengths = seen.windows[k].length_s
     window, sky = float(np.median(lengths)) if lengths.size else 0.0, sky_behind(seen, k)
-    changes: dict[str, Any] = {}
+    changes: dict[str, Any] = {"star": (star,)}
     if sky is not None:
         changes["sky"] = SkyLight(surface_brightness=sky)
     if conditions is not None:
@@ -182,8 +181,7 @@ def observe(
         if study.observation.temperature_c is None:
             at = {"temperature_c": conditions.temperature_c}
             changes["observation"] = study.observation.model_copy(update=at)
-    case = Case(study.model_copy(update={"star": (star,), **changes})).one_frame
-    return TargetObservation(target, case, window, sky, conditions)
+    return TargetObservation(target, case.with_sections(**changes).one_frame, window, sky, conditions)
 
 
 def sky_behind(seen: VisibleAnswer, k: int) -> float | None:

@@ -13,9 +13,9 @@ from mauvecl.lightcurve.flares.rates import BOLOMETRIC
 from mauvecl.lightcurve.search.completeness import PER_DECADE, Completeness, DurationLaw
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool
+from mauvecl.study.cases import Case
 from mauvecl.study.searches import InjectionQuestion
 from mauvecl.study.stare_section import CurveText
-from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
     from mauvecl.device.stares import Stares
@@ -34,7 +34,7 @@ def inject_target(observation: TargetObservation, engine: Stares | Pool | None =
 
     Each orbit of the stare has one window of the target's median length. The checkpoint of a pool keeps the result.
     """
-    study, question = observation.case.study, question_of(observation)
+    study, question = observation.case.study, injection_case(observation).study
     energy = 10 ** np.arange(24.0, 40.0, 1 / PER_DECADE)
 
     def computed() -> Arrays:
@@ -59,8 +59,8 @@ def inject_target(observation: TargetObservation, engine: Stares | Pool | None =
     return Completeness(energy, found["probability"], BOLOMETRIC, how)
 
 
-def question_of(observation: TargetObservation) -> Study:
-    """Return the study for `inject`, with the target's windows and conditions."""
+def injection_case(observation: TargetObservation) -> Case:
+    """Return the case for `inject`, with the target's windows and conditions."""
     study, conditions = observation.case.study, observation.conditions
     orbit_s = study.orbit.orbit().elements.period_s
     gap = max(orbit_s - observation.window_s, 0.0)
@@ -73,12 +73,10 @@ def question_of(observation: TargetObservation) -> Study:
         of="energy", sizes=2, widths=WIDTHS, half_width_low_s=WIDTH_RANGE_S[0], half_width_high_s=WIDTH_RANGE_S[1],
         count=study.plan.injections, positions=min(POSITIONS, study.plan.injections), fitted=0,
     )  # fmt: skip
-    return study.model_copy(
-        update={
-            "stare": study.stare.model_copy(update=changes),
-            "search": study.search.model_copy(update={"nulls": 0}),
-            "injections": injections,
-        }
+    return observation.case.with_sections(
+        stare=study.stare.model_copy(update=changes),
+        search=study.search.model_copy(update={"nulls": 0}),
+        injections=injections,
     )
 
 

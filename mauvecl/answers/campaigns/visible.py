@@ -85,7 +85,7 @@ def assumption_columns(first: str) -> tuple[Column, ...]:
 
 @dataclass(frozen=True, eq=False)
 class VisibleAnswer(Answer):
-    """What `visible` answers.
+    """The answer of `visible`.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ class VisibleAnswer(Answer):
         return Bodies.at(TimeGrid(self.days[0], len(self.days), DAY_S))
 
     def elongation_deg(self, k: int) -> Float:
-        """Angle of a target from the Sun at noon of each day, (n_day,)."""
+        """Return the angle of a target from the Sun at noon of each day, shape (n_day,)."""
         return elongation_deg(self.noons.sun, self.targets[k].direction)
 
     @cached_property
@@ -191,7 +191,7 @@ class VisibleAnswer(Answer):
         return views
 
     def _longest_gap_d(self, k: int) -> float:
-        """Days without a window."""
+        """Return the longest time without a window, in days."""
         one = self.windows[k]
         ends = (
             np.concatenate([[0.0], one.stop_s]),
@@ -263,7 +263,7 @@ class VisibleAnswer(Answer):
         return {"visible.ics": partial(calendar_bytes, self.entries(), "Mauve")}
 
     def entries(self) -> list[Entry]:
-        """Appointments of the calendar."""
+        """Return the appointments of the calendar."""
         times, entries = self.times, list[Entry]()
         single = self.study.orbit.orbit().resolved(times) == "tle" and self._writes_windows
         for k, one in enumerate(self.targets):
@@ -303,7 +303,7 @@ class VisibleAnswer(Answer):
         return lines
 
     def reason(self, name: str) -> str:
-        """Why a target is never seen."""
+        """Return the reason why a target is never visible."""
         k = [one.name for one in self.targets].index(name)
         alone = [limit for limit, kept in self.visibility.kept_by.items() if kept[k] == 0]
         return f"the limit of {alone[0]} alone leaves nothing" if alone else "its limits together leave nothing"
@@ -313,7 +313,7 @@ class VisibleAnswer(Answer):
 def visible(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> VisibleAnswer:
-    """When a study's targets are seen.
+    """Compute when a study's targets are visible.
 
     Parameters
     ----------

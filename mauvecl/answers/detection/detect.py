@@ -1,4 +1,4 @@
-"""Would a study's flares be seen: every star, in every cell of the sweep."""
+"""Detection of a study's flares, for every star and sweep value."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ MOST_ROWS = 100_000
 
 @dataclass(frozen=True, eq=False)
 class StarDetection(InCell):
-    """One star in one cell of the sweep."""
+    """A star in a cell of the sweep."""
 
     amplitudes: tuple[float, ...]
     detection: Detection
@@ -64,13 +64,13 @@ class StarDetection(InCell):
 
 @dataclass(eq=False)
 class DetectAnswer(Answer):
-    """What `mauvecl detect` answers.
+    """The answer of `mauvecl detect`.
 
     Attributes
     ----------
     study : Study
     stars : list of StarDetection
-        Every star in every cell of the sweep.
+        One per star and cell of the sweep.
     messages : list of str
         What the reader must be told, worst first.
     paper : list of str
@@ -211,7 +211,7 @@ class DetectAnswer(Answer):
 def detect(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> DetectAnswer:
-    """Null and flare distributions of every star of a study, in every cell of its sweep.
+    """Simulate the detection of every flare of a study, for every star and sweep value.
 
     Parameters
     ----------
@@ -219,13 +219,8 @@ def detect(
     engine : Engine or Pool, optional
     progress : callable, optional
         Called as ``progress(done, total)`` in stars.
-
-    Raises
-    ------
-    InputError
-        For anything in the study that cannot be.
     """
-    # Everything is looked at before anything is drawn: bad input shows at once.
+    # Bad input is refused before anything is drawn.
     run = study.run
     check_fap(run.fap, run.realisations, run.tails)
     prepared = cases(study)

@@ -87,13 +87,13 @@ GRID = Sweep(
 
 
 def coverage(result: SnrResult) -> NDArray[np.float64]:
-    """Share of realisations whose observed signal plus or minus its estimated noise holds the true one.
+    """Return the coverage of intervals of one estimated standard deviation about the observed signal.
 
     Returns
     -------
     ndarray, shape (n_pixel,)
-        The estimate is the observer's: photons as seen, dark and read noise as known. Interpolated within bins of the
-        counts' histogram, 1/64 of a standard deviation or less.
+        The standard deviation is estimated from the observed photons and the known dark and read noise. Values are
+        interpolated within the bins of the histogram of counts, 1/64 of a standard deviation or less.
     """
     seen = result.observers[: result.scene.n_pixel]
     signal = result.expectation.light_dn
@@ -114,13 +114,13 @@ def coverage(result: SnrResult) -> NDArray[np.float64]:
 
 
 def beyond(x: Expectation, sigmas: float) -> NDArray[np.float64]:
-    """Probability that a pixel's exposure exceeds its mean by so many standard deviations, shape (n_pixel,).
+    """Return the probability that a pixel deviates by more than N standard deviations, shape (n_pixel,).
 
     Parameters
     ----------
     x : Expectation
     sigmas : float
-        Below zero: that it falls short of it by as many.
+        Number of standard deviations; negative for deviations below the mean.
 
     Notes
     -----
@@ -132,7 +132,7 @@ def beyond(x: Expectation, sigmas: float) -> NDArray[np.float64]:
     parts = ((c.photon_step, photons), (c.dark_step, c.dark_dn / c.dark_step))
 
     def cumulants(u: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Of the deviation from the mean: the generating function and its first two derivatives at u."""
+        """Return the cumulant generating function of the deviation and its first two derivatives at u."""
         value, first, second = c.gaussian * u**2 / 2, c.gaussian * u, c.gaussian.copy()
         for step, mean in parts:
             value = value + mean * (np.expm1(step * u) - step * u)
@@ -163,7 +163,7 @@ def _promises(result: SnrResult) -> QTable:
 
 @dataclass(eq=False)
 class GaussianReport(Answer):
-    """What `gaussian_report` answers.
+    """The answer of `gaussian_report`.
 
     Attributes
     ----------
@@ -226,7 +226,7 @@ class GaussianReport(Answer):
 
 
 def _by_star(table: QTable, stars: int) -> list[QTable]:
-    """Equal parts of a table, in order."""
+    """Split a table into equal parts, in order."""
     each = len(table) // stars
     return [table[k * each : (k + 1) * each] for k in range(stars)]
 
@@ -276,11 +276,6 @@ def gaussian(
     engine : Engine or Pool, optional
     progress : callable, optional
         Called as ``progress(done, total)`` in stars, each of which is asked for its S/N and then for its flares.
-
-    Raises
-    ------
-    InputError
-        For anything in the study that cannot be.
     """
     from mauvecl.device.engine import Engine as Default
 

@@ -49,7 +49,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class MapResult(Answer):
-    """What `detection_map` answers, for the study's first star.
+    """The answer of `detection_map`, for the study's first star.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class MapResult(Answer):
 
     @property
     def tables(self) -> dict[str, Table]:
-        """The one table."""
+        """The only table."""
         return {"map": self.table}
 
     @property
@@ -150,11 +150,6 @@ def map(
     engine : Engine or Pool, optional
     progress : callable, optional
         Called as ``progress(done, total)`` in cells.
-
-    Raises
-    ------
-    InputError
-        For anything in the study that cannot be.
     """
     from mauvecl.device.engine import Engine as Default
 

@@ -54,7 +54,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class UnknownTable(Answer):
-    """What `unknown_table` answers.
+    """The answer of `unknown_table`.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ class UnknownTable(Answer):
 
     @property
     def tables(self) -> dict[str, Table]:
-        """The one table."""
+        """The only table."""
         return {"unknowns": self.table}
 
     @property

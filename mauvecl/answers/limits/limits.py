@@ -284,7 +284,7 @@ def solve(case: Case, statistic: str, engine: Engine | Pool) -> Limit:
 def limit(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> LimitResult:
-    """Limits of a study's stars and flares, by every statistic it names.
+    """Compute the limits of a study's stars and flares, by every statistic.
 
     Parameters
     ----------

@@ -251,11 +251,6 @@ def measure(
         Draws the exposures; the default device. The checkpoint of a pool keeps the fits that are finished.
     progress : callable, optional
         Receives the flares that are done, and all of them.
-
-    Raises
-    ------
-    InputError
-        For anything in the study that cannot be.
     """
     if study.flare.geometry != "added":
         raise InputError.of("flare.geometry", "replaces", "'added': fits take light for added")

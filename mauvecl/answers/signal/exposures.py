@@ -72,7 +72,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class ExposureResult(Answer):
-    """What `exposure_for` answers, one row per star.
+    """The answer of `exposure_for`, one row per star.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ class ExposureResult(Answer):
 
     @property
     def tables(self) -> dict[str, Table]:
-        """The one table."""
+        """The only table."""
         return {"exposure": self.table}
 
     @property
@@ -112,24 +112,12 @@ class ExposureResult(Answer):
 
 
 def snr_at(x: Expectation, wavelength_nm: float, per: Per = "element") -> float:
-    """Closed-form S/N of the pixel or 10.5 nm element that holds a wavelength.
-
-    Raises
-    ------
-    InputError
-        If it lies outside the spectrum.
-    """
+    """Return the closed-form S/N of the pixel or 10.5 nm element at a wavelength; see `place_of`."""
     return float((x.snr_per_element() if per == "element" else x.snr())[place_of(x, wavelength_nm, per)])
 
 
 def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
-    """Index of the pixel or element that holds a wavelength.
-
-    Raises
-    ------
-    InputError
-        If it lies outside the spectrum.
-    """
+    """Return the index of the pixel or element at a wavelength; raises InputError outside the spectrum."""
     if per not in ("pixel", "element"):
         raise InputError(f"S/N per {per!r}", "pixel or element", key="per", value=per)
     first, last = float(x.wavelength_nm[0]), float(x.wavelength_nm[-1])
@@ -174,7 +162,7 @@ def exposure(
         try:
             answered.append(_one(case, snr, wavelength_nm, per))
         except InputError as error:
-            # One star's failure does not lose the others'.
+            # The exposures of other stars are still computed.
             failed.append(error)
         if progress is not None:
             progress(done, len(prepared))
@@ -191,7 +179,7 @@ def exposure(
 def exposure_for(
     study: Study, snr: float | None = None, wavelength_nm: Wavelength | None = None, *, per: Per | None = None
 ) -> ExposureResult:
-    """Answer `exposure` for an S/N and a wavelength that may be given here.
+    """Compute `exposure` for another S/N or wavelength than the study's.
 
     Parameters
     ----------
@@ -217,7 +205,7 @@ def _one(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposu
     frame, frame_s = case.one_frame.quiet, case.instrument.frame_s
 
     def after(frames: int) -> Expectation:
-        # As many frames as it takes: they may fill several exposures.
+        # The frames may exceed one exposure.
         return replace(frame, n_frames=frames)
 
     one = snr_at(after(1), wavelength_nm, per)
@@ -228,7 +216,7 @@ def _one(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposu
             key="signal.snr",
             value=snr,
         )
-    # S/N grows with the root of the frames, to rounding: the neighbours settle it.
+    # S/N is proportional to the root of the number of frames, so only rounding has to be corrected.
     frames = max(int(np.ceil((snr / one) ** 2)), 1)
     while frames > 1 and snr_at(after(frames - 1), wavelength_nm, per) >= snr:
         frames -= 1

@@ -1,4 +1,4 @@
-"""One observation of every star of a study, taken apart."""
+"""Single simulated observations of a study's stars, by component."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ SUMMARY_COLUMNS = (
 
 @dataclass(eq=False)
 class SimulateAnswer(Answer):
-    """What `mauvecl simulate` answers: one table of components per star and stage."""
+    """The answer of `mauvecl simulate`: one table of components per star and stage."""
 
     USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "unknowns", "seed")
 
@@ -93,7 +93,7 @@ class SimulateAnswer(Answer):
         return [View("One observation each (closed-form S/N)", SUMMARY_COLUMNS, self.summary)]
 
     def plot(self, path: str | Path | None = None, *, number: int = 0, ax: Any = None) -> Any:
-        """One of the observations and what it is made of; needs matplotlib."""
+        """Plot an observation and its components; requires matplotlib."""
         return list(self.pictures.values())[number](path, ax=ax)
 
 
@@ -106,7 +106,7 @@ def simulate(
     realisation: FirstRealisation = 0,
     flaring: bool = False,
 ) -> SimulateAnswer:
-    """One observation of every star of a study, taken apart; with its flares too where asked.
+    """Simulate one observation of every star of a study, by component.
 
     Parameters
     ----------

@@ -34,7 +34,7 @@ SHOWN_NM = (250.0, 300.0, 400.0, 550.0)
 
 @dataclass(frozen=True, eq=False)
 class StarSnr(InCell):
-    """One star in one cell of the sweep."""
+    """A star in a cell of the sweep."""
 
     result: SnrResult
     asked_nm: float | None = None
@@ -50,13 +50,13 @@ class StarSnr(InCell):
 
 @dataclass(eq=False)
 class SnrAnswer(Answer):
-    """What `mauvecl snr` answers.
+    """The answer of `mauvecl snr`.
 
     Attributes
     ----------
     study : Study
     stars : list of StarSnr
-        Every star in every cell of the sweep.
+        One per star and cell of the sweep.
     messages : list of str
     """
 
@@ -117,7 +117,7 @@ class SnrAnswer(Answer):
 def snr(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> SnrAnswer:
-    """S/N distributions of every star of a study, without flares, in every cell of its sweep.
+    """Simulate the S/N of every star of a study without flares, for every sweep value.
 
     Parameters
     ----------
@@ -125,13 +125,8 @@ def snr(
     engine : Engine or Pool, optional
     progress : callable, optional
         Called as ``progress(done, total)`` in stars.
-
-    Raises
-    ------
-    InputError
-        For anything in the study that cannot be.
     """
-    # Everything is looked at before anything is drawn: bad input shows at once.
+    # Bad input is refused before anything is drawn.
     prepared, run, asked = cases(study), study.run, study.signal.wavelength_nm
     quiet = [case.quiet for case in prepared]
     if asked is not None:
@@ -165,7 +160,7 @@ def snr(
 
 
 def _cut_off(star: StarSnr) -> str:
-    """How many pixels saturation cut off in the simulation, and how often."""
+    """Return a message on pixels that saturated in the simulation, or an empty text."""
     result = star.result
     cut = result.counts.clipped[:, 1]
     met = cut[cut > 0]

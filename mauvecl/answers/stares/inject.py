@@ -1,4 +1,4 @@
-"""Completeness of a search for flares: of injected ones over size and half-width, and how well they are recovered."""
+"""Completeness of a search for flares over size and half-width, and the accuracy of fits, from injected flares."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ Float = NDArray[np.float64]
 
 #: Powers at which limits are given.
 POWERS = (0.5, 0.9)
-#: Units of sizes, as astropy reads them.
+#: Units of sizes, in astropy's notation.
 SIZE_UNITS = {"amplitude": "", "duration": "s", "energy": "erg", "band_energy": "erg"}
-#: Standard errors of the number of alarms beyond which the two differ.
+#: Difference between drawn and expected alarms that is reported, in standard errors.
 DIFFERS = 4.0
-#: Chance of as many alarms at the threshold below which they are too many.
+#: Probability of the observed number of alarms below which it is reported as too large.
 LEAST_CHANCE = 1e-5
 
 
@@ -109,44 +109,20 @@ SEARCH_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class StarCompleteness(InCell):
-    """One star in one cell of the sweep.
-
-    Attributes
-    ----------
-    surveyed : StarSurvey
-    sizes : Sizes
-    threshold : Interval
-    simulated : Interval
-        False alarms per star-day of drawn stares at the value `checked`, which a few in ten exceed, with 4 standard
-        errors; NaN where none are drawn.
-    asked : float
-        What it should be there by importance sampling.
-    checked : float
-    alarmed : int
-        Drawn stares with an alarm at the threshold.
-    expected : float
-        How many should have one; NaN where none are drawn.
-    shifted : bool
-        Whether the threshold allows for what the search neither subtracts nor marginalises over.
-    saturates : float
-        Amplitude from which on flares saturate a used pixel, which injections leave out.
-    in_a_row : float
-        False alarms per star-day of the common rule in white noise.
-    injected : InjectedCompleteness
-    fitted : FitAccuracy, optional
-    """
+    """Completeness at one star in one cell of the sweep."""
 
     surveyed: StarSurvey
     sizes: Sizes
     threshold: Interval
+    # False alarms per star-day of drawn stares at `checked`, with 4 standard errors; NaN if none are drawn.
     simulated: Interval
-    asked: float
-    checked: float
-    alarmed: int
-    expected: float
-    shifted: bool
-    saturates: float
-    in_a_row: float
+    asked: float  # the same by importance sampling
+    checked: float  # value that the maximum of a few stares in ten exceeds
+    alarmed: int  # drawn stares with an alarm at the threshold
+    expected: float  # their expected number; NaN if none are drawn
+    shifted: bool  # whether the threshold is raised for trends that the search does not remove
+    saturates: float  # amplitude at which flares saturate a used pixel, which injections ignore
+    in_a_row: float  # false alarms per star-day of the conventional rule in white noise
     injected: InjectedCompleteness
     fitted: FitAccuracy | None
 
@@ -212,7 +188,7 @@ class StarCompleteness(InCell):
 
 @dataclass(eq=False)
 class InjectAnswer(Answer):
-    """What `mauvecl inject` answers.
+    """The answer of `mauvecl inject`.
 
     Attributes
     ----------
@@ -277,20 +253,15 @@ class InjectAnswer(Answer):
 def inject(
     study: Study, engine: Stares | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> InjectAnswer:
-    """Completeness of a study's search at each of its stars, in every cell of its sweep.
+    """Compute the completeness of a study's search for every star and sweep value.
 
     Parameters
     ----------
     study : Study
     engine : Stares or Pool, optional
-        Who draws; the default device.
+        Draws; the default device if not given.
     progress : callable, optional
         Called as ``progress(done, total)`` in injections; may raise to stop the work.
-
-    Raises
-    ------
-    InputError
-        For anything in the study that cannot be.
     """
     idle = next((axis.quantity for axis in study.sweep.axes if axis.quantity in ("amplitude", "exposure")), None)
     if idle is not None:

@@ -1,4 +1,4 @@
-"""One simulated stare at every star of a study: light curves in bands, a spectrum of every frame, the flares in it."""
+"""Simulated stares: light curves in bands, a spectrum of every frame, and the flares."""
 
 from __future__ import annotations
 
@@ -41,53 +41,37 @@ if TYPE_CHECKING:
     from mauvecl.study.assumptions import Use
 
 KINDS: tuple[Kind, ...] = ("band", "bolometric")
-#: Light curves in text, at most; longer ones are in their FITS files alone.
+#: Largest number of frames of light curves in text files; longer ones are in FITS files only.
 MOST_ROWS = 100_000
-#: Frames whose spectra are kept, at most: 115 days, 1.2 GB.
+#: Largest number of frames: 115 days, with spectra of 1.2 GB.
 MOST_SHOWN = 2_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class Flaring:
-    """One flare of a stare, with its energies, erg (NaN where the star's size is unknown), and its S/N.
-
-    `snr` is that of a search which knows everything but whether the flare is there.
-    """
+class StareFlare:
+    """A flare of a stare, with its energies and S/N."""
 
     event: Event
-    band_erg: float
-    bolometric_erg: float
-    snr: float
+    band_erg: float  # NaN if the star's size is unknown
+    bolometric_erg: float  # likewise
+    snr: float  # of the matched filter for this flare
 
 
 @dataclass(frozen=True, eq=False)
-class Searched:
-    """What a search of one stare found, and the threshold that it was searched with.
+class SearchResult:
+    """Result of the search of a stare."""
 
-    Attributes
-    ----------
-    threshold : float
-        By importance sampling of normal noise.
-    alarms : list of Alarm
-        By falling value.
-    bolometric_erg : tuple of float
-        Of each, by its fit; NaN where the star's size is unknown.
-    events : tuple of int
-        The flare put in that each is nearest to, from 1 on, within a half-width and two frames; 0 for none.
-    shifted : bool
-        Whether the threshold allows for what the search neither subtracts nor marginalises over.
-    """
-
-    threshold: float
-    alarms: list[Alarm]
-    bolometric_erg: tuple[float, ...]
+    threshold: float  # from importance sampling of normal noise
+    alarms: list[Alarm]  # in descending order of value
+    bolometric_erg: tuple[float, ...]  # of each alarm's fit; NaN if the star's size is unknown
+    # Number of the nearest flare of the stare within a half-width and two frames, from 1 on; 0 if there is none.
     events: tuple[int, ...]
-    shifted: bool = False
+    shifted: bool = False  # whether the threshold is raised for trends that the search does not remove
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """One flare that a search found: its bolometric energy, erg, and the number of the flare put in near it."""
+class FoundFlare:
+    """A flare that a search found: its bolometric energy, erg, and the number of the nearest flare of the stare."""
 
     alarm: Alarm
     bolometric_erg: float
@@ -96,20 +80,20 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class StarStare(InCell):
-    """One star in one cell of the sweep; `searched` is a sentence where no search was possible."""
+    """A stare at one star in one cell of the sweep; `search` is a message if no search is possible."""
 
     staring: StareExpectation
-    flares: tuple[Flaring, ...]
+    flares: tuple[StareFlare, ...]
     light: LightCurves
-    searched: Searched | str | None = None
+    search: SearchResult | str | None = None
 
     @property
-    def found(self) -> list[Found]:
-        """What the search found."""
-        one = self.searched
-        if not isinstance(one, Searched):
+    def found(self) -> list[FoundFlare]:
+        """Flares that the search found."""
+        one = self.search
+        if not isinstance(one, SearchResult):
             return []
-        return [Found(*parts) for parts in zip(one.alarms, one.bolometric_erg, one.events, strict=True)]
+        return [FoundFlare(*parts) for parts in zip(one.alarms, one.bolometric_erg, one.events, strict=True)]
 
 
 def _with_error(value: float, error: float) -> str:
@@ -139,18 +123,18 @@ COLUMNS = (
            "standard deviation of a frame's own noise, relative to its light", "noise of a frame", percent(".3g")),
     Column("flares", lambda one: len(one.flares), "", "flares put into it"),
 )  # fmt: skip
-#: Columns that are there where stares are searched.
+#: Additional columns if stares are searched.
 SEARCHED_COLUMNS = (
-    Column("threshold", lambda one: one.searched.threshold if isinstance(one.searched, Searched) else np.nan, "",
+    Column("threshold", lambda one: one.search.threshold if isinstance(one.search, SearchResult) else np.nan, "",
            "value of the search's statistic from which on it alarms"),
-    Column("found", lambda one: len(one.searched.alarms) if isinstance(one.searched, Searched) else -1, "",
+    Column("found", lambda one: len(one.search.alarms) if isinstance(one.search, SearchResult) else -1, "",
            "flares found; -1: not searched"),
 )  # fmt: skip
 SATURATED_COLUMN = Column(
     "saturated_frames", lambda one: int(np.count_nonzero(one.staring.quality)), "",
     "frames in which the mean of a used pixel reaches saturation", "saturated",
 )  # fmt: skip
-#: Columns of the table of flares, for `Flaring`.
+#: Columns of the table of flares, for `StareFlare`.
 EVENT_COLUMNS = (
     Column("peak_time", "event.peak_s", "s", "from the start of the stare; tau = 0 of the shape", "peak at (s)", ".6g",
            kind=float),
@@ -190,7 +174,7 @@ def _interval(name: str, key: str, unit: str) -> list[Column]:
     ]  # fmt: skip
 
 
-#: Columns of the table of flares that a search found, for `Found`.
+#: Columns of the table of flares that a search found, for `FoundFlare`.
 FOUND_COLUMNS = (
     *_fitted("peak_time", "peak_s", "s", "from the start of the stare", "peak at (s)", number(".6g", "not measured")),
     *_fitted("amplitude", "amplitude", "", "in the flare's band", "amplitude", _percent_with_error, "amplitude_error"),
@@ -235,7 +219,7 @@ class StareAnswer(Answer):
     ----------
     study : Study
     stares : list of StarStare
-        Every star in every cell of the sweep.
+        One per star and cell of the sweep.
     messages : list of str
     """
 
@@ -292,18 +276,18 @@ class StareAnswer(Answer):
             ),
             *(
                 View(
-                    f"Found at {one.title} above {one.searched.threshold:.2f}, {asked.false_alarms:g} {alarms} per "
+                    f"Found at {one.title} above {one.search.threshold:.2f}, {asked.false_alarms:g} {alarms} per "
                     f"star-{asked.per}",
                     FOUND_COLUMNS,
                     table_of(FOUND_COLUMNS, one.found),
                 )
                 for one in self.stares
-                if isinstance(one.searched, Searched)
+                if isinstance(one.search, SearchResult)
             ),
         ]
 
     def light_curve(self, number: int = 0) -> QTable:
-        """Frames of one star and cell: time, cadence number, quality, and light in every band."""
+        """Return the frames of a star in a cell: time, cadence number, quality, and light in every band."""
         one = self.stares[number]
         suffixes = ["", *("_" + name.removesuffix(" nm").replace("-", "_") for name in one.light.bands[1:])]
         bands = (
@@ -361,7 +345,7 @@ def stare(
     *,
     checkpoint: Checkpoint | None = None,
 ) -> StareAnswer:
-    """One simulated stare at every star of a study, in every cell of its sweep.
+    """Simulate one stare for every star and sweep value of a study.
 
     Parameters
     ----------
@@ -373,11 +357,6 @@ def stare(
         Called as ``progress(done, total)`` in stares.
     checkpoint : Checkpoint, optional
         Keeps the frames that are drawn and the thresholds of searches.
-
-    Raises
-    ------
-    InputError
-        For anything in the study that cannot be.
     """
     check_sweep(study)
     prepared = cases(study)
@@ -403,11 +382,11 @@ def stare(
             progress(len(drawn), len(prepared))
     messages = collect_messages(quiet) + orbit_lines(prepared[0])
     messages += dict.fromkeys(line for case in prepared for line in unused_lines(case))
-    messages += [one.searched for one in drawn if isinstance(one.searched, str)]
+    messages += [one.search for one in drawn if isinstance(one.search, str)]
     messages += [
-        threshold_line(one.title, one.searched.threshold)
+        threshold_line(one.title, one.search.threshold)
         for one in drawn
-        if isinstance(one.searched, Searched) and one.searched.shifted
+        if isinstance(one.search, SearchResult) and one.search.shifted
     ]
     for one in drawn:
         cut = int(np.count_nonzero(one.staring.quality))
@@ -434,7 +413,7 @@ def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStar
     return StarStare(case.label, case.at, staring, _flares(case), light, searched)
 
 
-def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> Searched | str:
+def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> SearchResult | str:
     """Search the stare of a case for flares, or return a message if no search is possible."""
     study, staring, events = case.study, case.stare_expectation, case.events
     try:
@@ -458,19 +437,20 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> Searched |
             energies.append(float("nan"))
             nearest.append(0)
             continue
-        event = _event_of(study, fit)
+        event = _event_of(case, fit)
         energies.append(_found_energy(case, event))
         away = [abs(one.peak_s - event.peak_s) for one in events]
         near = int(np.argmin(away)) if away else -1
         close = near >= 0 and away[near] <= events[near].half_width_s + 2 * staring.stare.frame_s
         nearest.append(near + 1 if close else 0)
-    return Searched(threshold, raised, tuple(energies), tuple(nearest), bool(tail["shifted"]))
+    return SearchResult(threshold, raised, tuple(energies), tuple(nearest), bool(tail["shifted"]))
 
 
-def _event_of(study: Study, fit: FittedFlares) -> Event:
+def _event_of(case: Case, fit: FittedFlares) -> Event:
     """Return a fitted flare as an event."""
-    kelvin = float(np.nan_to_num(fit.temperature_k[0], nan=study.flare.temperature_k))
-    return Event(float(fit.peak_s[0]), float(fit.half_width_s[0]), float(fit.amplitude[0]), kelvin, study.search.shape)
+    kelvin = float(np.nan_to_num(fit.temperature_k[0], nan=case.study.flare.temperature_k))
+    values = (float(fit.peak_s[0]), float(fit.half_width_s[0]), float(fit.amplitude[0]))
+    return Event(*values, kelvin, case.study.search.shape)
 
 
 def _log_energy(case: Case) -> Factor | None:
@@ -501,7 +481,7 @@ def _found_energy(case: Case, event: Event) -> float:
     return float("nan") if energy is None else energy
 
 
-def _flares(case: Case) -> tuple[Flaring, ...]:
+def _flares(case: Case) -> tuple[StareFlare, ...]:
     """Return the flares of a case's stare with their energies and S/N."""
     staring, kelvin, frames = case.stare_expectation, temperatures_of(case.events), case.stare
     flares = []
@@ -509,5 +489,5 @@ def _flares(case: Case) -> tuple[Flaring, ...]:
         energies = [energy_of(case, event, kind, kelvin) for kind in KINDS]
         band, bolometric = (float("nan") if energy is None else energy for energy in energies)
         own = coefficients([event], frames.start_s, frames.frame_s, kelvin)
-        flares.append(Flaring(event, band, bolometric, staring.snr(own)))
+        flares.append(StareFlare(event, band, bolometric, staring.snr(own)))
     return tuple(flares)

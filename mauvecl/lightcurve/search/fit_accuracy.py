@@ -18,7 +18,7 @@ from mauvecl.schema.tables import Column
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.search.flare_fit import Fit, FittedFlares
-    from mauvecl.lightcurve.search.injection_sites import Place
+    from mauvecl.lightcurve.search.injection_sites import InjectionSite
 
 Float = NDArray[np.float64]
 
@@ -42,16 +42,16 @@ class Refit:
         templates = self.fit.templates
         return np.array(templates.temperatures_k)[list(templates.chosen)]
 
-    def compared(self, recovered: FittedFlares, amplitude: Float, place: Place) -> dict[str, NDArray[Any]]:
+    def compared(self, recovered: FittedFlares, amplitude: Float, site: InjectionSite) -> dict[str, NDArray[Any]]:
         """Compare fits with the injected flares, by the names of `FIT_QUANTITIES`, shape (n_amplitude,) each."""
-        duration = amplitude * place.half_width_s * self.fit.bank.shape.equivalent_duration
+        duration = amplitude * site.half_width_s * self.fit.bank.shape.equivalent_duration
         off = np.abs(recovered.equivalent_duration_s - duration)
         return {
             "energy": recovered.equivalent_duration_s / duration,
             "amplitude": recovered.amplitude / amplitude,
-            "half_width": recovered.half_width_s / place.half_width_s,
+            "half_width": recovered.half_width_s / site.half_width_s,
             "temperature": recovered.temperature_k / self.temperature_k,
-            "peak": (recovered.peak_s - place.peak_s) / place.half_width_s,
+            "peak": (recovered.peak_s - site.peak_s) / site.half_width_s,
             "covered": off <= recovered.equivalent_duration_error_s,
         }
 

@@ -32,7 +32,7 @@ WHOLE = 20_000
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class InjectionSite:
     """Half-width and time of a flare in a stare, and the templates that can detect it."""
 
     half_width_s: float
@@ -54,12 +54,12 @@ class Place:
         """Transposed filters in double precision, shape (n_frame, n_filter)."""
         return np.ascontiguousarray(self.filters.T, np.float64)
 
-    def within(self, first: int) -> Place:
+    def within(self, first: int) -> InjectionSite:
         """Return the site in the part of the stare that starts with frame `first`."""
         return replace(self, first=self.first - first)
 
 
-def places_of(survey: Survey, widths_s: Sequence[float], peak_s: float, response: Float) -> tuple[Place, ...]:
+def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float, response: Float) -> tuple[InjectionSite, ...]:
     """Return flares of several half-widths that peak at one time, and the templates that can find each.
 
     Parameters
@@ -160,7 +160,7 @@ def _filters(search: Search, seen: Sequence[_Seen]) -> dict[int, tuple[NDArray[n
 def _place(
     search: Search, first: int, width_s: float, peak_s: float, mean: Float, seen: Sequence[_Seen],
     filters: dict[int, tuple[NDArray[np.int64], Single]],
-) -> Place:  # fmt: skip
+) -> InjectionSite:  # fmt: skip
     none = np.zeros((0, mean.size), np.float32)
     own = [filters[one.row][1][np.searchsorted(filters[one.row][0], one.onsets)] for one in seen]
     weights = np.concatenate([none, *own])
@@ -168,7 +168,7 @@ def _place(
     ends = slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 0)
     widths = [np.full(one.onsets.size, search.grid[one.row].template.half_width_s) for one in seen]
     no_counts = np.zeros((len(search.bank.directions), 0), np.bool_)
-    return Place(
+    return InjectionSite(
         width_s,
         peak_s,
         first + ends.start,

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.lightcurve.search.fit_accuracy import FIT_QUANTITIES, Refit
-from mauvecl.lightcurve.search.injection_sites import Place, places_of
+from mauvecl.lightcurve.search.injection_sites import InjectionSite, sites_of
 from mauvecl.lightcurve.search.survey import select_frames, subtract_known
 from mauvecl.lightcurve.stares.components import STEADY, Components
 from mauvecl.lightcurve.stares.requests import Method, StaresRequest
@@ -115,22 +115,22 @@ class Injections:
         """Method of drawing frames."""
         return method_for(self.quiescent, self.survey.stare, self.processes)
 
-    def places(self, position: int) -> tuple[Place, ...]:
+    def sites(self, position: int) -> tuple[InjectionSite, ...]:
         """Return the sites of all half-widths at a peak time."""
-        return places_of(self.survey, self.half_widths_s, float(self.peaks_s[position]), self.response)
+        return sites_of(self.survey, self.half_widths_s, float(self.peaks_s[position]), self.response)
 
     def request(self, position: int, refit: Refit | None = None) -> StaresRequest:
         """Return the request for the critical amplitudes at a peak time and, with `refit`, fits of detected flares."""
         survey = self.survey
-        places = self.places(position)
-        reached = [place.frames for place in places if len(place.filters)]
+        sites = self.sites(position)
+        reached = [site.frames for site in sites if len(site.filters)]
         # Without templates, one frame is drawn, since requests cannot be empty.
         first = min((part.start for part in reached), default=0)
         window = slice(first, max((part.stop for part in reached), default=1))
         start = (1 + position) * NUMBERS
         stare = select_frames(survey.stare, window)
         injecting = Injecting(
-            tuple(place.within(first) for place in places),
+            tuple(site.within(first) for site in sites),
             self.threshold,
             survey.bank.directions,
             self.response,
@@ -163,7 +163,7 @@ class Injecting:
 
     adds: ClassVar[bool] = False
 
-    places: tuple[Place, ...]  # in these frames
+    sites: tuple[InjectionSite, ...]  # in these frames
     threshold: float
     directions: Float  # of the bank, shape (n_temperature, n_sum)
     response: Float  # see `Injections.response`
@@ -182,66 +182,68 @@ class Injecting:
 
         It is infinite if no template covers the flare, and zero if there is an alarm without it.
         """
-        critical = np.full((len(values), len(self.places)), np.inf, np.float32)
+        critical = np.full((len(values), len(self.sites)), np.inf, np.float32)
         for begin in range(0, len(values), BLOCK):
             part = slice(begin, begin + BLOCK)
-            drawn = self.drawn(values[part], glow[part])
-            for column, place in zip(critical[part].T, self.places, strict=True):
-                if len(place.filters):
-                    column[:] = self._critical(place, self.values(place, drawn))
+            drawn = self.frame_noise(values[part], glow[part])
+            for column, site in zip(critical[part].T, self.sites, strict=True):
+                if len(site.filters):
+                    column[:] = self._critical(site, self.values(site, drawn))
         kept: dict[str, NDArray[Any]] = {"critical": critical}
         if self.refit is not None:
             # Stares are processed one at a time, so that fits do not depend on the batch.
             these = range(min(len(values), max(0, self.start + self.refit.count - first)))
-            each = [self._fitted(self.drawn(values[k : k + 1], glow[k : k + 1]), self.refit) for k in these]
+            each = [self._fitted(self.frame_noise(values[k : k + 1], glow[k : k + 1]), self.refit) for k in these]
             none = np.zeros((0, *self.refit.amplitudes.shape), np.float32)
             kept |= {name: np.array([one[name] for one in each]) if each else none for name in FIT_QUANTITIES}
         return kept
 
-    def drawn(self, values: Single, glow: Single) -> Drawn:
+    def frame_noise(self, values: Single, glow: Single) -> FrameNoise:
         """Prepare the random part of some stares."""
         n_sum = values.shape[2]
         noise = np.moveaxis(subtract_known(values, self.known, self.trend), 2, 0)
         own, light = np.ascontiguousarray(np.moveaxis(glow[:, :, :n_sum], 2, 0)), glow[:, :, n_sum]
-        return Drawn(_multiple(noise, NOISE_STEP).astype(np.float64), own, light if light.any() else None)
+        return FrameNoise(_multiple(noise, NOISE_STEP).astype(np.float64), own, light if light.any() else None)
 
-    def values(self, place: Place, drawn: Drawn) -> tuple[Single, Single, Single]:
+    def values(self, site: InjectionSite, drawn: FrameNoise) -> tuple[Single, Single, Single]:
         """Return a, b and c of the module's formula, shapes (n_temperature, n_draw or 1, n_filter)."""
-        filters, here = place.weights, place.frames
-        mean = np.atleast_2d(place.mean if drawn.light is None else place.mean * (1 + drawn.light[:, here]))
-        start, width = self.start_s[here], place.half_width_s
-        shining = (start > place.peak_s - width - self.frame_s) & (start < place.peak_s + GLOW * width)
+        filters, here = site.weights, site.frames
+        mean = np.atleast_2d(site.mean if drawn.light is None else site.mean * (1 + drawn.light[:, here]))
+        start, width = self.start_s[here], site.half_width_s
+        shining = (start > site.peak_s - width - self.frame_s) & (start < site.peak_s + GLOW * width)
         ends = np.flatnonzero(shining)[[0, -1]] if shining.any() else np.array([0, -1])
         lit = slice(int(ends[0]), int(ends[1]) + 1)
-        own = drawn.own[:, :, here][:, :, lit] * np.sqrt(np.maximum(place.mean[lit], 0))
+        own = drawn.own[:, :, here][:, :, lit] * np.sqrt(np.maximum(site.mean[lit], 0))
         return (
             _combined(self.directions, drawn.noise[:, :, here] @ filters),
             _combined((self.directions @ self.response)[:, None], (_multiple(mean, MEAN_STEP) @ filters)[None]),
             _combined(self.directions @ self.photons, _multiple(own, NOISE_STEP) @ filters[lit]),
         )
 
-    def best(self, place: Place, drawn: Drawn, amplitudes: Float) -> tuple[Float, NDArray[np.int64], NDArray[np.int64]]:
+    def best(
+        self, site: InjectionSite, drawn: FrameNoise, amplitudes: Float
+    ) -> tuple[Float, NDArray[np.int64], NDArray[np.int64]]:
         """Return the largest value of all templates, its temperature and its template, (n_amplitude, n_draw) each."""
-        a, b, c = self.values(place, drawn)
+        a, b, c = self.values(site, drawn)
         values = np.array([a + x * b + np.sqrt(x) * c for x in amplitudes.astype(np.float32)])
-        values[:, ~place.counts[:, None].repeat(a.shape[1], axis=1)] = -np.inf
+        values[:, ~site.counts[:, None].repeat(a.shape[1], axis=1)] = -np.inf
         flat = np.moveaxis(values, 2, 1).reshape(len(amplitudes), a.shape[1], -1)
         which = flat.argmax(axis=2)
         largest = np.take_along_axis(flat, which[:, :, None], axis=2)[:, :, 0]
         temperature, template = np.divmod(which, a.shape[2])
         return largest.astype(np.float64), temperature, template
 
-    def sums(self, place: Place, drawn: Drawn, amplitudes: Float) -> Single:
+    def sums(self, site: InjectionSite, drawn: FrameNoise, amplitudes: Float) -> Single:
         """Return frames with the flare less their known mean, shape (n_amplitude, n_draw, n_frame, n_sum)."""
-        here = place.frames
-        mean = np.atleast_2d(place.mean if drawn.light is None else place.mean * (1 + drawn.light[:, here]))
-        glow = np.sqrt(np.maximum(place.mean, 0))
+        here = site.frames
+        mean = np.atleast_2d(site.mean if drawn.light is None else site.mean * (1 + drawn.light[:, here]))
+        glow = np.sqrt(np.maximum(site.mean, 0))
         own = np.einsum("kj,jmt->mtk", self.photons.astype(np.float32), drawn.own[:, :, here] * glow)
         rise = mean[:, :, None] * self.response.astype(np.float32)
         noise = np.moveaxis(drawn.noise[:, :, here], 0, 2)
         return np.asarray([noise + x * rise + np.sqrt(x) * own for x in amplitudes.astype(np.float32)])
 
-    def _critical(self, place: Place, values: tuple[Single, Single, Single]) -> Single:
+    def _critical(self, site: InjectionSite, values: tuple[Single, Single, Single]) -> Single:
         a, b, c = values
         left = np.float32(self.threshold) - a
         # Root of b x^2 + c x = left in its numerically stable form; zero if there is an alarm without the flare.
@@ -251,37 +253,37 @@ class Injecting:
         root += c
         with np.errstate(divide="ignore", invalid="ignore"):
             np.divide(2 * left, root, out=root)
-        root[~((b > 0) & place.counts[:, None]).repeat(root.shape[1] // b.shape[1], axis=1)] = np.inf
-        np.copyto(root, 0, where=(left <= 0) & place.counts[:, None])
+        root[~((b > 0) & site.counts[:, None]).repeat(root.shape[1] // b.shape[1], axis=1)] = np.inf
+        np.copyto(root, 0, where=(left <= 0) & site.counts[:, None])
         return np.asarray(root.min(axis=(0, 2)) ** 2)
 
-    def _fitted(self, drawn: Drawn, refit: Refit) -> dict[str, Single]:
+    def _fitted(self, drawn: FrameNoise, refit: Refit) -> dict[str, Single]:
         """Fit the detected flares of one stare; arrays of shape (n_half_width, n_amplitude), NaN if not detected."""
         kept = {name: np.full(refit.amplitudes.shape, np.nan, np.float32) for name in FIT_QUANTITIES}
-        for d, (place, row) in enumerate(zip(self.places, refit.amplitudes, strict=True)):
-            if not len(place.filters):
+        for d, (site, row) in enumerate(zip(self.sites, refit.amplitudes, strict=True)):
+            if not len(site.filters):
                 continue
-            value, temperature, template = (each[:, 0] for each in self.best(place, drawn, row))
+            value, temperature, template = (each[:, 0] for each in self.best(site, drawn, row))
             alarm = value >= self.threshold
             if not alarm.any():
                 continue
-            here, which = place.frames, template[alarm]
+            here, which = site.frames, template[alarm]
             recovered = refit.fit.recover(
-                self.sums(place, drawn, row[alarm])[:, 0],
+                self.sums(site, drawn, row[alarm])[:, 0],
                 self.start_s[here],
-                peak_s=place.peaks_s[which],
-                half_width_s=place.widths_s[which],
+                peak_s=site.peaks_s[which],
+                half_width_s=site.widths_s[which],
                 temperature_k=refit.kelvin[temperature[alarm]],
                 variance=self.variance[here],
                 curves=None if self.curves is None else self.curves[:, here],
             )
-            for name, values in refit.compared(recovered, row[alarm], place).items():
+            for name, values in refit.compared(recovered, row[alarm], site).items():
                 kept[name][d, alarm] = values
         return kept
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
+class FrameNoise:
     """Random part of the frames of some stares."""
 
     noise: Float  # sums without a flare less their known mean, shape (n_sum, n_draw, n_frame)

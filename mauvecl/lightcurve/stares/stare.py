@@ -259,7 +259,7 @@ class Stare:
         return np.column_stack([self.start_s[first], self.start_s[last] + self.frame_s])
 
     def dark_factor(self, quiet: Expectation) -> Float:
-        """Known factor on an expectation's dark in each frame, by the instrument's law, shape (n_frame,)."""
+        """Return the factor on an expectation's dark current in each frame, shape (n_frame,)."""
         slope, at = quiet.conditions["dark_slope_per_c"], quiet.conditions["temperature_c"]
         return np.asarray(np.exp(slope * (self.temperature_c - at)))
 
