@@ -27,6 +27,7 @@ QUESTIONS: list[tuple[str, list[str], str]] = [
     ("limit", [*LIMIT, "flare.amplitudes=[1e-6]"], "limit.of"),
     ("limit", [*LIMIT, "run.fap=1e-4"], "fap"),
     ("limit", [*LIMIT, "sweep.axes=[{quantity='magnitude', values=[6, 9]}]"], "sweep"),
+    ("detect", ["processes.jitter={uniform=[0, 0.9]}"], "jitter"),
     ("measure", ["flare.geometry=replaces"], "flare.geometry"),
     ("measure", ["flare.amplitudes=[0.5, 0.0]"], "flare.amplitudes"),
     ("inject", [SIZES], "injections.of"),

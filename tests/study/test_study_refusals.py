@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -81,6 +82,28 @@ SETTINGS = [
 def test_bad_settings_are_named(setting: str, key: str) -> None:
     with refused(key):
         Study().with_settings([setting])
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ("[run]\nsead = 3", "run.sead"),
+        ("[[star]]\nlibrary = 'G2V'\nmagnitud = 3", "star.0.magnitud"),
+        ("[run\nseed = 3", "file"),
+        ("[run]\nfap = 2", "run.fap"),
+        ("[flare]\namplitudes = []", "flare.amplitudes"),
+        ("[[star]]\nmagnitude = 3", "star.0.library"),
+        ("[observation]\nexposure_s = 'long'", "observation.exposure_s"),
+        ("[processes]\njitter = { unform = [0, 1] }", "processes.jitter.unform"),
+        ("[processes]\njitter = { normal = [0, 1] }", "processes.jitter.uniform"),
+        ("[processes]\njitter = { uniform = [0.05, 0] }", "processes.jitter.low"),
+        ("[processes.cosmic_rays]\nrate_per_cm2_s = -1", "processes.cosmic_rays.rate_per_cm2_s"),
+    ],
+)
+def test_bad_study_files_are_named(text: str, key: str, tmp_path: Path) -> None:
+    (tmp_path / "study.toml").write_text(text)
+    with refused(key):
+        Study.read(tmp_path / "study.toml")
 
 
 @pytest.mark.parametrize("spread", [0, -1.0, True, "much", float("inf"), float("nan"), [1]])
