@@ -199,6 +199,54 @@ class Quantity:
     label: str  # of an axis, with the unit
 
 
+@dataclass(frozen=True)
+class Slider:
+    """Range and step of a slider, additive or by factors."""
+
+    low: float
+    high: float
+    step: float
+    log: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Widget:
+    """Field of the page that sets a key.
+
+    Attributes
+    ----------
+    label : str
+    hint : str
+        Explanation for visitors, in sentences.
+    group : str
+        Heading under which the field stands; empty for fields that show at once.
+    place : int
+        Order within the group; fields of the same place follow the order of the study.
+    name : str
+        Name in links; that of the key by default.
+    first : str, optional
+        Text of a new page; the default of the key by default.
+    choices : tuple of str
+        Accepted words; those of the key by default.
+    unit : str
+        Unit as the page shows it; that of the key by default.
+    scale : float
+        Factor from the value of the key to that of the page.
+    slider : Slider, optional
+    """
+
+    label: str
+    hint: str
+    group: str = ""
+    place: int = 0
+    name: str = ""
+    first: str | None = None
+    choices: tuple[str, ...] = ()
+    unit: str | None = None
+    scale: float = 1.0
+    slider: Slider | None = None
+
+
 def found(kind: Any, of: type[Metadata]) -> list[Metadata]:
     """Return all metadata of a class in an annotation or field, outermost first."""
     return [one for one in _metadata(kind) if isinstance(one, of)]

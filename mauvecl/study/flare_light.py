@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Help, Quantity, Range, Unit
+from mauvecl.schema.fields import Flag, Help, Quantity, Range, Unit, Widget
 from mauvecl.schema.physical import AreaRatio, BalmerJump, LineFraction, LineScale, Temperature
 from mauvecl.schema.section import Section
 
@@ -32,6 +32,12 @@ class FlareLight(Section):
         BalmerJump | None,
         Help("Ratio of the flare's flux just below the Balmer edge to that just above", default="1"),
         Flag("--balmer-jump"),
+        Widget(
+            label="Balmer jump",
+            hint="Flux just below 364.6 nm over that just above, by hydrogen recombination: 1 to 4 in most flares. "
+            "Nothing: a plain blackbody.",
+            group="Flare's spectrum",
+        ),
         Quantity(
             "balmer_jump", "flux of the flare just below the Balmer edge over that just above", "Balmer jump ratio"
         ),
@@ -41,12 +47,23 @@ class FlareLight(Section):
         Temperature | None,
         Help("Temperature of a second blackbody of the flare", "needs its area"),
         Flag("--second-temperature"),
+        Widget(
+            label="Second temperature",
+            hint="A second blackbody in the flare, instead of a Balmer jump. Nothing: there is none.",
+            group="Flare's spectrum",
+        ),
         Quantity("second_temperature", "temperature of the flare's second blackbody", "second temperature (K)"),
     ] = None
     second_area: Annotated[
         AreaRatio | None,
         Help("Area of the second blackbody over that of the first"),
         Flag("--second-area"),
+        Widget(
+            label="Second area",
+            hint="Area at the second temperature over that at the first, if there is one.",
+            group="Flare's spectrum",
+            first="0.05",
+        ),
         Quantity("second_area", "area of the flare's second blackbody over that of the first", "second area"),
     ] = None
     lines: Annotated[

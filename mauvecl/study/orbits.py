@@ -11,7 +11,7 @@ from pydantic import ValidationError, ValidationInfo, field_validator, model_val
 from mauvecl.host.files.text_table import read_text_table
 from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Help, Range, Unit
+from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, Widget
 from mauvecl.schema.physical import Distance, Duration, Energy, Magnitude
 from mauvecl.schema.records import holds_truth, input_error
 from mauvecl.schema.text import shortened, shown
@@ -243,6 +243,14 @@ class PlanQuestion(Section):
         Annotated[float, Unit("h"), Range(0, open_low=True)] | None,
         Help("Exposure of each target at most", default="all"),
         Flag("--hours"),
+        Widget(
+            label="Hours of the campaign",
+            hint="How long the target is observed, at most: what would be found is on the tab Plan.",
+            group="Visibility and plan",
+            place=1,
+            first="100",
+            slider=Slider(10, 1000, 10),
+        ),
     ] = None
     half_width_s: Annotated[Duration, Help("Half-width of flares of the energy at_erg")] = 100.0
     at_erg: Annotated[Energy, Help("That energy")] = 1e33

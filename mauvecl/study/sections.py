@@ -14,7 +14,7 @@ from mauvecl.noise.priors import Prior, PriorField
 from mauvecl.noise.unknowns import INSTRUMENT_VALUES
 from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Help, Quantity, Range
+from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Widget
 from mauvecl.schema.physical import (
     Amplitude,
     BinWidth,
@@ -67,9 +67,25 @@ class Star(Section):
         Magnitude | None,
         Help("Magnitude", "one for all stars or one each, as in 7,8"),
         Flag("--magnitude", "-m", kind=list[float]),
+        Widget(
+            label="Magnitude",
+            hint="How bright the star is without the flare, in the band beside it.",
+            first="8.5",
+            unit="",
+            slider=Slider(0, 15, 0.1),
+        ),
         Quantity("magnitude", "magnitude of the star in its band", "magnitude"),
     ] = None
-    band: Annotated[str, Help("Band of the magnitude", choices=", ".join(ALIASES)), Flag("--band")] = "V"
+    band: Annotated[
+        str,
+        Help("Band of the magnitude", choices=", ".join(ALIASES)),
+        Flag("--band"),
+        Widget(
+            label="Band",
+            hint="The band of the magnitude. In V, Vega has 0.03, as in catalogues.",
+            choices=tuple(ALIASES),
+        ),
+    ] = "V"
     magnitude_system: Annotated[
         Literal["catalogue", "vega", "ab"],
         Help("Zero point of the magnitude", choices="catalogue, vega (Vega is 0 in every band) or ab"),
@@ -162,12 +178,30 @@ class Flare(Section):
             help=Help("Table of flares with their amplitudes", "CSV, ECSV or FITS, as AltaiPony's ampl_rec"),
         ),
         Flag("--amplitude", "-a"),
+        Widget(
+            label="Flare amplitude",
+            hint="By how much the flare at its peak brightens the star in the band of the Kepler satellite. In the "
+            "ultraviolet the rise is many times as large.",
+            name="amplitude_percent",
+            first="2",
+            unit="%",
+            scale=100.0,
+            slider=Slider(0.01, 1000, 10**0.1, log=True),
+        ),
         Quantity("amplitude", "flare amplitude: relative rise of the photons in the flare's band", "flare amplitude"),
     ] = (0.0076, 0.02, 0.081, 0.24)
     temperature_k: Annotated[
         Temperature,
         Help("Flare temperature"),
         Flag("--flare-temperature"),
+        Widget(
+            label="Flare temperature",
+            hint="The flare shines as a blackbody of this temperature. The hotter, the more of its light is "
+            "ultraviolet.",
+            group="Flare's spectrum",
+            name="flare_temperature_k",
+            slider=Slider(5000, 30_000, 500),
+        ),
         Quantity("flare_temperature", "blackbody temperature of the flare", "flare temperature (K)"),
     ] = 10_000.0
     band: Annotated[str, Help("Band of the amplitude", choices=", ".join(ALIASES)), Flag("--flare-band")] = "Kepler"
@@ -200,17 +234,37 @@ class Observation(Section):
         Exposure,
         Help("Exposure time", "rounded up to whole frames of 5 s"),
         Flag("--exposure", "-t"),
+        Widget(
+            label="Exposure",
+            hint="Time on the star; whole frames of 5 s are added up.",
+            place=1,
+            slider=Slider(5, 3600, 5),
+        ),
         Quantity("exposure", "length of the exposure", "exposure (s)"),
     ] = 50.0
     instrument: Annotated[
         str,
         Help("Instrument", choices="mauve (as in the paper), mauve-electrons (for planning), or your own TOML file"),
         Flag("--instrument"),
+        Widget(
+            label="Payload",
+            hint="mauve as its paper has it, or with the dark current counted in electrons.",
+            group="Detector",
+            place=1,
+            choices=("mauve", "mauve-electrons"),
+        ),
     ] = "mauve"
     temperature_c: Annotated[
         DetectorTemperature | None,
         Help("Detector temperature", default="the instrument's"),
         Flag("--temperature"),
+        Widget(
+            label="Detector temperature",
+            hint="The dark current doubles every few degrees.",
+            group="Detector",
+            first="21",
+            slider=Slider(-10, 40, 1),
+        ),
         Quantity("detector_temperature", "temperature of the detector", "detector temperature (deg C)"),
     ] = None
     order: Annotated[
@@ -221,6 +275,13 @@ class Observation(Section):
         Literal["net", "paper"],
         Help("Signal of an S/N", choices="net (the star alone) or paper (with the zodiacal light)"),
         Flag("--signal"),
+        Widget(
+            label="Counted as signal",
+            hint="In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It "
+            "moves no detection.",
+            group="Sky",
+            place=2,
+        ),
     ] = "net"
     mode: Annotated[Literal["auto", "frames", "stacked"], Help("How the frames of an exposure are drawn")] = "auto"
     recipe: Annotated[Literal["auto", "joint", "apart"], Help("How the noise of a frame is drawn")] = "auto"
@@ -244,14 +305,30 @@ class SkyLight(Section):
         SkyBrightness | None,
         Help("Surface brightness of the sky in V", "or none", default=f"{DEFAULT_SKY:g}"),
         Flag("--sky", kind=str),
+        Widget(
+            label="Sky brightness",
+            hint="Of the zodiacal light, V magnitudes per square arc second.",
+            group="Sky",
+            place=1,
+            name="sky_brightness",
+            first=f"{DEFAULT_SKY:g}",
+            unit="mag/arcsec²",
+            slider=Slider(20, 24, 0.1),
+        ),
         Quantity("sky", "zodiacal surface brightness in V", "sky brightness (V mag / arcsec²)"),
     ] = None
     target: Annotated[
         str | None,
         Help("Coordinates whose zodiacal light is the sky, with the time", "such as '290.68 +11.12'"),
         Flag("--target"),
+        Widget(label="Target", hint="Coordinates in degrees such as 290.68 +11.12.", group="Sky", place=1),
     ] = None
-    time: Annotated[str | None, Help("Time of the observation, UTC, with the target"), Flag("--time")] = None
+    time: Annotated[
+        str | None,
+        Help("Time of the observation, UTC, with the target"),
+        Flag("--time"),
+        Widget(label="Time, UTC", hint="Such as 2026-09-01T12:00.", group="Sky", place=1),
+    ] = None
     none: Annotated[bool, Help("Whether there is no sky")] = False
 
     @model_validator(mode="before")
@@ -291,14 +368,31 @@ class Run(Section):
     """Number of realisations, seed, statistics and false-alarm probability."""
 
     realisations: Annotated[int, Range(1), Help("Noise realisations"), Flag("--realisations", "-n")] = 1_000_000
-    seed: Annotated[int, Range(0, 2**64 - 1), Help("Seed"), Flag("--seed")] = 1
+    seed: Annotated[
+        int,
+        Range(0, 2**64 - 1),
+        Help("Seed"),
+        Flag("--seed"),
+        Widget(label="Seed", hint="The same seed gives the same noise, to the bit.", group="Detection", place=3),
+    ] = 1
     statistics: Annotated[
         tuple[str, ...],
         Field(min_length=1),
         Help("Detection statistic", choices=f"{', '.join(STATISTIC_NAMES)}, or all"),
         Flag("--statistic", read=parsing.words),
     ] = DEFAULT_STATISTICS
-    fap: Annotated[Probability, Help("False-alarm probability per test"), Flag("--fap")] = 1e-3
+    fap: Annotated[
+        Probability,
+        Help("False-alarm probability per test"),
+        Flag("--fap"),
+        Widget(
+            label="False-alarm probability",
+            hint="How often noise alone passes for a flare, per test: it sets the threshold.",
+            group="Detection",
+            unit="per test",
+            slider=Slider(1e-6, 0.1, 10**0.1, log=True),
+        ),
+    ] = 1e-3
     tails: Annotated[
         Literal["counted", "sampled"],
         Help(

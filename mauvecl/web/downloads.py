@@ -91,6 +91,7 @@ def as_command(question: Question) -> str:
     if q.uploaded is not None or len(q.own_unknown) > 20:
         return "mauvecl detect study.toml"
     data = q.data()
+    spectrum = data["flare"].get("spectrum", {})
     words = ["mauvecl", "detect", "--star", q.star, "--magnitude", f"{q.magnitude:.15g}", "--band", q.band]
     words += [
         "--amplitude",
@@ -103,7 +104,7 @@ def as_command(question: Question) -> str:
         ("second_temperature_k", "--second-temperature"),
         ("second_area", "--second-area"),
     ):
-        words += [flag, f"{q.spectrum[key]:.15g}"] if key in q.spectrum else []
+        words += [flag, f"{spectrum[key]:.15g}"] if key in spectrum else []
     for name, fraction in q.lines:
         words += ["--line", f"{name}={fraction:.15g}"]
     words += ["--exposure", f"{q.exposure_s:.15g}", "--instrument", q.instrument]

@@ -5,38 +5,26 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args, get_origin
 
-from mauvecl.host.stars.band_names import ALIASES
+from pydantic.fields import FieldInfo
+
 from mauvecl.host.stars.catalogue import embedded, library_table
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Range, first, range_of, unit_of
-from mauvecl.schema.physical import (
-    Amplitude,
-    AreaRatio,
-    BalmerJump,
-    DetectorTemperature,
-    Exposure,
-    LineFraction,
-    Magnitude,
-    Probability,
-    SkyBrightness,
-    Temperature,
-)
+from mauvecl.schema.fields import Range, Slider, Unit, Widget, first, found, range_of, unit_of
+from mauvecl.schema.physical import LineFraction
+from mauvecl.schema.section import fields_of
 from mauvecl.schema.text import shortened
 from mauvecl.statistics.registry import STATISTICS
-from mauvecl.study.orbits import PlanQuestion
-from mauvecl.study.sections import Run
+from mauvecl.study.study import Study
 from mauvecl.web.simulations import SIMULATIONS
 
 UPLOADED, UPLOADED_UNKNOWN = "uploaded star", "uploaded spectrum"
 #: Realisations that a visitor may ask for, and with a tail by importance sampling.
 REALISATIONS, SAMPLED = (10_000, 100_000, 1_000_000, 4_000_000), (100_000, 1_000_000)
 
-#: Amplitudes in percent.
-PERCENT = Range(100 * range_of(Amplitude).low, 100 * range_of(Amplitude).high)
 #: Choices of what is unknown.
 UNKNOWN = ("nothing", "the usual")
 SKIES = ("brightness", "target and time", "none")
@@ -120,7 +108,7 @@ def points(text: str) -> tuple[tuple[float, float], ...] | None:
     return spectrum
 
 
-def optional(number: Number) -> Callable[[str], float | int | None]:
+def or_nothing(number: Number) -> Callable[[str], float | int | None]:
     """Return a parser that takes nothing entered for None."""
     return lambda text: number(text) if text.strip() else None
 
@@ -211,16 +199,6 @@ def star_words(name: str) -> str:
 
 
 @dataclass(frozen=True)
-class Slider:
-    """Range and step of a slider, additive or by factors; exposures move by whole frames."""
-
-    low: float
-    high: float
-    step: float
-    log: bool = False
-
-
-@dataclass(frozen=True)
 class Field:
     """Field of the page.
 
@@ -228,13 +206,21 @@ class Field:
     ----------
     label : str
     first : str
-        What stands in it at first.
+        Text of a new page.
     read : callable
-        Text to value; raises InputError with what is accepted.
+        Converts text to the value; raises InputError with what is accepted.
     told : str
-        What it means, for who asks.
+        Explanation for visitors.
     unit : str
     slider : Slider, optional
+    group : str
+        Heading; empty for fields that show at once.
+    place : int
+        Order within the group.
+    path : tuple of str
+        Key of the study that takes the value; empty if `Question` converts it.
+    scale : float
+        Factor from the value of the key to that of the page.
     """
 
     label: str
@@ -243,124 +229,102 @@ class Field:
     told: str = ""
     unit: str = ""
     slider: Slider | None = None
+    group: str = ""
+    place: int = 0
+    path: tuple[str, ...] = ()
+    scale: float = 1.0
 
 
-#: By name, as links and `Question` have them; the default is a flare at the edge of detection.
-FIELDS = {
+def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
+    """Return the field of a key from its metadata."""
+    default = field.get_default()
+    text = "" if default is None else f"{default:g}" if isinstance(default, float) else str(default)
+    unit = first(field, Unit) or Unit("")
+    return Field(
+        widget.label,
+        text if widget.first is None else widget.first,
+        _reader(field, widget, unit.name, optional=default is None and widget.first is None),
+        widget.hint,
+        unit.written if widget.unit is None else widget.unit,
+        widget.slider,
+        widget.group,
+        widget.place,
+        path,
+        widget.scale,
+    )
+
+
+def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> Callable[[str], Any]:
+    choices = widget.choices or (get_args(field.annotation) if get_origin(field.annotation) is Literal else ())
+    if choices:
+        return Choice(choices)
+    reach = first(field, Range)
+    if reach is None:
+        return str
+    if widget.scale != 1.0:
+        reach = replace(reach, low=widget.scale * reach.low, high=widget.scale * reach.high)
+    number = Number(reach, whole=field.annotation is int, unit=unit)
+    return or_nothing(number) if optional else number
+
+
+#: Fields that do not stand for one key of the study.
+_OWN = {
     "star": Field(
         "Star", "G2V", star_name,
         "Whose spectrum: a spectral type of the library, one of its stars by any name (GJ 581, HD 40307), or your own "
-        "file.",
-    ),
-    "magnitude": Field(
-        "Magnitude", "8.5", number_of(Magnitude), "How bright the star is without the flare, in the band beside it.",
-        slider=Slider(0, 15, 0.1),
-    ),
-    "band": Field(
-        "Band", "V", Choice(tuple(ALIASES)), "The band of the magnitude. In V, Vega has 0.03, as in catalogues."
-    ),
-    "amplitude_percent": Field(
-        "Flare amplitude", "2", Number(PERCENT),
-        "By how much the flare at its peak brightens the star in the band of the Kepler satellite. In the ultraviolet "
-        "the rise is many times as large.",
-        "%", Slider(0.01, 1000, 10**0.1, log=True),
-    ),
-    "exposure_s": Field(
-        "Exposure", "50", number_of(Exposure), "Time on the star; whole frames of 5 s are added up.", "s",
-        Slider(5, 3600, 5),
-    ),
-    "flare_temperature_k": Field(
-        "Flare temperature", "10000", number_of(Temperature),
-        "The flare shines as a blackbody of this temperature. The hotter, the more of its light is ultraviolet.", "K",
-        Slider(5000, 30_000, 500),
-    ),
-    "balmer_jump": Field(
-        "Balmer jump", "", optional(number_of(BalmerJump)),
-        "Flux just below 364.6 nm over that just above, by hydrogen recombination: 1 to 4 in most flares. Nothing: a "
-        "plain blackbody.",
-    ),
-    "second_temperature_k": Field(
-        "Second temperature", "", optional(number_of(Temperature)),
-        "A second blackbody in the flare, instead of a Balmer jump. Nothing: there is none.", "K",
-    ),
-    "second_area": Field(
-        "Second area", "0.05", number_of(AreaRatio),
-        "Area at the second temperature over that at the first, if there is one.",
+        "file.", group="", place=-1,
     ),
     "lines": Field(
         "Emission lines", "", line_fluxes,
         "Flux of lines as a fraction of the continuum's in 200-700 nm, such as Mg II=0.03, Ca II=0.02, Balmer=0.1, or "
-        "280=0.03 for one at 280 nm.",
+        "280=0.03 for one at 280 nm.", group="Flare's spectrum", place=1,
     ),
-    "temperature_c": Field(
-        "Detector temperature", "21", number_of(DetectorTemperature), "The dark current doubles every few degrees.",
-        "deg C", Slider(-10, 40, 1),
+    "sky": Field("Sky", "brightness", Choice(SKIES), "Zodiacal light behind the star.", group="Sky", place=0,
     ),
-    "instrument": Field(
-        "Payload", "mauve", Choice(("mauve", "mauve-electrons")),
-        "mauve as its paper has it, or with the dark current counted in electrons.",
-    ),
-    "signal": Field(
-        "Counted as signal", "net", Choice(("net", "paper")),
-        "In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It moves no "
-        "detection.",
-    ),
-    "sky": Field("Sky", "brightness", Choice(SKIES), "Zodiacal light behind the star."),
-    "sky_brightness": Field(
-        "Sky brightness", "22.1", number_of(SkyBrightness),
-        "Of the zodiacal light, V magnitudes per square arc second.",
-        "mag/arcsec²", Slider(20, 24, 0.1),
-    ),
-    "target": Field("Target", "", str, "Coordinates in degrees such as 290.68 +11.12."),
-    "time": Field("Time, UTC", "", str, "Such as 2026-09-01T12:00."),
     "statistic": Field(
         "Detection statistic", "matched", Choice(tuple(STATISTICS)),
-        "; ".join(f"{name}: {one.definition}" for name, one in STATISTICS.items()) + ".",
-    ),
-    "fap": Field(
-        "False-alarm probability", "0.001", number_of(Probability),
-        "How often noise alone passes for a flare, per test: it sets the threshold.", "per test",
-        Slider(1e-6, 0.1, 10**0.1, log=True),
+        "; ".join(f"{name}: {one.definition}" for name, one in STATISTICS.items()) + ".", group="Detection", place=1,
     ),
     "unknown": Field(
         "Unknown", UNKNOWN[0], Choice(UNKNOWN),
         "What differs from exposure to exposure and is not known: the usual are detector temperature, light lost and "
-        "sky. They are drawn, and the statistic is made blind to them.",
+        "sky. They are drawn, and the statistic is made blind to them.", group="Unknown", place=0,
     ),
     "own_unknown": Field(
         "Own unknown spectrum", "", points,
         "Something else of known shape and unknown strength, such as stray light: pairs of nm and DN, as in "
-        "200 1, 450 3, 700 1, or a file of two columns.",
+        "200 1, 450 3, 700 1, or a file of two columns.", group="Unknown", place=1,
     ),
     "see": Field(
         "Target to see", "", seen_target,
         "When it can be seen is on the tab Visibility: a name such as eps Eri or AU Mic, or coordinates such as "
-        "53.23 -9.46.",
-    ),
-    "hours": Field(
-        "Hours of the campaign", "100", Number(first(PlanQuestion.model_fields["hours"], Range) or Range(), unit="h"),
-        "How long the target is observed, at most: what would be found is on the tab Plan.", "h", Slider(10, 1000, 10),
+        "53.23 -9.46.", group="Visibility and plan", place=0,
     ),
     "realisations": Field(
         "Realisations", "100000",
         Choice((*map(str, REALISATIONS), *(f"{count} sampled" for count in SAMPLED)), draws),
         "How many noisy exposures a simulation draws. At least 100 must lie beyond the threshold; a sampled tail "
-        "(importance sampling) needs fewer.",
-    ),
-    "seed": Field(
-        "Seed", "1", Number(first(Run.model_fields["seed"], Range) or Range(), whole=True),
-        "The same seed gives the same noise, to the bit.",
+        "(importance sampling) needs fewer.", group="Detection", place=2,
     ),
 }  # fmt: skip
-#: Fields that show at once, and the others by what they are about.
-ASKED = ("star", "magnitude", "band", "amplitude_percent", "exposure_s")
+_KEYS = {
+    widget.name or path[-1]: _field(path, field, widget)
+    for path, field in fields_of(Study)
+    for widget in found(field, Widget)
+}
+#: Fields by name, as in links and in `Question`; the default is a flare at the edge of detection.
+FIELDS = dict(sorted((_OWN | _KEYS).items(), key=lambda item: item[1].place))
+
+
+def _group(name: str) -> tuple[str, ...]:
+    return tuple(key for key, field in FIELDS.items() if field.group == name)
+
+
+#: Fields that show at once, and the others by their headings; the band stands next to the magnitude.
+ASKED = ("star", *(name for name in _group("") if name != "star"))
 ADVANCED = {
-    "Detection": ("fap", "statistic", "realisations", "seed"),
-    "Flare's spectrum": ("flare_temperature_k", "balmer_jump", "second_temperature_k", "second_area", "lines"),
-    "Detector": ("temperature_c", "instrument"),
-    "Sky": ("sky", "sky_brightness", "target", "time", "signal"),
-    "Unknown": ("unknown", "own_unknown"),
-    "Visibility and plan": ("see", "hours"),
+    name: _group(name)
+    for name in ("Detection", "Flare's spectrum", "Detector", "Sky", "Unknown", "Visibility and plan")
 }
 #: Fields that ask for something under one sky only.
 ASKED_UNDER = {"sky_brightness": "brightness", "target": "target and time", "time": "target and time"}

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
-from mauvecl.web.fields import UPLOADED, Draws
+from mauvecl.web.fields import FIELDS, UPLOADED, Draws, Field
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
 
+#: Fields whose values only count with those of others.
+CONDITIONAL = ("sky_brightness", "target", "time", "second_area", "hours")
 Points = tuple[tuple[float, float], ...]
 #: Name of an uploaded star's file beside its study.
 STAR_FILE = "star.ecsv"
@@ -20,34 +23,16 @@ STAR_FILE = "star.ecsv"
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """Valid values of all fields, which `fields.FIELDS` describes."""
+    """Valid values of all fields of `fields.FIELDS`, by name, and an uploaded star."""
 
-    star: str
-    magnitude: float
-    band: str
-    exposure_s: float
-    temperature_c: float
-    instrument: str
-    signal: str
-    sky: str
-    sky_brightness: float
-    target: str
-    time: str
-    amplitude_percent: float
-    flare_temperature_k: float
-    balmer_jump: float | None
-    second_temperature_k: float | None
-    second_area: float
-    lines: tuple[tuple[str, float], ...]
-    statistic: str
-    fap: float
-    realisations: Draws
-    unknown: str
-    own_unknown: Points
-    see: str
-    hours: float
-    seed: int
+    values: Mapping[str, Any]
     uploaded: Source | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        """Return the value of a field, as in ``question.magnitude``."""
+        if name != "values" and name in self.values:
+            return self.values[name]
+        raise AttributeError(name)
 
     def study(self, folder: Path | None = None) -> Study:
         """Return the question as a study.
@@ -76,50 +61,43 @@ class Question:
         file : str
             Where an uploaded spectrum is.
         """
-        star: dict[str, Any] = {"magnitude": self.magnitude, "band": self.band}
-        if self.uploaded is None:
-            star["library"] = self.star
-        else:
-            star["file"] = file
-        skies: dict[str, dict[str, Any]] = {
-            "brightness": {"surface_brightness": self.sky_brightness},
-            "target and time": {"target": self.target, "time": self.time},
+        values = self.values
+        data: dict[str, Any] = {}
+        for name, field in FIELDS.items():
+            if field.path and name not in CONDITIONAL and values[name] is not None:
+                self._set(data, field, values[name])
+        data["star"] = [data["star"] | ({"file": file} if self.uploaded else {"library": values["star"]})]
+        data["sky"] = {
+            "brightness": {"surface_brightness": values["sky_brightness"]},
+            "target and time": {"target": values["target"], "time": values["time"]},
             "none": {"none": True},
+        }[values["sky"]]
+        if values["second_temperature_k"] is not None:
+            self._set(data, FIELDS["second_area"], values["second_area"])
+        if values["lines"]:
+            data["flare"].setdefault("spectrum", {})["lines"] = dict(values["lines"])
+        own = {"own": {"points": values["own_unknown"]}} if values["own_unknown"] else {}
+        data["nuisances"] = {"usual": values["unknown"] == "the usual", "own": own}
+        draws: Draws = values["realisations"]
+        data["run"] |= {
+            "realisations": draws.number,
+            "tails": draws.tails,
+            "statistics": list(dict.fromkeys(["chi2", "chi2_element", values["statistic"]])),
         }
-        own = {"own": {"points": self.own_unknown}} if self.own_unknown else {}
-        seen = {"orbit": {"targets": [self.see.strip()]}, "plan": {"hours": self.hours}}
-        orbit = seen if self.see.strip() else {}
-        spectrum = self.spectrum
-        return orbit | {
-            "star": [star],
-            "flare": {"amplitudes": [self.amplitude_percent / 100.0], "temperature_k": self.flare_temperature_k}
-            | ({"spectrum": spectrum} if spectrum else {}),
-            "observation": {
-                "exposure_s": self.exposure_s,
-                "temperature_c": self.temperature_c,
-                "instrument": self.instrument,
-                "signal": self.signal,
-            },
-            "sky": skies[self.sky],
-            "nuisances": {"usual": self.unknown == "the usual", "own": own},
-            "run": {
-                "realisations": self.realisations.number,
-                "tails": self.realisations.tails,
-                "seed": self.seed,
-                "statistics": list(dict.fromkeys(["chi2", "chi2_element", self.statistic])),
-                "fap": self.fap,
-            },
-        }
+        if values["see"].strip():
+            data |= {"orbit": {"targets": [values["see"].strip()]}, "plan": {"hours": values["hours"]}}
+        return data
 
-    @property
-    def spectrum(self) -> dict[str, Any]:
-        """The study's section of the flare's spectrum; empty for a blackbody."""
-        given: dict[str, Any] = {}
-        if self.balmer_jump is not None:
-            given["balmer_jump"] = self.balmer_jump
-        if self.second_temperature_k is not None:
-            given |= {"second_temperature_k": self.second_temperature_k, "second_area": self.second_area}
-        return given | ({"lines": dict(self.lines)} if self.lines else {})
+    @staticmethod
+    def _set(data: dict[str, Any], field: Field, value: Any) -> None:
+        """Set the key of a field in the data of a study, in place."""
+        *sections, key = field.path
+        for section in sections:
+            data = data.setdefault(section, {})
+        if field.scale != 1.0:
+            value = value / field.scale
+        # A single flare.
+        data[key] = [value] if key == "amplitudes" else value
 
 
 def write_spectrum(source: Source, folder: Path) -> Path:

@@ -122,7 +122,7 @@ class State:
         values = {name: self._values[name] for name in FIELDS}
         if values["own_unknown"] is None:
             values["own_unknown"] = self.unknown
-        return Question(**values, uploaded=self.uploaded if values["star"] == UPLOADED else None)
+        return Question(values, uploaded=self.uploaded if values["star"] == UPLOADED else None)
 
     @property
     def simulated(self) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ import io
 import json
 import logging
 import lzma
+import math
 import re
 import resource
 import shlex
@@ -42,7 +43,7 @@ from mauvecl.study.study import Study
 from mauvecl.web import access, closed_forms, server, visitor
 from mauvecl.web.closed_forms import ClosedForms, percent
 from mauvecl.web.downloads import as_command, as_python
-from mauvecl.web.fields import FIELDS, PRESETS, UPLOADED_UNKNOWN, star_names, star_words
+from mauvecl.web.fields import FIELDS, PRESETS, UPLOADED_UNKNOWN, Number, star_names, star_words
 from mauvecl.web.figures import INKS
 from mauvecl.web.plain_log import Plain
 from mauvecl.web.simulations import SIMULATIONS, campaign_plan
@@ -50,7 +51,7 @@ from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS, limit
 from mauvecl.web.upload import MOST_UPLOADED, read_pairs, read_upload
 
-NUMBERS = [name for name, field in FIELDS.items() if hasattr(field.read, "low")]
+NUMBERS = [name for name, field in FIELDS.items() if isinstance(field.read, Number)]
 HOSTILE = "![x](http://127.0.0.1:1/x.png) <img src=http://127.0.0.1:1/y.png>"
 
 
@@ -64,7 +65,8 @@ HOSTILE = "![x](http://127.0.0.1:1/x.png) <img src=http://127.0.0.1:1/y.png>"
 def test_no_number_is_guessed(name: str, text: str) -> None:
     state = State()
     state.enter({name: text})
-    assert re.search(r"expected a (whole )?number from \S+ to \S+", state.faults[name]), "what it accepts"
+    read: Any = FIELDS[name].read
+    assert read.range.words(read.unit, whole=read.whole) in state.faults[name], "what it accepts"
     assert state.entered[name] == text, "what stands there stays"
     with refused(name, FIELDS[name].label):
         state.question()
@@ -76,11 +78,18 @@ def test_no_number_is_guessed(name: str, text: str) -> None:
 @pytest.mark.parametrize("name", NUMBERS)
 def test_ranges_end_where_they_say(name: str) -> None:
     read: Any = FIELDS[name].read
-    for end in (read.low, read.high):
-        assert read(f"{end:.17g}") == end
-    for beyond in (read.low - 1, 2 * read.high + 1):
-        with refused("number"):
-            read(f"{beyond:.15g}")
+    reach = read.range
+    text = str if read.whole else "{:.17g}".format
+    for end, is_open in ((reach.low, reach.open_low), (reach.high, reach.open_high)):
+        if is_open and math.isfinite(end):
+            with refused("number"):
+                read(text(end))
+        elif math.isfinite(end):
+            assert read(text(end)) == end
+    for beyond in (reach.low - 1, 2 * reach.high + 1):
+        if math.isfinite(beyond):
+            with refused("number"):
+                read(text(beyond))
 
 
 def test_stars_by_any_name_they_have() -> None:

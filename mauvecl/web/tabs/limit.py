@@ -38,7 +38,7 @@ def odds(closed: ClosedForms, magnitude: float, rises: Float) -> list[DetectionF
 
 def _key(closed: ClosedForms) -> tuple[Any, ...]:
     """Return everything on which a map depends except its axes."""
-    asked = vars(closed.question).items()
+    asked = closed.question.values.items()
     uploaded = closed.question.uploaded
     return (*(value for name, value in asked if name not in FREE), None if uploaded is None else uploaded.digest)
 
