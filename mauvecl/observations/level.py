@@ -73,9 +73,11 @@ def quiescent_level(frames: Frames, flux: Float, error: Float | None, median_s: 
     usable = reasons == 0
     if usable.sum() < 10:
         raise InputError(
-            f"{frames.name} has {usable.sum()} frames without a fault, expected at least 10", key="frames",
-            value=int(usable.sum()), expected="at least 10 frames without a fault",
-        )  # fmt: skip
+            f"{frames.name} has {usable.sum()} frames without a fault",
+            "at least 10",
+            key="frames",
+            value=int(usable.sum()),
+        )
     width = max(3, round(median_s / frames.cadence_s))
     quiet = usable.copy()
     excess = float("nan")
@@ -85,9 +87,11 @@ def quiescent_level(frames: Frames, flux: Float, error: Float | None, median_s: 
         spread = _scatter(frames.numbers[quiet], ((flux - level) / stated)[quiet])
         if not spread > 0:
             raise InputError(
-                f"{frames.name}: the flux of most frames is the same, expected a light curve with noise", key="flux",
-                value=float(np.median(flux[quiet])), expected="a light curve with noise",
-            )  # fmt: skip
+                f"{frames.name}: the flux of most frames is the same",
+                "a light curve with noise",
+                key="flux",
+                value=float(np.median(flux[quiet])),
+            )
         now = usable & (np.abs(flux - level) < CLIP * spread * stated)
         if (now == quiet).all():
             break

@@ -76,7 +76,7 @@ def _fits_table(content: bytes, what: str, mapping: FrameMapping | None) -> File
     try:
         check_sizes(content)
     except InputError as error:
-        raise InputError(f"{what} {error}") from error
+        raise error.within(what) from error
     with parsing(what, FORMATS), warnings.catch_warnings(), fits.open(io.BytesIO(content), memmap=False) as hdus:
         warnings.simplefilter("ignore")
         tables = {n: hdu for n, hdu in enumerate(hdus) if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)}

@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 from mauvecl.schema.text import shown
-
-#: The usual sentence: ``key = value, expected this``, after the name of a file or section where there is one.
-_SENTENCE = re.compile(
-    r"(?:[^:=]*: )?(?P<key>[A-Za-z_][\w. ]*?) = (?P<value>.+?)(?:, expected (?P<expected>.+))?$", re.S
-)
 
 
 class InputError(ValueError):
@@ -44,13 +38,7 @@ class InputError(ValueError):
     def __init__(
         self, fault: str = "", expected: str | None = None, *, key: str | None = None, value: Any = None
     ) -> None:
-        message = f"{fault}, expected {expected}" if expected else fault
-        super().__init__(message)
-        found = _SENTENCE.match(message)
-        if key is None and found is not None:
-            key, value = found["key"].replace(" ", "_"), found["value"] if value is None else value
-        if expected is None and ", expected " in message:
-            expected = message.partition(", expected ")[2]
+        super().__init__(f"{fault}, expected {expected}" if expected else fault)
         self.key, self.value, self.expected = key, value, expected
 
     def within(self, place: str) -> InputError:

@@ -57,7 +57,10 @@ class Record(BaseModel, metaclass=_InputErrorMeta):
             super().__setattr__(name, value)
         except ValidationError:
             raise InputError(
-                f"{type(self).__name__}.{name} is not set in place, expected a changed copy: with_, with_settings, at"
+                f"{type(self).__name__}.{name} is not set in place",
+                "a changed copy: with_, with_settings, at",
+                key=name,
+                value=value,
             ) from None
 
 

@@ -74,9 +74,7 @@ def drawn(study: Study) -> DrawnStudies:
         try:
             changed.observation.load_instrument()
         except InputError as error:
-            raise InputError(
-                f"the priors of unknown values include impossible ones: {error}", key=error.key, value=error.value
-            ) from error
+            raise error.within("the priors of unknown values include impossible ones") from error
         studies.append(changed)
     return DrawnStudies(tuple(priors), values, tuple(studies))
 

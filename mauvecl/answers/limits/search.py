@@ -285,7 +285,9 @@ def settle(question: LimitSearch, start: float) -> Interval:
     except InputError as error:
         outside = question.prior_clause(start)
         if outside:
-            raise InputError(f"{error}{outside}", key=error.key, value=error.value) from error
+            longer = InputError(f"{error}{outside}", key=error.key, value=error.value)
+            longer.expected = error.expected
+            raise longer from error
         raise
 
 
