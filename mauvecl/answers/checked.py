@@ -66,7 +66,7 @@ def verify_answer(folder: str | Path) -> list[FileFault]:
     """Compare an answer's folder with the digests in its run record.
 
     Notices any change of a file that the run wrote, and of the record itself. It is no signature: who changes a file
-    and computes the digests anew is not noticed. Other files in the folder are not looked at.
+    and computes the digests anew is not noticed. Other files in the folder are ignored.
 
     Parameters
     ----------

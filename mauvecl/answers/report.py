@@ -62,7 +62,7 @@ def write_table(table: Table, path: Path) -> Path:
     """
     if path.suffix == ".fits":
         plain, packed = table.copy(), io.BytesIO()
-        # FITS keywords have eight letters and short values: the study goes beside it.
+        # FITS keywords have eight letters and short values: the study has its own file.
         plain.meta = {FITS_KEYWORDS[k]: v for k, v in plain.meta.items() if k in FITS_KEYWORDS}
         plain.write(packed, format="fits")
         write_whole(path, packed.getbuffer())
@@ -140,19 +140,18 @@ def write_record(
         Their provenance holds the digests of the inputs.
     folder : Path
     pool : Pool, optional
-        Who drew,
+        The pool that drew, if any.
     opened : Device, optional
-        or on which device something was drawn without a pool.
+        The device, if something was drawn without a pool.
     seconds : float
         Wall time.
     messages : sequence of str
-        What the reader was told.
+        Messages for the reader.
     files : sequence of Path, optional
-        What was written next to the record, which holds their digests and one of itself; see `checked.verify_answer`.
+        Written files; the record contains their digests and its own, see `checked.verify_answer`.
     whole : bool
-        Whether these are all files of the answer. What the record of another run in the folder names, as that run left
-        it, is then removed where this one has written nothing of that name: no picture or table of another run stays
-        next to these.
+        Whether these are all files of the answer. If so, unchanged files of an earlier run in the folder that this run
+        did not write are removed.
     """
     record: dict[str, Any] = {
         "mauvecl": VERSION,
@@ -176,8 +175,8 @@ def write_record(
             record["shards"] = asdict(pool.standing)
         from mauvecl.device.selftest import read_outcome
 
-        told = "not run on this device and version: mauvecl selftest"
-        record["selftest"] = [read_outcome(device) or told for device in devices]
+        missing = "not run on this device and version: mauvecl selftest"
+        record["selftest"] = [read_outcome(device) or missing for device in devices]
     stale: list[Path] = []
     if files is not None:
         record["files"] = {path.name: digest_of(path) for path in files}

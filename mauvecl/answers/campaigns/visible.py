@@ -103,7 +103,7 @@ class VisibleAnswer(Answer):
 
     @property
     def times(self) -> TimeGrid:
-        """The times that are looked at."""
+        """The time grid."""
         return self.visibility.track.times
 
     @cached_property

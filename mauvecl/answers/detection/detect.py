@@ -58,7 +58,7 @@ class StarDetection(InCell):
 
     @property
     def shown(self) -> tuple[str, Detection, list[str]]:
-        """Title, findings and names of the flares, as pictures take them."""
+        """Title, detection and names of the flares, for pictures."""
         return self.title, self.detection, [f"flare {100 * amplitude:g} %" for amplitude in self.amplitudes]
 
 
@@ -72,9 +72,9 @@ class DetectAnswer(Answer):
     stars : list of StarDetection
         One per star and cell of the sweep.
     messages : list of str
-        What the reader must be told, worst first.
+        Messages for the reader, the most severe first.
     paper : list of str
-        The comparison with the paper's values, where the study holds its G2V star.
+        Comparison with the paper's values, if the study has its G2V star.
     """
 
     USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")

@@ -37,11 +37,11 @@ if TYPE_CHECKING:
     from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use
 
-#: Share of normal values within one standard deviation.
+#: Fraction of normal values within one standard deviation.
 ONE_SIGMA = float(special.ndtr(1.0) - special.ndtr(-1.0))
-#: Standard errors beyond which a difference is told, and how many of them a 95 % interval is wide.
+#: Significance of reported differences, and width of a 95 % interval, in standard errors.
 SURE, ERRORS_IN_INTERVAL = 4, 3.92
-#: A false-alarm probability further below the promised one is as wrong as this.
+#: Smallest ratio of false-alarm probabilities that is distinguished.
 SMALLEST_RATIO = 1e-3
 #: Columns of the table of resolution elements.
 ELEMENT_COLUMNS = (
@@ -77,7 +77,7 @@ WORST_COLUMNS = (
            description="largest significant difference of a detection probability from the closed form",
            heading="detection off by", format="+.4f"),
 )  # fmt: skip
-#: Looked at where a study sweeps over nothing.
+#: Default sweep.
 GRID = Sweep(
     axes=(
         Axis(quantity="magnitude", values=(4.0, 6.0, 8.0, 10.0, 12.0)),
@@ -283,14 +283,14 @@ def gaussian(
     if not study.sweep.axes:
         study = study.model_copy(update={"sweep": GRID})
 
-    def told_of(part: int) -> Callable[[int, int], None]:
-        def told(done: int, total: int) -> None:
+    def progress_of(part: int) -> Callable[[int, int], None]:
+        def report(done: int, total: int) -> None:
             if progress is not None:
                 progress(part * total + done, 2 * total)
 
-        return told
+        return report
 
-    return GaussianReport(study, snr(study, engine, told_of(0)), detect(study, engine, told_of(1)))
+    return GaussianReport(study, snr(study, engine, progress_of(0)), detect(study, engine, progress_of(1)))
 
 
 #: The older name.

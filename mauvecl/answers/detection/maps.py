@@ -59,12 +59,12 @@ class MapResult(Answer):
         Values of both axes.
     statistics : tuple of str
     probability, low, high, closed_form : ndarray, shape (n_statistic, n_y, n_x)
-        Detection probability, its 95 % interval with the threshold's own, and the same for Gaussian noise; NaN where
-        every pixel saturates.
+        Detection probability, its 95 % interval including that of the threshold, and the probability for Gaussian
+        noise; NaN if every pixel saturates.
     messages : list of str
     shares : dict of dict of float
-        By statistic, where the map is averaged over what is unknown: the share of the variance of its mean probability
-        that each unknown explains, the largest first.
+        For maps averaged over unknowns, by statistic: the share of the variance of the mean probability that each
+        unknown explains, largest first.
     quiet : Expectation, optional
         The star of the first cell.
     """
@@ -121,7 +121,7 @@ class MapResult(Answer):
 
     @property
     def assumed(self) -> str:
-        """One line with what the study assumes beside the two quantities of the map."""
+        """One line with the study's assumptions apart from the two quantities of the map."""
         from mauvecl.study.assumptions import assumption_line
 
         return assumption_line(self.study, self.USES, (self.study.map.x.quantity, self.study.map.y.quantity))
@@ -167,12 +167,12 @@ def map(
     maps = []
     for number, one in enumerate(draws):
 
-        def told_of(done: int, number: int = number) -> None:
+        def report(done: int, number: int = number) -> None:
             if progress is not None:
                 cells = len(x) * len(y)
                 progress(number * cells + done, len(draws) * cells)
 
-        maps.append(_map(one, x, y, engine, seen, of_flares, lowered, told_of))
+        maps.append(_map(one, x, y, engine, seen, of_flares, lowered, report))
     values, parts = maps[0], {}
     if unknown is not None:
         values = _averaged(maps)
@@ -247,9 +247,9 @@ def _without_threshold(run: Run, values: Arrays) -> list[str]:
 
 def _wrong_sign(case: Case, lowered: set[Lowered], cells: int) -> list[str]:
     """Return a sentence for each weighted sum on the cells whose flare lowers it, if any."""
-    told = "marginalised over unknowns, " if case.study.nuisances != NuisanceChoice() else ""
+    how = "marginalised over unknowns, " if case.study.nuisances != NuisanceChoice() else ""
     return [
-        f"WRONG SIGN: {told}{statistic} falls with the flare in {number} of {cells} cells, and only higher values are "
+        f"WRONG SIGN: {how}{statistic} falls with the flare in {number} of {cells} cells, and only higher values are "
         "alarms: its detection probability says nothing of the flare there."
         for statistic in case.study.run.statistics
         if (number := sum(name == statistic for name, *_ in lowered))
@@ -264,7 +264,7 @@ def _map(
     seen: list[Expectation],
     of_flares: list[str],
     lowered: set[Lowered],
-    told_of: Callable[[int], None],
+    report: Callable[[int], None],
 ) -> Arrays:
     """Compute the map on one instrument.
 
@@ -287,7 +287,7 @@ def _map(
         seen.append(quiet)
         of_flares.extend(texts)
         done += count
-        told_of(done)
+        report(done)
     return values
 
 

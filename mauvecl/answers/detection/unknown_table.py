@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from mauvecl.study.assumptions import Use
     from mauvecl.study.study import Study
 
-#: What is looked at where nothing else is named: METHODS' table, and more.
+#: Default unknowns, which include those of the table in METHODS.
 SHOWN: dict[str, NuisanceChoice] = {
     spoken(choice): choice
     for choice in (

@@ -45,25 +45,25 @@ class Limit:
     of, statistic : str
     fap, power : float
     value : Interval
-        With the simulation's own 95 % interval, that of the threshold included.
+        With its 95 % interval, including that of the threshold.
     closed_form : float
-        The same for Gaussian noise.
+        Limit for Gaussian noise.
     check : Point
         Detection probability at the value, simulated again with another seed.
     points : tuple of Point
-        What was simulated on the way.
+        Simulations of the search.
     curve : tuple of (value, probability)
         The closed form around the limit.
     at : mapping
-        What the study sweeps over.
+        Sweep values.
     unknown : Unknown, optional
-        Where the limit is averaged over what is unknown.
+        For limits averaged over unknown instrument values.
     messages : tuple of str
-        What saturates at the limit, without the flare and with it.
+        Saturation at the limit, without and with the flare.
     cost : Cost, optional
-        What it costs there not to know all of the instrument.
+        Loss of S/N to unknowns at the limit.
     quiet : Expectation, optional
-        The star there, without the flare.
+        The star at the limit, without the flare.
     """
 
     star: str
@@ -85,17 +85,17 @@ class Limit:
 
     @property
     def agrees(self) -> bool:
-        """Whether the fresh simulation's 95 % interval holds the wanted power."""
+        """True if the 95 % interval of the second simulation contains the power."""
         p = self.check.probability
         return p.low <= self.power <= p.high
 
     @property
     def verdict(self) -> str:
-        """What the fresh simulation says of the limit, in two words.
+        """Verdict of the second simulation on the limit.
 
-        "confirms it" where its interval holds the wanted power; of whole frames "exceeds it" where it lies above the
-        power; "DIFFERS" where it misses the power by more than its own width; nothing between, as chance makes of one
-        in six.
+        It is "confirms it" if its interval contains the power, "exceeds it" if exposures of whole frames have more
+        power, and "DIFFERS" if the interval misses the power by more than its width. It is empty in between, which
+        happens by chance for one limit in six.
         """
         p = self.check.probability
         if self.agrees:
@@ -108,16 +108,16 @@ class Limit:
 
 @dataclass(eq=False)
 class LimitResult(Answer):
-    """What `limiting_magnitude` and its relatives answer.
+    """The answer of `limit`.
 
     Attributes
     ----------
     study : Study
     limits : list of Limit
     assumptions : QTable, optional
-        How far what is assumed of the instrument moves them (`assumptions.what_matters`).
+        Change of the limits with assumptions about the instrument (`assumptions.what_matters`).
     failed : tuple of str
-        Why there is no limit of some of the stars, flares or statistics.
+        Reasons for missing limits.
     """
 
     USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
@@ -218,7 +218,7 @@ class LimitResult(Answer):
 
     @property
     def messages(self) -> list[str]:
-        """What holds at the limits, what is told of the stars, and what is unknown."""
+        """Messages about failed limits, the stars, and unknowns."""
         stars = worst_first(
             [
                 *(text for one in self.limits for text in one.messages),

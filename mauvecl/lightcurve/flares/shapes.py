@@ -316,21 +316,21 @@ class TableShape(Shape):
 
     def __post_init__(self) -> None:
         tau, values = np.array(self.tau, np.float64), np.array(self.values, np.float64)
-        told = f"the flare shape {shortened(self.name)}"
+        name = f"the flare shape {shortened(self.name)}"
         if tau.ndim != 1 or tau.shape != values.shape or tau.size < 2:
             raise InputError(
-                f"{told} has {tau.size} times and {values.size} values",
+                f"{name} has {tau.size} times and {values.size} values",
                 "as many, at least 2",
                 key="values",
                 value=values.size,
             )
         if not (np.isfinite(tau).all() and (np.diff(tau) > 0).all()):
             raise InputError(
-                f"{told} has times that do not ascend", "finite ones in ascending order", key="tau", value=tau
+                f"{name} has times that do not ascend", "finite ones in ascending order", key="tau", value=tau
             )
         if not (np.isfinite(values).all() and values.min() >= 0 and values.max() > 0):
             raise InputError(
-                f"{told} has values from {values.min():g} to {values.max():g}",
+                f"{name} has values from {values.min():g} to {values.max():g}",
                 "finite ones of at least 0, some above it",
                 key="values",
                 value=values,
