@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from refusals import refused
 from scenes import instrument, star
+from searches import DAVENPORT, KNOWN, ONE
 
 from mauvecl import Study
 from mauvecl.device.engine import Engine
@@ -20,15 +21,18 @@ from mauvecl.host.stars.source import Source
 from mauvecl.lightcurve.defaults import per_day
 from mauvecl.lightcurve.flares.energies import EnergyScale
 from mauvecl.lightcurve.flares.events import Cooling, Event, coefficients, temperatures_of
-from mauvecl.lightcurve.flares.rates import RateTable, preset
+from mauvecl.lightcurve.flares.rates import PowerLaw, RateTable, davenport2019, fiducial2018, preset
 from mauvecl.lightcurve.flares.shapes import Fiducial, TableShape, shape_of
-from mauvecl.lightcurve.search.completeness import Completeness, frame_signal, search_threshold
+from mauvecl.lightcurve.search.bank import Bank, Level
+from mauvecl.lightcurve.search.completeness import Completeness, DurationLaw, frame_signal, search_threshold
+from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.search.yields import fit_power_law
 from mauvecl.lightcurve.stares.along import stare_along
 from mauvecl.lightcurve.stares.components import Components
 from mauvecl.lightcurve.stares.curves import Sinusoid, Table
 from mauvecl.lightcurve.stares.stare import Stare, StareUnknown
 
+BANK = Bank((20.0,), ONE, DAVENPORT, 5.0, KNOWN)
 START = np.arange(20) * 5.0
 TWO = np.array([0.0, 1.0])
 
@@ -67,10 +71,30 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "band": (lambda: EnergyScale.of_blackbody(1.0, 5778.0, band="Q"), "band"),
     "distance": (lambda: EnergyScale.of_star(Source.from_library("G2V"), -1.0), "distance_pc"),
     "energy": (lambda: EnergyScale.of_blackbody(1.0, 5778.0).equivalent_duration(0.0), "energy_erg"),
+    "exponent of rates": (lambda: PowerLaw(alpha=0.5, log10_beta=30.0), "alpha"),
+    "undefined rates": (lambda: PowerLaw(alpha=2.0, log10_beta=np.nan), "log10_beta"),
+    "largest energy": (lambda: PowerLaw(alpha=2.0, log10_beta=30.0, largest_erg=0.0), "largest_erg"),
+    "measured energies": (lambda: PowerLaw(alpha=2.0, log10_beta=30.0, measured_erg=(2.0, 1.0)), "measured_erg"),
+    "scatter of rates": (lambda: PowerLaw(alpha=2.0, log10_beta=30.0, scatter_dex=9.0), "scatter_dex"),
+    "rate at an energy": (lambda: PowerLaw.through(2.0, 1e32, 0.0), "per_day"),
+    "exponent through a rate": (lambda: PowerLaw.through(0.5, 1e32, 1.0), "alpha"),
+    "rising rates": (lambda: davenport2019(mass_msun=2.0, age_myr=10.0), "mass_msun"),
+    "Si IV light": (lambda: fiducial2018(0.0), "quiescent_si_iv_erg_s"),
     "preset": (lambda: preset("B"), "preset"),
     "no false alarms": (lambda: per_day(0.0, "day"), "false_alarms"),
     "undefined false alarms": (lambda: per_day(float("nan"), "year"), "false_alarms"),
     "false alarms per week": (lambda: per_day(1.0, "week"), "per"),
+    "exponent of durations": (lambda: DurationLaw(exponent=2.0), "exponent"),
+    "scatter of durations": (lambda: DurationLaw(scatter_dex=9.0), "scatter_dex"),
+    "half width of durations": (lambda: DurationLaw(half_width_s=0.0), "half_width_s"),
+    "slope of a baseline": (lambda: Level(offset=False, slope=True), "slope"),
+    "window of a baseline": (lambda: Level(window_s=-1.0), "window_s"),
+    "half widths of a bank": (lambda: Bank((2.0, 1.0), ONE, DAVENPORT, 5.0, KNOWN), "half_widths_s"),
+    "frames of a bank": (lambda: Bank((20.0,), ONE, DAVENPORT, 0.0, KNOWN), "frame_s"),
+    "directions of a bank": (lambda: Bank((20.0,), 0 * ONE, DAVENPORT, 5.0, KNOWN), "directions"),
+    "bank of other frames": (lambda: Search(Bank((20.0,), ONE, DAVENPORT, 4.0, KNOWN), Stare.of(500.0)), "frame_s"),
+    "curves without a cycle": (lambda: Search(BANK, Stare.of(500.0), np.ones((1, 100))), "curves"),
+    "shape of sums": (lambda: Search(BANK, Stare.of(500.0)).largest(np.zeros((1, 3, 1))), "sums"),
     "no rate": (lambda: search_threshold(0.0), "false_alarms_per_day"),
     "high rate": (lambda: search_threshold(1e6), "false_alarms_per_day"),
     "low rate": (lambda: search_threshold(1e-99), "false_alarms_per_day"),
