@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from mauvecl.results.detection.detection import Detection
     from mauvecl.results.measurements.fit import fit, forecast
     from mauvecl.results.measurements.model import FlareModel
+    from mauvecl.results.measurements.two_temperatures import fit_two_temperatures
     from mauvecl.runs.cluster import DaskWorkers
     from mauvecl.runs.pool import LocalWorkers, Pool
     from mauvecl.schema.errors import InputError
@@ -114,6 +115,7 @@ __all__ = [
     "exposure_for",
     "fit",
     "fit_cooling",
+    "fit_two_temperatures",
     "forecast",
     "gaussian",
     "gaussian_report",
@@ -179,6 +181,7 @@ _HOMES = HOMES | {
     "expect": "host.expectation",
     "exposure_for": "answers.signal.exposures",
     "fit_cooling": "lightcurve.stares.cooling_fit",
+    "fit_two_temperatures": "results.measurements.two_temperatures",
     "measure_along": "lightcurve.stares.measured",
     "shortest_exposure": "answers.limits.limits",
     "smallest_amplitude": "answers.limits.limits",

@@ -76,6 +76,8 @@ REASONS = {
     "ObservedFlare.read.wavelength_unit": "a unit, no wavelength",
     "ObservedFlare.read.continue_at_k": "handed on to ObservedFlare.from_arrays",
     "fit.frames": "raw DN, as Engine.realise gives them",
+    "fit_two_temperatures.frames": "as fit takes them",
+    "fit_two_temperatures.skipped_nm": "as fit takes them",
 } | {
     f"{name}.{method}.wavelength_nm": "grids of spectra, as Source has them"
     for name in ("BalmerFlare", "Blackbody", "FlareWithLines", "ObservedFlare", "TwoBlackbodies")

@@ -116,6 +116,7 @@ def bounded_intervals(
             ends = _linear_ends(faces, spline(x), least)
         else:
             ends = _ratio_ends(profile, faces, spline, x, least)
+            ends = one.offset + ends[0], one.offset + ends[1]
         columns.append(ends)
     # A parabola through the outermost samples may pass a bound.
     lows = np.maximum(np.column_stack([c[0] for c in columns]), model.bounds)
@@ -146,7 +147,7 @@ def _ratio_ends(
     x: Float,
     least: Float,
 ) -> tuple[Float, Float]:
-    """Return the ends of 1 + per x (amplitude 1) / (amplitude 0); see `profile.ratio_roots`."""
+    """Return the ends of per x (amplitude 1) / (amplitude 0); see `profile.ratio_roots`."""
     components, per = profile.components(x), spline(x)
     lows, highs = np.full(x.shape, np.inf), np.full(x.shape, -np.inf)
     for face, _, _, gain, positive in faces:
@@ -184,4 +185,4 @@ def _ratio_ends(
                     weights = np.einsum("...jk,...k->...j", np.linalg.pinv(np.swapaxes(lines, -1, -2)), left)
                     there &= (weights >= 0).all(axis=-1)
                 lows[there], highs[there] = np.minimum(lows, r)[there], np.maximum(highs, r)[there]
-    return 1.0 + extreme(lows, np.minimum), 1.0 + extreme(highs, np.maximum)
+    return extreme(lows, np.minimum), extreme(highs, np.maximum)

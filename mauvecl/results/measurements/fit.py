@@ -194,23 +194,7 @@ def fit(
     >>> [round(float(x), 2) for x in found.estimates[0, :2]]
     [9000.0, 0.5]
     """
-    raw = np.atleast_2d(np.asarray(frames, np.float64))
-    if raw.ndim != 2 or not len(raw) or raw.shape[1] != expectation.wavelength_nm.size:
-        raise InputError(
-            f"frames of the shape {raw.shape}",
-            f"{expectation.wavelength_nm.size} pixels in each of some",
-            key="frames",
-            value=raw.shape,
-        )
-    if not np.isfinite(raw).all():
-        raise InputError("frames hold undefined values", "finite numbers", key="frames")
-    if not levels:
-        raise InputError.of("levels", levels, "at least one probability")
-    excess = raw - expectation.recorded_dn
-    nm = expectation.wavelength_nm
-    left_out = np.zeros(nm.size, np.bool_)
-    for low, high in skipped_nm:
-        left_out |= (nm >= low) & (nm <= high)
+    excess, left_out = checked_excess(frames, expectation, levels, skipped_nm)
 
     def reduction_of(added_dn: Float | None) -> Reduction:
         return Reduction.of(model, expectation, added_dn, nuisances, left_out)
@@ -219,7 +203,7 @@ def fit(
     parts: list[tuple[NDArray[np.intp], dict[str, Any]]] = []
     for step in range(REFITS):
         parts = []
-        for rows, reduction in _groups(expectation, model, log_k, linear, reduction_of):
+        for rows, reduction in variance_groups(expectation, model, log_k, linear, reduction_of):
             for start in range(0, rows.size, BATCH):
                 some = rows[start : start + BATCH]
                 parts.append((some, _fitted(excess[some], model, reduction, levels if step == REFITS - 1 else ())))
@@ -236,6 +220,29 @@ def fit(
     return Measurement(model.names, model.units, model.bounds, levels=tuple(levels), dof=int(dof.min()), **joined)
 
 
+def checked_excess(
+    frames: ArrayLike, expectation: Expectation, levels: Sequence[float], skipped_nm: Sequence[tuple[float, float]]
+) -> tuple[Float, NDArray[np.bool_]]:
+    """Return frames less the quiescent mean, and pixels that are left out; raises InputError as `fit`."""
+    raw = np.atleast_2d(np.asarray(frames, np.float64))
+    if raw.ndim != 2 or not len(raw) or raw.shape[1] != expectation.wavelength_nm.size:
+        raise InputError(
+            f"frames of the shape {raw.shape}",
+            f"{expectation.wavelength_nm.size} pixels in each of some",
+            key="frames",
+            value=raw.shape,
+        )
+    if not np.isfinite(raw).all():
+        raise InputError("frames hold undefined values", "finite numbers", key="frames")
+    if not levels:
+        raise InputError.of("levels", levels, "at least one probability")
+    nm = expectation.wavelength_nm
+    left_out = np.zeros(nm.size, np.bool_)
+    for low, high in skipped_nm:
+        left_out |= (nm >= low) & (nm <= high)
+    return raw - expectation.recorded_dn, left_out
+
+
 def _pilot(excess: Float, model: FlareModel, reduction: Reduction) -> tuple[Float, Float]:
     """Return fits with one variance for all frames, that of the quiescent star."""
     log_k, linear = np.empty(len(excess)), np.empty((len(excess), len(model.linear)))
@@ -246,7 +253,7 @@ def _pilot(excess: Float, model: FlareModel, reduction: Reduction) -> tuple[Floa
     return log_k, linear
 
 
-def _groups(
+def variance_groups(
     quiet: Expectation,
     model: FlareModel,
     log_k: Float,

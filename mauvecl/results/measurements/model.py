@@ -60,7 +60,8 @@ class Derived:
     factors : ndarray, shape (n_node, n_linear), optional
         The quantity is the sum of these times the amplitudes; None for the temperature and for a ratio.
     ratio : ndarray, shape (n_node,), optional
-        The quantity is one plus amplitude 1 over amplitude 0 times this.
+        The quantity is `offset` plus amplitude 1 over amplitude 0 times this.
+    offset : float
     """
 
     name: str
@@ -68,11 +69,12 @@ class Derived:
     description: str
     factors: Float | None = None
     ratio: Float | None = None
+    offset: float = 1.0
 
     @property
     def bound(self) -> float:
         """Smallest value, that of amplitudes of zero."""
-        return 1.0 if self.ratio is not None else 0.0 if self.factors is not None else -np.inf
+        return self.offset if self.ratio is not None else 0.0 if self.factors is not None else -np.inf
 
 
 @public
@@ -275,7 +277,7 @@ def derived_values(model: FlareModel, log_k: Float, linear: Float) -> Float:
         else:
             positive = linear[:, 0] > 0.0
             over = np.divide(linear[:, 1], linear[:, 0], out=np.full(log_k.size, np.nan), where=positive)
-            columns.append(1.0 + spline(log_k) * over)
+            columns.append(one.offset + spline(log_k) * over)
     return np.column_stack(columns)
 
 

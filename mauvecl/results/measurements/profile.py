@@ -333,7 +333,7 @@ def gradient_of(model: FlareModel, log_k: Float, linear: Float) -> Float:
             gradient[:, q, m] = np.einsum("nl,nl->n", spline(log_k, 1), linear)
         else:
             amplitude = np.where(linear[:, 0] > 0, linear[:, 0], np.nan)
-            gradient[:, q, 0] = (1.0 - values[:, q]) / amplitude
+            gradient[:, q, 0] = (one.offset - values[:, q]) / amplitude
             gradient[:, q, 1] = spline(log_k) / amplitude
             gradient[:, q, m] = spline(log_k, 1) * linear[:, 1] / amplitude
     return gradient

@@ -1,0 +1,240 @@
+"""Fits of flares with two free temperatures.
+
+At each second temperature, taken from the model's, the flare is one blackbody with a further component of fixed shape,
+so that everything else is a fit of `results.measurements.bounded`. The second temperature is the higher one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike, NDArray
+
+from mauvecl.results.measurements.bounded import BoundedProfile, bounded_intervals
+from mauvecl.results.measurements.fit import LEVELS, Measurement, checked_excess, fit, variance_groups
+from mauvecl.results.measurements.model import Derived, FlareModel, derived_values
+from mauvecl.results.measurements.profile import Best
+from mauvecl.results.measurements.reduction import Reduction
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
+
+if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.statistics.nuisances import Nuisances
+
+Float = NDArray[np.float64]
+
+#: Second temperatures are this many to a node of the model: 0.6 % apart.
+PER_NODE = 3
+#: Steps between those that are tried at first, and number of those within an interval and next to it.
+COARSE, TRIES = 36, 20
+#: Nodes between the temperatures, at least: closer ones are one.
+APART = 4
+
+
+@public
+def fit_two_temperatures(
+    frames: ArrayLike,
+    expectation: Expectation,
+    model: FlareModel,
+    nuisances: Nuisances | None = None,
+    *,
+    levels: Sequence[float] = LEVELS,
+    skipped_nm: Sequence[tuple[float, float]] = (),
+) -> Measurement:
+    """Fit a flare of two blackbodies, both temperatures free, to each of some exposures.
+
+    Parameters
+    ----------
+    frames, expectation, nuisances, levels, skipped_nm
+        As for `fit`.
+    model : FlareModel
+        Of one blackbody, with lines if they are fitted.
+
+    Returns
+    -------
+    Measurement
+        As of `fit`: the temperature is the lower one; amplitude, fluxes and areas are those of both. Then the second
+        temperature, and its area over that of the first. Errors by curvature are undefined where one blackbody alone
+        fits best.
+
+    Raises
+    ------
+    InputError
+        For a model with a Balmer jump, and as `fit`.
+    """
+    if any(one.ratio is not None for one in model.derived):
+        raise InputError("a model with a Balmer jump", "blackbodies, with lines or without", key="model")
+    single = fit(frames, expectation, model, nuisances, levels=levels, skipped_nm=skipped_nm)
+    excess, left_out = checked_excess(frames, expectation, levels, skipped_nm)
+
+    def reduction_of(added_dn: Float | None) -> Reduction:
+        return Reduction.of(model, expectation, added_dn, nuisances, left_out)
+
+    allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
+    parts, order = [], []
+    for rows, reduction in variance_groups(expectation, model, single.log_k, single.amplitudes, reduction_of):
+        sums, rest = reduction.sums(excess[rows])
+        found = _Search(model, reduction, sums, allowed).measured()
+        best, low, high, second, estimates = found
+        chi2 = rest + np.einsum("nk,nk->n", sums, sums) - best.gain
+        dof = reduction.n_used - reduction.n_free - len(model.linear) - 3
+        covariance = _covariance(model, reduction, best, second, estimates)
+        parts.append(
+            Measurement(
+                (*model.names, "second temperature", "second area"), (*model.units, "K", ""),
+                (*model.bounds, -np.inf, 0.0), estimates, covariance, tuple(levels), low, high, chi2,
+                np.asarray(scipy.stats.chi2.sf(chi2, dof)), dof, np.sqrt(best.gain), best.log_k, best.linear,
+            )
+        )  # fmt: skip
+        order.append(rows)
+    return Measurement.joined(parts).rows(np.argsort(np.concatenate(order)))
+
+
+def with_second(model: FlareModel, log_k: float) -> FlareModel:
+    """Return a model of lower temperatures with a blackbody of another one as a further component."""
+    end = _lower(model.log_k, log_k)
+    bolometric = model.splines[model.names.index("flux bolometric")]
+    assert bolometric is not None
+
+    def area(x: Float | float) -> Float:
+        # Flux at the telescope over that of the surface, which is in proportion to the area.
+        return np.asarray(bolometric(x)[..., 0] / np.exp(4 * x))
+
+    def both(one: Derived, spline: scipy.interpolate.CubicSpline | None) -> Derived:
+        if one.factors is None or spline is None:
+            return one
+        return replace(one, factors=np.insert(one.factors[:end], 1, spline(log_k)[0], axis=1))
+
+    share = Derived("second area", "", "area at the second temperature over that at the first",
+                    ratio=area(log_k) / area(model.log_k[:end]), offset=0.0)  # fmt: skip
+    return FlareModel(
+        model.log_k[:end], model.hot[:end], np.vstack([model.hot_spline(log_k), model.fixed]),
+        (model.linear[0], "second", *model.linear[1:]),
+        (*map(both, model.derived, model.splines), share),
+    )  # fmt: skip
+
+
+def _lower(nodes: Float, log_k: float) -> int:
+    """Return the number of nodes that are well below a temperature."""
+    return int(np.searchsorted(nodes, log_k - APART * (nodes[1] - nodes[0]) + 1e-9))
+
+
+class _Search:
+    """The fit of some exposures of one variance over second temperatures."""
+
+    def __init__(self, model: FlareModel, reduction: Reduction, sums: Float, allowed: list[float]) -> None:
+        self._model, self._reduction, self._sums, self._allowed = model, reduction, sums, allowed
+        first, last = model.log_k[2 * APART], model.log_k[-1]
+        #: Second log temperatures that may be tried.
+        self._grid = np.linspace(first, last, PER_NODE * (model.log_k.size - 1 - 2 * APART) + 1)
+        self._gain = np.full((len(sums), self._grid.size), -np.inf)
+
+    def _profile(self, node: int, rows: NDArray[np.intp]) -> BoundedProfile:
+        r, end = self._reduction, _lower(self._reduction.log_k, self._grid[node])
+        own = replace(r, hot=r.hot[:end], fixed=np.vstack([r.spline(self._grid[node]), r.fixed]), log_k=r.log_k[:end])
+        return BoundedProfile(own, self._sums[rows])
+
+    def _look(self, wanted: NDArray[np.bool_]) -> None:
+        """Compute the largest gain at second temperatures, (n, n_node)."""
+        for node in np.flatnonzero(wanted.any(axis=0)):
+            rows = np.flatnonzero(wanted[:, node] & np.isinf(self._gain[:, node]))
+            if rows.size:
+                self._gain[rows, node] = self._profile(int(node), rows).best().gain
+
+    def measured(self) -> tuple[Best, Float, Float, Float, Float]:
+        """Return best fits, intervals (n_level, n, n_derived), second log temperatures, and estimates."""
+        n, nodes = self._gain.shape
+        coarse = np.zeros((n, nodes), np.bool_)
+        coarse[:, ::COARSE] = True
+        self._look(coarse)
+        # Twice, since the first interval may be a single temperature.
+        for margin in (COARSE, COARSE // 4):
+            inside = self._gain >= self._gain.max(axis=1)[:, None] - max(self._allowed)
+            low = np.maximum(inside.argmax(axis=1) - margin, 0)
+            high = np.minimum(nodes - 1 - inside[:, ::-1].argmax(axis=1) + margin, nodes - 1)
+            fine = np.zeros((n, nodes), np.bool_)
+            for share in np.linspace(0.0, 1.0, TRIES + 1):
+                fine[np.arange(n), np.rint(low + share * (high - low)).astype(np.intp)] = True
+            self._look(fine)
+        best_node = self._gain.argmax(axis=1)
+        gain = self._gain.max(axis=1)
+        q = len(self._model.derived) + 2
+        lows, highs = np.full((len(self._allowed), n, q), np.inf), np.full((len(self._allowed), n, q), -np.inf)
+        log_k, linear = np.empty(n), np.empty((n, len(self._model.linear) + 1))
+        estimates = np.empty((n, q))
+        for node in np.flatnonzero((self._gain >= gain[:, None] - max(self._allowed)).any(axis=0)):
+            rows = np.flatnonzero(self._gain[:, node] >= gain - max(self._allowed))
+            profile, model = self._profile(int(node), rows), with_second(self._model, float(self._grid[node]))
+            at_nodes = profile.gain_at_nodes()
+            own = profile.best(at_nodes)
+            here = np.flatnonzero(best_node[rows] == node)
+            log_k[rows[here]], linear[rows[here]] = own.log_k[here], own.linear[here]
+            values = derived_values(model, own.log_k[here], own.linear[here])
+            estimates[rows[here]] = np.insert(values, q - 2, np.exp(self._grid[node]), axis=1)
+            for k, one in enumerate(self._allowed):
+                there = np.flatnonzero(own.gain >= gain[rows] - one)
+                if not there.size:
+                    continue
+                some = self._profile(int(node), rows[there])
+                limit = Best(own.log_k[there], own.linear[there], gain[rows[there]])
+                ends = bounded_intervals(model, some, limit, at_nodes[there], one)
+                for found, end, which in ((lows, ends[0], np.minimum), (highs, ends[1], np.maximum)):
+                    columns = np.delete(np.arange(q), q - 2)
+                    found[k][np.ix_(rows[there], columns)] = which(found[k][np.ix_(rows[there], columns)], end)
+        for k, one in enumerate(self._allowed):
+            lows[k, :, q - 2], highs[k, :, q - 2] = self._second_ends(gain, one)
+        best = Best(log_k, linear, gain)
+        return best, lows, highs, self._grid[best_node], estimates
+
+    def _second_ends(self, gain: Float, allowed: float) -> tuple[Float, Float]:
+        """Return the ends of the second temperature's interval, interpolated between the nodes that were tried."""
+        low, high = np.full(gain.size, -np.inf), np.full(gain.size, np.inf)
+        for k in range(gain.size):
+            tried = np.flatnonzero(np.isfinite(self._gain[k]))
+            root = np.sqrt(np.maximum(gain[k] - self._gain[k, tried], 0.0)) - np.sqrt(allowed)
+            inside = np.flatnonzero(root <= 0)
+            x = self._grid[tried]
+            a, b = inside[0], inside[-1]
+            if a > 0:
+                low[k] = np.exp(np.interp(0.0, [root[a], root[a - 1]], [x[a], x[a - 1]]))
+            if b < tried.size - 1:
+                high[k] = np.exp(np.interp(0.0, [root[b], root[b + 1]], [x[b], x[b + 1]]))
+        return low, high
+
+
+def _covariance(model: FlareModel, reduction: Reduction, best: Best, second: Float, estimates: Float) -> Float:
+    """Return the covariance of quantities, (n, n_derived + 2, n_derived + 2), from the Fisher information."""
+    n, m = best.linear.shape
+    a, b = best.linear[:, 0], best.linear[:, 1]
+    columns = [reduction.spline(best.log_k), reduction.spline(second)]
+    columns += [np.tile(row, (n, 1)) for row in reduction.fixed]
+    columns += [a[:, None] * reduction.spline(best.log_k, 1), b[:, None] * reduction.spline(second, 1)]
+    jacobian = np.stack(columns, axis=1)
+    gradient = np.zeros((n, len(model.derived) + 2, m + 2))
+    for q, (one, spline) in enumerate(zip(model.derived, model.splines, strict=True)):
+        if spline is None or one.factors is None:
+            gradient[:, q, m] = np.exp(best.log_k)
+            continue
+        here, there = spline(best.log_k), spline(second)
+        gradient[:, q, 0], gradient[:, q, 1], gradient[:, q, 2:m] = here[:, 0], there[:, 0], here[:, 1:]
+        gradient[:, q, m] = spline(best.log_k, 1)[:, 0] * a
+        gradient[:, q, m + 1] = spline(second, 1)[:, 0] * b
+    gradient[:, -2, m + 1] = np.exp(second)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        areas = estimates[:, -1]
+        bolometric = model.splines[model.names.index("flux bolometric")]
+        assert bolometric is not None
+        slopes = [4.0 - bolometric(x, 1)[:, 0] / bolometric(x)[:, 0] for x in (best.log_k, second)]
+        gradient[:, -1, 0], gradient[:, -1, 1] = -areas / a, areas / b
+        gradient[:, -1, m], gradient[:, -1, m + 1] = areas * slopes[0], -areas * slopes[1]
+    information = np.einsum("nik,njk->nij", jacobian, jacobian)
+    good = (best.linear > 0).all(axis=1)
+    information[~good] = np.eye(m + 2)
+    inverse = np.linalg.pinv(information, rcond=1e-14, hermitian=True)
+    inverse[~good] = np.nan
+    return np.asarray(np.einsum("nqi,nij,nrj->nqr", np.nan_to_num(gradient), inverse, np.nan_to_num(gradient)))
