@@ -25,6 +25,7 @@ from mauvecl.results.measurements.profile import Profile
 from mauvecl.results.measurements.reduction import Reduction
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import Duration, Moment, Probability
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -114,12 +115,12 @@ def fit_cooling(
     model: FlareModel,
     nuisances: Nuisances | None = None,
     *,
-    peak_s: float,
-    half_width_s: float,
+    peak_s: Moment,
+    half_width_s: Duration,
     shape: str = "davenport2014",
     cooling: bool = True,
     stare: Stare | None = None,
-    levels: Sequence[float] = LEVELS,
+    levels: Sequence[Probability] = LEVELS,
 ) -> Measurement:
     """Fit the shape of one flare and a blackbody whose temperature falls to all frames of a stare together.
 
@@ -155,10 +156,6 @@ def fit_cooling(
     InputError
         For frames of another shape, a model with a jump or lines, or a stare without light of the flare.
     """
-    if not (0.0 < half_width_s < np.inf and np.isfinite(peak_s)):
-        raise InputError.of("half_width_s", half_width_s, "a number above 0, and a finite peak_s")
-    if not all(0.0 < level < 1.0 for level in levels):
-        raise InputError.of("levels", list(levels), "probabilities between 0 and 1")
     if len(model.linear) > 1:
         raise InputError(f"a model of {', '.join(model.linear)}", "a blackbody alone", key="model", value=model.linear)
     raw, stare = checked_frames(frames, quiet, stare)

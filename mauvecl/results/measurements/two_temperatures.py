@@ -21,6 +21,7 @@ from mauvecl.results.measurements.profile import Best
 from mauvecl.results.measurements.reduction import Reduction
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import Probability, Wavelength
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -43,8 +44,8 @@ def fit_two_temperatures(
     model: FlareModel,
     nuisances: Nuisances | None = None,
     *,
-    levels: Sequence[float] = LEVELS,
-    skipped_nm: Sequence[tuple[float, float]] = (),
+    levels: Sequence[Probability] = LEVELS,
+    skipped_nm: Sequence[tuple[Wavelength, Wavelength]] = (),
 ) -> Measurement:
     """Fit a flare of two blackbodies, both temperatures free, to each of some exposures.
 
