@@ -1,4 +1,4 @@
-"""The one place where failures end: a sentence and an exit code for each kind, and never a bare traceback."""
+"""Conversion of failures to one sentence and an exit code, never a bare traceback."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     import typer
 
-#: Exit codes beside 0; 70 and 74 as sysexits.h has them, those above 128 as shells count signals.
+#: Exit codes other than 0; 70 and 74 as sysexits.h has them, those above 128 as shells count signals.
 FAULTY: Final = 1
 BAD_INPUT: Final = 2
 UNFORESEEN: Final = 70
 OUTPUT_FULL: Final = 74
 INTERRUPTED: Final = 130
 READER_GONE: Final = 141
-#: What `--help` says of them.
+#: Their description in `--help`.
 EXIT_CODES = (
     f"Exit codes: 0 done, {FAULTY} a check found a fault, {BAD_INPUT} bad input, {UNFORESEEN} an unforeseen failure "
     f"(a fault of mauvecl; a file with its traceback is named), {OUTPUT_FULL} standard output cannot be written, "
@@ -43,7 +43,7 @@ _folder: Path | None = None
 
 
 def writes_to(folder: Path) -> None:
-    """Tell where an unforeseen failure may leave its traceback."""
+    """Set the folder into which an unforeseen failure writes its traceback."""
     global _folder
     _folder = folder
 
@@ -94,7 +94,7 @@ def _run(app: typer.Typer) -> int:
 
 
 def _failed(error: Exception) -> int:
-    """A wrong use of flags, a device that cannot, or what nobody foresaw."""
+    """Report a wrong use of flags, a device that fails, or an unforeseen failure."""
     if hasattr(error, "format_message") and isinstance(getattr(error, "exit_code", None), int):
         # A usage error of Click's, or help because nothing was asked, which says so itself.
         text = str(error.format_message())
@@ -115,7 +115,7 @@ def _failed(error: Exception) -> int:
 
 
 def _failed_call(error: OSError) -> int:
-    """What the operating system refused: standard output, or a file that the user named."""
+    """Report an error of the operating system: standard output, or a file that the user named."""
     code = _flushed(0)
     if code:
         return code
@@ -138,7 +138,7 @@ def _failed_call(error: OSError) -> int:
 
 
 def _say(text: str, code: int, *, whole: bool = False) -> int:
-    """One sentence on standard error; `whole` keeps the lines of a compiler's log."""
+    """Print one sentence on standard error; `whole` keeps the lines of a compiler's log."""
     if not whole:
         if len(text) > LONGEST:
             text = f"{text[: LONGEST - 203]}...{text[-200:]}"
@@ -149,12 +149,12 @@ def _say(text: str, code: int, *, whole: bool = False) -> int:
 
 
 def _warn(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-    """A warning of a library, on one line."""
+    """Print a warning of a library on one line."""
     _say(f"note: {message} ({category.__name__})", 0)
 
 
 def _print_anything() -> None:
-    """Characters that the terminal's encoding lacks are written as escapes; names may hold any."""
+    """Write characters that the terminal's encoding lacks as escapes; names may contain any."""
     for stream in (sys.stdout, sys.stderr):
         change: Callable[..., None] | None = getattr(stream, "reconfigure", None)
         if change is not None:
@@ -162,7 +162,7 @@ def _print_anything() -> None:
 
 
 def _flushed(code: int) -> int:
-    """The exit code once standard output has taken everything, or that of its failure."""
+    """Flush standard output; return the exit code, or that of a failure to write."""
     try:
         if sys.stdout is not None:
             sys.stdout.flush()
@@ -184,7 +184,7 @@ def _not_written(error: OSError) -> int:
 
 
 def _raised_by(error: BaseException) -> str:
-    """The module that raised it."""
+    """Return the name of the module that raised an exception."""
     step = error.__traceback__
     while step is not None and step.tb_next is not None:
         step = step.tb_next
@@ -192,7 +192,7 @@ def _raised_by(error: BaseException) -> str:
 
 
 def _discard() -> None:
-    """Let what standard output still holds go to nowhere: Python would fail on it once more at its end."""
+    """Discard what standard output still holds; Python would fail on it again at its end."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
@@ -200,7 +200,7 @@ def _discard() -> None:
 
 
 def _write_traceback(error: Exception) -> Path | str:
-    """The traceback in a file: in the output folder where there is one, else in the folder of temporary files."""
+    """Write the traceback to a file in the output folder, or else in the folder of temporary files."""
     from mauvecl.host.version import VERSION
 
     now = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%S")

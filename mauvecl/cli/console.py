@@ -1,4 +1,4 @@
-"""What the terminal shows: tables, messages, progress."""
+"""Output to the terminal: tables, messages, progress."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 PATIENCE_S = 2.0
 #: Columns of a table that goes into a pipe or a file, at most.
 WIDEST = 100_000
-#: Share of the work from which the time left is told: the first tile's rate says little.
+#: Share of the work from which on the time left is estimated; the rate of the first tile says little.
 TOLD_FROM = 0.01
 
 
@@ -31,7 +31,7 @@ class Meter:
     Attributes
     ----------
     standing : callable, optional
-        Tells how far a pool is: what it had from a checkpoint, what it counted again.
+        Returns the progress of a pool, with parts from a checkpoint and parts that were counted again.
     """
 
     standing: Callable[[], PoolProgress] | None = None
@@ -50,7 +50,7 @@ class Meter:
         self._stop()
 
     def __call__(self, done: int, total: int) -> None:
-        """Take note of work done, in the meter's unit."""
+        """Record how much work is done, in the meter's unit."""
         now = time.monotonic()
         if done < self._last and total == self._total:
             # Threads may tell in another order than they worked.
@@ -71,7 +71,7 @@ class Meter:
             print(f"{done} of {total} {self._unit}, {rate:.3g} a second, {left}{self._retries()}", file=sys.stderr)
 
     def _left(self, done: int, total: int, rate: float) -> str:
-        """Time left, once so much is done that it can be told."""
+        """Return the time left, once enough is done to estimate it."""
         if rate * (time.monotonic() - self._started) < TOLD_FROM * total:
             return "time left unknown"
         seconds = (total - done) / rate
@@ -86,7 +86,7 @@ class Meter:
         return (done - resumed) / max(time.monotonic() - self._started, 1e-9)
 
     def _retries(self) -> str:
-        """What a pool tells beside that, where a device failed."""
+        """Return a note on failed devices, if any."""
         retries = 0 if self.standing is None else self.standing().retries
         return f", {retries} parts counted again" if retries else ""
 
@@ -136,7 +136,7 @@ def show_view(view: View) -> None:
 
 
 def show_table(title: str, columns: Sequence[str], cells: Sequence[Sequence[Any]]) -> None:
-    """A table without its empty columns, in parts where the terminal is narrower; numbers are formatted already."""
+    """Print a table without its empty columns, in parts if the terminal is narrower; cells are text."""
     from rich.console import Console
 
     columns, cells = without_empty(columns, cells)

@@ -192,14 +192,14 @@ def _text(default: Any) -> str:
 
 
 def output_flag(usual: str) -> Any:
-    """Where a verb writes, and where unless told."""
+    """Return the option of the output, with its default."""
     return Annotated[
         Path | None,
         typer.Option("--output", "-o", metavar="PATH", help=f"Where to write [{usual}].", show_default=False),
     ]
 
 
-#: How much a verb says, and who draws for it: values of its `Session`, with their defaults.
+#: Options of a verb's `Session`, with their defaults: output on the terminal.
 TELLING = {"as_json": (JsonFlag, False), "quiet": (QuietFlag, False)}
 PICTURES = {
     "pictures": (
@@ -246,5 +246,5 @@ WORKERS = {
         False,
     ),
 }
-#: Of verbs that can be resumed, and draw no realisations.
+#: Options of verbs that can be resumed and draw no realisations.
 RESUMING = {name: WORKERS[name] for name in ("resume", "restart", "keep_after")}

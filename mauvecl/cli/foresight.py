@@ -1,4 +1,4 @@
-"""Questions that cannot be, would never end, or never fit: told before anything large is loaded, or begins."""
+"""Checks before anything large is loaded or begins: invalid values, endless runs, and full disks."""
 
 from __future__ import annotations
 
@@ -26,18 +26,13 @@ MOST_REALISATIONS = 2**63 - 1
 
 
 def question_values(study: Study, *, detects: bool) -> None:
-    """Refuse values that no answer can come of, with the sentences of those who would meet them later.
+    """Raise InputError for values that a later step would reject.
 
     Parameters
     ----------
     study : Study
     detects : bool
-        Whether flares and thresholds are asked for.
-
-    Raises
-    ------
-    InputError
-        For the first of them.
+        Whether the verb needs flares and thresholds.
     """
     from mauvecl.host.instrument.paths import instrument_path
     from mauvecl.host.stars.band_names import known_band
@@ -69,22 +64,22 @@ def _check_file(file: Path) -> None:
         place, _ = without_columns(file)
         there = place.is_file()
     except (OSError, ValueError):
-        # What no name can be is told by who reads it.
+        # The reader reports what cannot be a name.
         return
     if not there:
         read_bytes(place, "spectrum file")
 
 
 def question_time(study: Study, *, device: str | None, cluster: str | None, insist: bool) -> None:
-    """Question a study that could not end within a year.
+    """Raise InputError for a study that cannot end within a year.
 
     Parameters
     ----------
     study : Study
     device, cluster : str, optional
-        As the command line has them.
+        Values of these flags.
     insist : bool
-        The user knows, and wants it all the same.
+        Skip the check of the time.
 
     Raises
     ------
@@ -119,7 +114,7 @@ def question_time(study: Study, *, device: str | None, cluster: str | None, insi
 
 
 def question_room(store: Store, *, insist: bool) -> None:
-    """Question a store that its disk has no room for.
+    """Raise InputError for a store that does not fit on its disk.
 
     Raises
     ------
@@ -142,7 +137,7 @@ def question_room(store: Store, *, insist: bool) -> None:
 
 
 def _rate(device: str | None, cluster: str | None) -> tuple[float, str]:
-    """Pixel-realisations a second at best, and whose rate it is."""
+    """Return the highest pixel-realisations per second, and the source of this rate."""
     cores = os.cpu_count() or 1
     if cluster is not None and not cluster.startswith("local:"):
         return CLUSTER_CORES * CORE_RATE, f"assumed of {CLUSTER_CORES} cores"
@@ -153,7 +148,7 @@ def _rate(device: str | None, cluster: str | None) -> tuple[float, str]:
 
 
 def _held(folder: Path) -> int:
-    """Bytes that an unfinished store has already."""
+    """Return the bytes that an unfinished store already has."""
     return sum(path.stat().st_size for path in folder.glob("star-*/*/c/*/*")) if folder.is_dir() else 0
 
 

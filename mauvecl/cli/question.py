@@ -1,4 +1,4 @@
-"""The study that a verb's flags make of a file, or of the default."""
+"""The study of a verb, from a file or the default, and flags."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def study_of(
     flags: Mapping[str, StudyFlag],
     default: Callable[[dict[str, Any]], Study] | None,
 ) -> Study:
-    """A study file, or the default, with the flags on top, and ``--set`` on top of those."""
+    """Return a study file, or the default, changed by flags and then by ``--set``."""
     from mauvecl.schema.errors import InputError
     from mauvecl.study.study import Study
 
@@ -70,7 +70,7 @@ def _is_toml(file: Path) -> bool:
 
 
 def holds_study(file: Path) -> bool:
-    """Whether a file is no mere table: CSV is one, and ECSV that no answer wrote."""
+    """Return whether a file is not a plain table, such as CSV, or ECSV that no answer wrote."""
     suffix = file.suffix.lower()
     if suffix != ".ecsv" or not file.is_file():
         return suffix != ".csv"
@@ -97,7 +97,7 @@ def sky_of(given: dict[str, Any]) -> dict[str, Any]:
 
 
 def nuisances_of(study: Study, texts: list[str]) -> dict[str, Any]:
-    """What is unknown, as words: dark=0.1, or a file's name, as in stray.txt=free."""
+    """Read nuisance parameters such as dark=0.1, or with the name of a file, stray.txt=free."""
     from mauvecl.noise.unknowns import NUISANCES
     from mauvecl.schema.errors import InputError
     from mauvecl.schema.text import shortened
@@ -157,7 +157,7 @@ def stars_of(study: Study, given: dict[str, Any], flags: Mapping[str, StudyFlag]
 
 
 def _is_there(name: str) -> bool:
-    """Whether a file has that name, which may hold commas."""
+    """Return whether a file has that name, which may contain commas."""
     from mauvecl.host.spectra.formats import without_columns
 
     try:

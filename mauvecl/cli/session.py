@@ -127,7 +127,7 @@ class Session:
 
     @contextmanager
     def checkpoint(self) -> Iterator[Checkpoint]:
-        """What is kept of the work in the output folder; interruptions are told."""
+        """Keep finished parts of the work in the output folder, and report interruptions."""
         from mauvecl.runs.checkpoint import Checkpoint
 
         how: dict[str, Any] = {"resume": self.resume, "restart": self.restart}
@@ -144,7 +144,7 @@ class Session:
         self._checkpoint = checkpoint
 
     def _load(self) -> None:
-        """What tables and pictures are made with: three quarters of a second that would be waited for at the end."""
+        """Import what tables and pictures need, which takes three quarters of a second at the end otherwise."""
         from importlib import import_module
 
         from mauvecl.pictures.registry import load
@@ -189,7 +189,7 @@ class Session:
         return self.pictures
 
     def write(self, table: Table, name: str) -> None:
-        """A table into the folder, by its name's ending."""
+        """Write a table into the folder, in the format of its name's ending."""
         from mauvecl.answers.report import write_table
 
         self.leave(lambda: write_table(table, self.folder / name))
@@ -211,7 +211,7 @@ class Session:
         self.files += [made] if isinstance(made, Path) else made
 
     def record(self, study: Study, inputs: Sequence[Expectation], messages: Sequence[str]) -> None:
-        """The study and the run's record into the folder; what was kept for a resume is no longer needed."""
+        """Write the study and the run record into the folder, and remove what was kept for a resume."""
         from mauvecl.answers.report import write_record, write_study
 
         if self.folder / "study.toml" not in self.files:
@@ -266,14 +266,14 @@ class Session:
         self.record(answer.study, answer.inputs, [*answer.messages, *answer.remarks])
 
     def _written(self) -> str:
-        """What an interruption while files are written leaves."""
+        """Describe what an interruption leaves while files are written."""
         whole = ", ".join(path.name for path in self.files) or "nothing"
         kept = None if self._checkpoint is None else self._checkpoint.kept
         again = "the same command with --resume" if kept else "the same command"
         return f"{whole} written to {str(self.folder)!r}, each file whole, and {again} writes all of them"
 
     def print_json(self, content: dict[str, Any]) -> None:
-        """The answer for machines."""
+        """Print the answer as JSON."""
         from mauvecl.answers.report import json_text
 
         print(json_text(content))
@@ -287,7 +287,7 @@ class Session:
 
 @contextmanager
 def working(device: str | None, cluster: str | None) -> Iterator[Workers]:
-    """The workers asked for; let go at the end, at once where the work ended early."""
+    """Open the workers that were asked for; release them at the end, at once if the work ended early."""
     from mauvecl.runs.pool import LocalWorkers
 
     if cluster is not None:

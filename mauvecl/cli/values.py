@@ -1,4 +1,4 @@
-"""Flags' values as people write them: numbers, counts such as 1e6, lists such as 7,8; one sentence for what is none."""
+"""Values of flags as text: numbers, counts such as 1e6, and lists such as 7,8."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from mauvecl.schema.parsing import count, number, refusal, several
 
 
 def as_text(kind: Any) -> tuple[Any, str, Callable[[str, str], Any] | None]:
-    """A flag's kind as the command line takes it, what it is called, and what reads its value where that is a number.
+    """Return the type of a flag as text, the flag's name, and a reader of its value if it is a number.
 
     Parameters
     ----------
     kind : Annotated
-        A type and a `typer.Option`, whose own limits are kept for the reader.
+        A type and a `typer.Option`, whose limits the reader applies.
     """
     if get_origin(kind) is not Annotated:
         return kind, "", None
@@ -37,7 +37,7 @@ def as_text(kind: Any) -> tuple[Any, str, Callable[[str, str], Any] | None]:
 
 
 def within(text: str, flag: str, *, read: Callable[[str, str], Any], low: float | None, high: float | None) -> Any:
-    """A number between two ends, either of which may be missing.
+    """Read a number between two ends, either of which may be missing.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""A function of a study and a session as a verb of the command line, which takes a study file and flags."""
+"""Decorator that turns a function of a study and a session into a verb with a study file and flags."""
 
 from __future__ import annotations
 
@@ -41,24 +41,24 @@ def takes_study(
     pictures: bool = True,
     observation: Sequence[str] = OBSERVATION,
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Let a verb take a study file and flags, and hand it the study and the session that they make.
+    """Let a verb take a study file and flags, and call it with the resulting study and session.
 
     Parameters
     ----------
     *keys : str
         Keys and sections of the study whose flags the verb takes, in addition to those of the observation.
     name : str
-        The verb's, where it is not the function's.
+        Name of the verb, if it differs from the function's.
     without : str
         A key of the observation that the verb does not take.
     defaults : mapping
         Values of keys where neither a study file nor a flag is given, if they differ from the study's.
     writes : str
-        Where it writes unless told, where that is no folder of tables.
+        Default output, if that is not a folder of tables.
     default : callable, optional
-        Makes the study where no file is given, from the flags; the paper's question by default.
+        Function of the flags that returns the study if no file is given; the paper's question by default.
     draws, pictures : bool
-        Whether the verb draws realisations, and pictures.
+        Whether the verb draws realisations, and whether it makes pictures.
     resumes : bool
         Whether a verb that draws no realisations can be resumed.
     observation : sequence of str
@@ -134,7 +134,7 @@ def takes_study(
         ]
         readers = {}
         for place, parameter in enumerate(parameters):
-            # Numbers come as text: whatever is wrong with one is told in one style.
+            # Numbers are taken as text, so that messages have one style.
             kind, shown, read = as_text(parameter.annotation)
             if read is not None:
                 readers[parameter.name] = shown or "--" + parameter.name.replace("_", "-"), read

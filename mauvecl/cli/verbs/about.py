@@ -1,4 +1,4 @@
-"""The verbs about mauvecl itself: devices, their self-test, what a study may hold."""
+"""Verbs about mauvecl itself: devices, their self-test, the schema of studies."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def devices(
     rate: Annotated[bool, typer.Option("--rate/--no-rate", help="Measure each device for a second.")] = True,
     as_json: JsonFlag = False,
 ) -> None:
-    """OpenCL devices that the kernels can run on, and their rates.
+    """List OpenCL devices that the kernels can run on, and their rates.
 
     Promise: which numbers are the same as on every other device.
     Rate: pixel-realisations per second of the chi2 statistic, two scenarios.
@@ -57,7 +57,7 @@ def devices(
 def selftest(
     device: DeviceFlag = None, output: WhereFlag = None, as_json: JsonFlag = False, quiet: QuietFlag = False
 ) -> None:
-    """Whether your own device gives what it should.
+    """Check that your device computes what it should.
 
     Known answers, the slow twin in NumPy, tests of chance and closed forms, in some ten seconds.
 
@@ -94,7 +94,7 @@ def selftest(
 
 
 def schema() -> None:
-    """The JSON schema of study files, for editors that check TOML.
+    """Print the JSON schema of study files, for editors of TOML.
 
     A study names it in its first line, as in #:schema study.schema.json.
 

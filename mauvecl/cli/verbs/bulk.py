@@ -1,4 +1,4 @@
-"""The verbs of raw spectra in bulk: draw them, verify them, put some into one file."""
+"""Verbs of raw spectra in bulk: draw them, verify them, export a part to one file."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ RowsFlag = Annotated[
     writes="mauvecl-frames.zarr; also NAME.fits, .h5, .hdf5",
 )
 def realise(study: Study, session: Session) -> None:
-    """Raw spectra in bulk: a Zarr store, or one FITS or HDF5 file.
+    """Draw raw spectra in bulk: a Zarr store, a FITS or HDF5 file.
 
     One file holds fewer than 4 GiB. An array per star and flare, a row per realisation, with calibration, units and
     the study. What was written stays: --resume draws what is missing.
@@ -124,7 +124,7 @@ def verify(
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Whether a store or an answer's folder is as it was written.
+    """Check that a store or an answer's folder is as it was written.
 
     In a store, finds flipped bytes, missing and foreign chunks, and can repair them. In the output folder of another
     verb, finds files that were changed or removed, by the digests in its run.json.
@@ -196,7 +196,7 @@ def export(
     replace: Annotated[bool, typer.Option("--replace", help="Take the place of what has that name.")] = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Some of a store as one FITS or HDF5 file.
+    """Write a part of a store as one FITS or HDF5 file.
 
     Example: mauvecl export frames.zarr some.fits --array star-1/quiescent --rows 0:1000
     """

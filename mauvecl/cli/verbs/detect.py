@@ -17,7 +17,7 @@ def detect(
     study: Study,
     session: Session,
 ) -> None:
-    """Whether these flares would be seen: thresholds, probabilities.
+    """Tell whether flares would be seen: thresholds, probabilities.
 
     Without arguments: the paper's K3V star of V = 3.7 and G2V star of V = 7.4 with flares of 0.76, 2, 8.1 and 24 %,
     50 s, one million realisations.
@@ -32,7 +32,7 @@ def gaussian(
     study: Study,
     session: Session,
 ) -> None:
-    """Where the usual root-of-N formula is wrong.
+    """Find where the usual root-of-N formula is wrong.
 
     Its S/N, its intervals and its false alarms, beside those of realisations.
 

@@ -35,7 +35,7 @@ DAY_S = 86_400.0
     defaults={"stare.duration_s": DAY_S},
 )
 def inject(study: Study, session: Session) -> None:
-    """Which flares a search would find: completeness, false alarms.
+    """Find which flares a search detects: completeness, false alarms.
 
     Over energy (or amplitude) and half-width, with the errors of what is recovered.
 

@@ -1,4 +1,4 @@
-"""The verb of spectra: list them, keep one's own, fetch public ones."""
+"""The verb of spectra: list them, keep your own, fetch public ones."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ReplaceFlag = Annotated[bool, typer.Option("--replace", help="Take the place of 
 
 @app.callback()
 def library(context: typer.Context, as_json: JsonFlag = False) -> None:
-    """The embedded spectra and your own.
+    """List the embedded spectra and your own.
 
     `add`, `fetch` and `remove` change yours.
 

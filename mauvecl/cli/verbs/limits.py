@@ -22,7 +22,7 @@ def limit(
         bool, typer.Option("--assumptions", help="Also: how far what is assumed of the instrument moves it.")
     ] = False,
 ) -> None:
-    """Limiting magnitude, smallest amplitude or shortest exposure.
+    """Find the limiting magnitude, smallest amplitude or exposure.
 
     Of a star or flare that is seen with a wanted probability.
 
@@ -43,7 +43,7 @@ def detection_map(
     study: Study,
     session: Session,
 ) -> None:
-    """Detection probability over two quantities, for one star.
+    """Map the detection probability over two quantities, for one star.
 
     Quantities: magnitude, amplitude, flare_temperature, exposure, detector_temperature, sky, star. All cells are drawn
     with the same random numbers.

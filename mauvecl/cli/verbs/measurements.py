@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @takes_study("flare", "measure", *STARE, *NUISANCES, *SIZE, "run.fap", "run.seed", "sweep")
 def measure(study: Study, session: Session) -> None:
-    """What would be measured of a flare's spectrum, and how well.
+    """Measure simulated spectra of flares, and how well that works.
 
     Temperature, area, energy, Balmer jump and lines: errors in advance, simulated fits with the coverage of their
     intervals, the same for flares that a search detects, and what a too simple model makes of the flare.

@@ -21,7 +21,7 @@ def simulate(
     given: dict[str, Any],
     realisation: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Which realisation to show.")] = 0,
 ) -> None:
-    """One observation, and what it is made of.
+    """Simulate one observation, and show what it consists of.
 
     Star, sky, photon noise, dark, bias, read noise, and the closed-form S/N.
 
@@ -34,7 +34,7 @@ def simulate(
 
 
 def _budgets_or_star(given: dict[str, Any]) -> Study:
-    """The paper's noise budgets where nothing is named, else the paper's stars."""
+    """Return the paper's noise budgets if no flag names anything else, or else the paper's stars."""
     from mauvecl.study.study import PAPER_BUDGETS, Study
 
     named = any(given[name] for name in ("star", "magnitude", "exposure", "sweep"))
@@ -46,7 +46,7 @@ def snr(
     study: Study,
     session: Session,
 ) -> None:
-    """Signal-to-noise ratios: their distributions, and noise budgets.
+    """Compute signal-to-noise ratios and noise budgets.
 
     Of each pixel and of each resolution element (10.5 nm).
 
@@ -66,7 +66,7 @@ def exposure(
     study: Study,
     session: Session,
 ) -> None:
-    """The shortest exposure with a wanted S/N at a wavelength.
+    """Find the shortest exposure with a wanted S/N at a wavelength.
 
     By the closed form, in whole frames; `mauvecl snr` goes the other way.
 

@@ -1,4 +1,4 @@
-"""The verbs that look from the orbit: when targets are seen, and what a campaign would find."""
+"""Verbs of the orbit: when targets are visible, and what a campaign would find."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ORBIT = (
 
 @takes_study("orbit.targets", "plan.targets", observation=ORBIT, draws=False)
 def visible(study: Study, session: Session) -> None:
-    """When targets can be seen from the orbit.
+    """Find when targets can be seen from the orbit.
 
     Windows, hours by day and month, the Sun's distance, zodiacal light, a calendar.
 
@@ -40,7 +40,7 @@ def visible(study: Study, session: Session) -> None:
     observation=ORBIT,
 )
 def plan(study: Study, session: Session) -> None:
-    """A campaign: hours, flares expected, false alarms; a report.
+    """Plan a campaign: hours, expected flares, false alarms; a report.
 
     The table has a column name, and what is known of each star: ra and dec, V, spectral_type, distance_pc, mass_msun
     and age_myr, or other rates of flares. Stars of the embedded list need their names only.

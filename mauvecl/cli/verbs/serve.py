@@ -27,7 +27,7 @@ def serve(
     ] = None,
     show: Annotated[bool, typer.Option("--show", help="Open a browser.")] = False,
 ) -> None:
-    """A page in your browser: questions, answers, downloads.
+    """Serve a page in your browser: questions, answers, downloads.
 
     Example: mauvecl serve --show
     """

@@ -19,7 +19,7 @@ def stare(
     given: dict[str, Any],
     device: DeviceFlag = None,
 ) -> None:
-    """One simulated stare: light curves, spectra, flares, a search.
+    """Simulate a stare: light curves, spectra, flares, a search.
 
     Without arguments: the paper's two stars over one orbit, four flares each. The FITS files are read by lightkurve.
 
