@@ -21,7 +21,7 @@ def devices(
     rate: Annotated[bool, typer.Option("--rate/--no-rate", help="Measure each device for a second.")] = True,
     as_json: JsonFlag = False,
 ) -> None:
-    """List OpenCL devices that the kernels can run on, and their rates.
+    """List the OpenCL devices that can run the kernels, and rates.
 
     Promise: which numbers are the same as on every other device.
     Rate: pixel-realisations per second of the chi2 statistic, two scenarios.
