@@ -89,7 +89,7 @@ class Visitor:
 
 
 async def visit(visitor: Visitor, number: int, changes: int, start: float) -> list[float]:
-    """Waits of one visitor who changes something once a second."""
+    """Measure the waits of one visitor who changes something once a second."""
     waits = []
     for i in range(changes):
         await asyncio.sleep(max(0.0, start + i + (number * 0.618) % 1.0 - time.perf_counter()))
@@ -101,7 +101,7 @@ async def visit(visitor: Visitor, number: int, changes: int, start: float) -> li
 
 
 async def bombs(visitor: Visitor, until: asyncio.Event) -> int:
-    """Uploads of files that unpack to much."""
+    """Upload files that unpack to large sizes."""
     content, sent = bz2.compress(bytes(2**30)), 0
     while not until.is_set():
         await visitor.upload(f"star{sent}.fits", content)

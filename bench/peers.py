@@ -65,7 +65,7 @@ def numpy_peer(m: Model) -> Peer:
 
 
 def numpy_threads_peer(m: Model) -> Peer:
-    """The same on two threads, each with its own Generator, which drops the interpreter's lock."""
+    """Draw on two threads, each with its own Generator, which releases the interpreter's lock."""
     generators = [np.random.default_rng(seed) for seed in (1, 2)]
 
     def part(index: int, n: int) -> np.ndarray:
@@ -197,7 +197,7 @@ def _serve(pipe: Connection, make: Callable[[Model], Peer], model: Model) -> Non
 
 
 def children(x: Expectation) -> list[Child]:
-    """The peers that are installed, compiled, each with its mean chi-squared looked at."""
+    """Return the installed peers, compiled and with checked mean chi-squared."""
     found = []
     for make in MAKERS:
         try:

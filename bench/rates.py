@@ -51,7 +51,7 @@ class Line:
 
 
 def ratio(a: Line, b: Line) -> str:
-    """The rate of `a` over that of `b`, of as many pixel-realisations."""
+    """Return the ratio of the rates of `a` and `b` for equal numbers of pixel-realisations."""
     wall, processor = (
         np.median(np.divide(getattr(b, name), getattr(a, name))) for name in ("seconds", "processor_seconds")
     )
@@ -70,7 +70,7 @@ def timed(work: Callable[[int], object]) -> Callable[[int], float]:
 
 
 def scenes(amplitudes: tuple[float, ...], exposure: float = 50.0) -> list[Expectation]:
-    """The paper's G2V star, quiescent and flaring."""
+    """Return the expectations of the paper's G2V star, quiescent and flaring."""
     star = Source.from_library("G2V").at_magnitude(7.4)
     mauve, sky = Instrument.load("mauve"), Sky.of_brightness(22.1)
     sources = (star, *(star.flaring(a) for a in amplitudes))
@@ -78,7 +78,7 @@ def scenes(amplitudes: tuple[float, ...], exposure: float = 50.0) -> list[Expect
 
 
 def engine_lines(engine: Engine) -> list[Line]:
-    """What the engine is for."""
+    """Measure the rate of the engine's detections."""
     quiet, flare, *more = scenes((0.0076, *np.linspace(0.02, 0.3, 14)))
     (frame,) = scenes((), 5.0)
     rows = np.empty((150_000, frame.wavelength_nm.size), np.uint16)

@@ -72,7 +72,7 @@ def copy_rate() -> float:
 
 
 def innermost_loops(library: Path, function: str) -> list[list[str]]:
-    """The instructions of each loop without a loop inside, in the order of the code."""
+    """Return the instructions of each innermost loop, in the order of the code."""
     text = subprocess.run(
         ["objdump", "-d", "--no-show-raw-insn", str(library)], capture_output=True, text=True, check=True
     ).stdout

@@ -37,7 +37,7 @@ for number, record in enumerate(devices()):
 
 
 def vendors(folder: Path) -> dict[str, str]:
-    """The environment with Oclgrind's driver beside the others."""
+    """Return the environment with Oclgrind's driver in addition to the others."""
     listed = Path(os.environ.get("OCL_ICD_VENDORS", "/etc/OpenCL/vendors"))
     for icd in listed.glob("*.icd"):
         shutil.copy(icd, folder)

@@ -38,7 +38,7 @@ PLAN, CORES = 1e15, 1000
 
 
 def timed(work: Callable[[], Any], repeats: int = 5) -> tuple[float, Any]:
-    """The shortest of some times, s, and what came of it."""
+    """Return the shortest of several times, s, and the result."""
     seconds, found = [], None
     for _ in range(repeats):
         started = time.perf_counter()

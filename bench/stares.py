@@ -94,7 +94,7 @@ class Last:
 
 
 def payload(sums: int) -> Components:
-    """The paper's G2V star, flares of 7000 and 15 000 K, smooth weights."""
+    """Return the components of the paper's G2V star with flares of 7000 and 15 000 K and smooth weights."""
     star = Source.from_library("G2V").at_magnitude(7.4)
     mauve, sky = Instrument.load("mauve"), Sky.of_brightness(22.1)
     sources = (star, star.flaring(1.0, temperature=7000.0), star.flaring(1.0, temperature=15_000.0))
@@ -104,7 +104,7 @@ def payload(sums: int) -> Components:
 
 
 def flares(count: int, n_flares: int, *, own: bool) -> tuple[np.ndarray, np.ndarray]:
-    """A flare by each spectrum, at one time or each stare's own, and amplitudes of the stares."""
+    """Return a flare with each spectrum, at common times or at each stare's own, and the stares' amplitudes."""
     rng = np.random.default_rng(2)
     after = np.arange(FRAMES) - (rng.integers(20, 150, count)[:, None] if own else np.array([[50]]))
     shape = np.where(after >= 0, np.exp(-np.maximum(after, 0) / 12.0), 0.0).astype(np.float32)
@@ -112,7 +112,7 @@ def flares(count: int, n_flares: int, *, own: bool) -> tuple[np.ndarray, np.ndar
 
 
 def engine_lines(stares: Stares) -> list[Line]:
-    """What the engine does."""
+    """Measure the rate of the engine."""
     name, lines = f"mauvecl {__version__}", []
     three = payload(3)
     n_pixel = three.quiet.wavelength_nm.size
@@ -159,7 +159,7 @@ def engine_lines(stares: Stares) -> list[Line]:
 
 
 def numpy_lines() -> list[Line]:
-    """The same by NumPy's Generator, one thread, in blocks that stay in the cache."""
+    """Measure NumPy's Generator on one thread, in blocks that stay in the cache."""
     components, name = payload(3), f"NumPy {np.__version__}"
     x, weights = components.quiet, components.weights.astype(np.float32)
     known, spectra = components.coefficients(STARE), components.mean_dn.astype(np.float32)

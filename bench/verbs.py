@@ -101,7 +101,7 @@ def measured(words: list[str], folder: str) -> dict[str, float]:
 
 
 def write(rows: list[tuple[object, ...]], output: Path, repeats: int) -> None:
-    """The table so far."""
+    """Write the table of the results so far."""
     columns = ("command", "wall", "wanted", "cpu", "kernels", "kernels_alone", "ratio", "wanted_ratio")
     table = Table(rows=rows, names=columns)
     for column in ("wall", "wanted", "cpu", "kernels", "kernels_alone"):

@@ -41,7 +41,7 @@ autodoc_typehints = "none"
 
 
 def bench_tables() -> None:
-    """The benches' last results as tables that a page includes."""
+    """Write the benchmarks' last results as tables that a page includes."""
     folder = Path(__file__).parent / "_generated"
     folder.mkdir(exist_ok=True)
     for path in (Path(__file__).parent.parent / "bench" / "results").glob("*.ecsv"):

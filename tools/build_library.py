@@ -197,7 +197,7 @@ def entries() -> list[Spectrum]:
 
 
 def wheel_of(package: str) -> str:
-    """The name of a package's wheel."""
+    """Return the name of a package's wheel."""
     return f"{package.lower()}-{PACKAGES[package]}-py3-none-any.whl"
 
 
@@ -353,7 +353,7 @@ def write_band(name: str, source: Path) -> None:
 
 
 def write_licence(package: str, source: Path) -> None:
-    """A package's licence, word for word, and what of the library it covers."""
+    """Write a package's licence verbatim, and the part of the library that it covers."""
     version, (what, home) = PACKAGES[package], COVERED[package]
     (text,) = source.glob(f"{package.lower()}-{version}.dist-info/licenses/LICENSE*")
     head = (

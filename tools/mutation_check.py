@@ -315,7 +315,7 @@ def fails(folder: Path, test: str) -> tuple[bool, str]:
 
 
 def copy(folder: Path) -> None:
-    """The project's own files, links kept."""
+    """Copy the project's own files, with links kept as links."""
     for name in ("host", "kernels", "mauvecl", "tests", "pyproject.toml"):
         source = ROOT / name
         if source.is_dir():

@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import IntFlag
 from functools import cached_property
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Unit
+from mauvecl.schema.physical import Moment
 
 Float = NDArray[np.float64]
 
@@ -38,6 +41,7 @@ class Reason(IntFlag):
         return ", ".join(str(one.name).lower().replace("_", " ") for one in cls if value & one)
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class Frames:
     """Observed frames of one star.
@@ -71,13 +75,13 @@ class Frames:
         What was done while reading, such as sorting.
     """
 
-    time_s: Float
-    exposure_s: Float
+    time_s: Annotated[Float, Unit("s")]
+    exposure_s: Annotated[Float, Unit("s")]
     flux: Float
     error: Float | None = None
     quality: NDArray[np.int64] | None = None
-    wavelength_nm: Float | None = None
-    temperature_c: Float | None = None
+    wavelength_nm: Annotated[Float, Unit("nm")] | None = None
+    temperature_c: Annotated[Float, Unit("deg_C")] | None = None
     unit: str = ""
     reference_mjd: float | None = None
     scale: str = ""
@@ -88,7 +92,7 @@ class Frames:
     @classmethod
     def of(
         cls,
-        time_s: ArrayLike,
+        time_s: Annotated[ArrayLike, Unit("s")],
         flux: ArrayLike,
         error: ArrayLike | None = None,
         *,
@@ -185,7 +189,7 @@ class Frames:
         flagged = np.zeros(self.n_frames, np.bool_) if self.quality is None else self.quality != 0
         return np.asarray(np.where(flagged, Reason.QUALITY, 0) | np.where(finite, 0, Reason.NOT_FINITE), np.int64)
 
-    def shifted(self, by_s: Float) -> Self:
+    def shifted(self, by_s: Annotated[Float, Unit("s")]) -> Self:
         """Return the frames with other times."""
         return replace(self, time_s=self.time_s + by_s)
 
@@ -193,7 +197,7 @@ class Frames:
         """Return the frames with additional remarks."""
         return replace(self, remarks=(*self.remarks, *remarks))
 
-    def date(self, time_s: float) -> str:
+    def date(self, time_s: Moment) -> str:
         """Return a time as an ISO 8601 date, or as seconds if the times have no date."""
         if self.reference_mjd is None:
             return f"{time_s:.1f} s"

@@ -1,6 +1,6 @@
-"""Units of arguments: numbers, arrays and counts, from Quantities of any fitting unit or plain in the documented one.
+"""Conversion of Quantities and plain values to numbers, arrays and counts.
 
-What checks a plain number loads no numpy: a wrong one is told at once.
+Plain numbers are checked without NumPy, so that wrong ones are reported immediately.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-#: What a unit is called in a sentence.
+#: Words for units in messages.
 WORDS = {
     "": "a number",
     "K": "kelvin",
@@ -25,7 +25,7 @@ WORDS = {
     "s": "seconds",
 }
 
-#: Ends of names, and the unit that they mean, the longest first.
+#: Units that ends of names state, the longest ends first.
 UNITS = {
     "_uv_per_electron": "uV / electron",
     "_nm_per_pixel": "nm / pix",
@@ -50,7 +50,7 @@ UNITS = {
     "_k": "K",
     "_s": "s",
 }
-#: Names without such an end that have a unit.
+#: Units of names without such an end.
 NAMED = {
     "magnitude": "mag",
     "ebv": "mag",
@@ -61,19 +61,19 @@ NAMED = {
 
 
 def unit_of(name: str) -> str:
-    """The unit that a name means: 0.3 is ``""``, a fraction, where it means none."""
+    """Return the unit that the end of a name states, or an empty string."""
     return NAMED.get(name) or next((unit for end, unit in UNITS.items() if name.endswith(end)), "")
 
 
 def is_quantity(value: Any) -> bool:
-    """Whether a value has a unit of astropy's."""
+    """Return whether a value is an astropy Quantity."""
     return hasattr(value, "to_value") and hasattr(value, "unit")
 
 
 def number(
     what: str, value: Any, unit: str = "", *, low: float = -math.inf, high: float = math.inf, expected: str = ""
 ) -> float:
-    """One finite number in a unit.
+    """Return one finite number in a unit.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def number(
 def numbers(
     what: str, values: Any, unit: str = "", *, low: float = -math.inf, high: float = math.inf
 ) -> NDArray[np.float64]:
-    """An array of finite numbers in a unit, of the shape of `values`; parameters and errors as for `number`."""
+    """Return finite numbers in a unit, in the shape of `values`; parameters and errors as for `number`."""
     import numpy as np
 
     wanted = _expected(unit, low, high)
@@ -119,7 +119,7 @@ def numbers(
 
 
 def count(what: str, value: Any, *, low: int = 0, high: int = 2**63 - 1) -> int:
-    """A whole number: an int, a float such as 1e5 or a dimensionless Quantity that is one.
+    """Return a whole number, given as an int, a float such as 1e5 or a dimensionless Quantity.
 
     Raises
     ------
@@ -182,7 +182,7 @@ def _no_truth(value: Any) -> Any:
 
 
 def word_of(unit: str) -> str:
-    """What a unit is called in a sentence."""
+    """Return the words for a unit in a message."""
     return WORDS.get(unit, unit)
 
 
