@@ -18,6 +18,7 @@ import pytest
 from commands import ended, run
 from refusals import refused as refused_by_key
 
+from mauvecl import Instrument, detect, exposure
 from mauvecl.cli import foresight
 from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
@@ -167,15 +168,26 @@ NUMBERS = ["1e-308", "5e-324", "1e-31", "1e31", "1e308", "9" * 5000, str(2**64),
 
 @pytest.mark.parametrize("value", NUMBERS, ids=lambda value: value[:8])
 @pytest.mark.parametrize("key", ["run.fap", "star.0.magnitude", "run.seed", "flare.temperature_k", "signal.snr"])
-def test_numbers_that_no_study_means(key: str, value: str, tmp_path: Path) -> None:
-    """fap 1e-308 and whole numbers of 5000 digits were tracebacks."""
-    refused("exposure", "--snr", "5", "--at", "300", "--set", f"{key}={value}", folder=tmp_path)
+def test_extreme_numbers_in_settings_are_refused(key: str, value: str) -> None:
+    """Values such as fap = 1e-308 and whole numbers of 5000 digits end in one short sentence."""
+    with pytest.raises(InputError) as error:
+        exposure(Study().with_settings(["signal={snr=5, wavelength_nm=300}", f"{key}={value}"]))
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 1100
 
 
-def test_instruments_hold_numbers_that_can_be(tmp_path: Path) -> None:
+def test_a_long_number_on_the_command_line_is_one_sentence(tmp_path: Path) -> None:
+    refused("exposure", "--snr", "5", "--at", "300", "--set", f"run.seed={'9' * 5000}", folder=tmp_path)
+
+
+def test_extreme_numbers_in_instruments_are_refused(tmp_path: Path) -> None:
     for value in NUMBERS:
         (tmp_path / "mine.toml").write_text(f"extends = 'mauve'\nread_noise_dn = {value}\n")
-        refused(*OBSERVE, "--instrument", "mine.toml", folder=tmp_path)
+        with pytest.raises(InputError) as error:
+            Instrument.load(tmp_path / "mine.toml")
+        assert "\n" not in str(error.value)
+        assert len(str(error.value)) < 1100
+    refused(*OBSERVE, "--instrument", "mine.toml", folder=tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -274,9 +286,11 @@ def test_what_is_read_is_a_regular_file(tmp_path: Path) -> None:
         "200",
     ],
 )
-def test_weights_that_weigh_nothing_or_too_much(weights: str, tmp_path: Path) -> None:
+def test_unusable_weights_are_refused(weights: str, tmp_path: Path) -> None:
     (tmp_path / "weights.txt").write_text(weights)
-    refused(*DETECT, "--set", "run.weights.mine='weights.txt'", folder=tmp_path)
+    with pytest.raises(InputError) as error:
+        detect(Study().with_settings([f"run.weights.mine='{tmp_path / 'weights.txt'}'"]))
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.long

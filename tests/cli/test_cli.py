@@ -391,7 +391,7 @@ BAD = {
     "sky": (["detect", "--sky", "dark"], "'dark'"),
     "instrument": (["detect", "--instrument", "hubble"], "hubble"),
     "device": (["detect", "--device", "abacus"], "'abacus' is not here, expected one of"),
-    "statistic": (["detect", "--statistic", "chi3"], "'chi3'"),
+    "statistic": (["detect", "--statistic", "chi2,chi3"], "--statistic 'chi3', expected one of "),
     "reference": (["detect", "--reference", "stack"], "--reference 'stack', expected 'template', 'exposure' or"),
     "variances": (["detect", "--variances", "guessed"], "--variances 'guessed'"),
     "rare fap": (["detect", "--fap", "1e-6", "-n", "1000", "--star", "G2V"], "ask for 100000000 realisations"),
