@@ -7,7 +7,54 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
+
+    from mauvecl.study.study import Study
+
+
+#: Default of verbs that need fewer realisations than a detection.
+FEWER = {"run.realisations": 100_000}
+
+# Keys of a study whose flags verbs take, in the order of `--help`.
+
+#: Those of every verb that observes.
+OBSERVATION = (
+    "star.library",
+    "star.magnitude",
+    "star.band",
+    "star.magnitude_system",
+    "star.ebv",
+    "star.wavelength_unit",
+    "star.flux_unit",
+    "star.extend",
+    "star.bin_nm",
+    "observation.exposure_s",
+    "observation.instrument",
+    "observation.temperature_c",
+    "sky",
+)
+SIZE = ("star.distance_pc", "star.radius_rsun", "star.effective_temperature_k")
+SIGNAL = ("observation.signal",)
+DRAWS = ("run.realisations", "run.seed")
+DETECTION = ("run.statistics", "run.fap", "run.tails", "run.reference", "run.variances")
+NUISANCES = ("nuisances.own", "nuisances.usual")
+UNKNOWN = ("unknowns.draws", "unknowns.known")
+STARE = (
+    "stare.duration_s",
+    "stare.gaps",
+    "stare.orbit_gap_s",
+    "stare.thermal",
+    "stare.half_width_s",
+    "stare.shape",
+    "stare.energies_erg",
+    "stare.search",
+    "nuisances.usual",
+)
+#: Those of verbs that look from the orbit; targets are given in a way of their own.
+ORBIT = (
+    *(f"orbit.{key}" for key in ("start", "days", "step_s", "tle", "kind", "simbad")),
+    "orbit.limits",
+)
 
 
 @dataclass(frozen=True)
@@ -19,16 +66,34 @@ class Verb:
     name : str
     home : str
         Module of `mauvecl.answers` that holds the function; it is imported when the verb is first used.
+    help : str
+        Help text of the command, with examples.
+    takes : tuple of str
+        Keys and sections of the study whose flags the command takes, in addition to those of `observation`.
     counts : str
         What the command line's progress bar counts; empty if a closed form answers at once.
     older : tuple of str
         Names that the function had before; they still work.
+    observation : tuple of str
+        Keys of an observation, or of what takes its place.
+    without : str
+        Key of the observation that the command does not take.
+    defaults : mapping, optional
+        Values of keys where neither a study file nor a flag is given, if they differ from the study's.
+    default : callable, optional
+        Makes the study from the flags where no file is given; the paper's question by default.
     """
 
     name: str
     home: str
+    help: str
+    takes: tuple[str, ...]
     counts: str = ""
     older: tuple[str, ...] = ()
+    observation: tuple[str, ...] = OBSERVATION
+    without: str = ""
+    defaults: Mapping[str, Any] | None = None
+    default: Callable[[dict[str, Any]], Study] | None = None
 
     @property
     def ask(self) -> Callable[..., Any]:
@@ -37,23 +102,233 @@ class Verb:
         return function
 
 
+def _budgets_or_star(given: dict[str, Any]) -> Study:
+    """Return the study of the paper's noise budgets if no flag names a star, else the default one."""
+    from mauvecl.study.study import PAPER_BUDGETS, Study
+
+    named = any(given[name] for name in ("star", "magnitude", "exposure", "sweep"))
+    return Study() if named else PAPER_BUDGETS
+
+
 #: By name, in the order of `mauvecl --help`: one star, flares, hours and campaigns.
 VERBS: dict[str, Verb] = {
     one.name: one
     for one in (
-        Verb("simulate", "signal.simulate"),
-        Verb("snr", "signal.snr", "realisations"),
-        Verb("exposure", "signal.exposures"),
-        Verb("detect", "detection.detect", "realisations"),
-        Verb("limit", "limits.limits", "limits", older=("limiting_magnitude",)),
-        Verb("map", "detection.maps", "cells", older=("detection_map",)),
-        Verb("gaussian", "detection.gaussian", "realisations", older=("gaussian_report",)),
-        Verb("measure", "measurements.measure", "flares"),
-        Verb("stare", "stares.stare", "stares"),
-        Verb("inject", "stares.inject", "injections"),
-        Verb("analyse", "observations.analyse"),
-        Verb("visible", "campaigns.visible"),
-        Verb("plan", "campaigns.plan", "targets"),
+        Verb(
+            "simulate",
+            "signal.simulate",
+            """Simulate one observation, and show what it consists of.
+
+    Star, sky, photon noise, dark, bias, read noise, and the closed-form S/N.
+
+    Example: mauvecl simulate --star G2V --magnitude 7.4 --exposure 50 --amplitude 0.24
+    """,
+            ("flare", *SIGNAL, "run.seed"),
+        ),
+        Verb(
+            "snr",
+            "signal.snr",
+            """Compute signal-to-noise ratios and noise budgets.
+
+    Of each pixel and of each resolution element (10.5 nm).
+
+    The signal is the star's alone: the sky is subtracted, and its photons are noise (`--signal paper`: signal as well).
+
+    Without arguments: the three stars of the paper's noise budgets, 50 s and 600 s.
+
+    Examples: mauvecl snr --star B2IV --magnitude 3.03 --exposure 5
+
+    mauvecl snr --star G2V --sweep magnitude=4,6,8,10 --sweep exposure=5,50,600
+    """,
+            (*DRAWS, *SIGNAL, "signal.wavelength_nm", "sweep"),
+            counts="realisations",
+            defaults=FEWER,
+            default=_budgets_or_star,
+        ),
+        Verb(
+            "exposure",
+            "signal.exposures",
+            """Find the shortest exposure with a wanted S/N at a wavelength.
+
+    By the closed form, in whole frames; `mauvecl snr` goes the other way.
+
+    Example: mauvecl exposure --snr 10 --at 300 --star G2V --magnitude 7.4
+    """,
+            ("signal", *SIGNAL),
+            without="observation.exposure_s",
+        ),
+        Verb(
+            "detect",
+            "detection.detect",
+            """Tell whether flares would be seen: thresholds, probabilities.
+
+    Without arguments: the paper's K3V star of V = 3.7 and G2V star of V = 7.4 with flares of 0.76, 2, 8.1 and 24 %,
+    50 s, one million realisations.
+
+    Example: mauvecl detect --star K5V --magnitude 6 --amplitude 0.05 --amplitude 0.1 --exposure 30
+    """,
+            ("flare", *DRAWS, *DETECTION, "campaign", *NUISANCES, "run.template_temperatures_k", "sweep"),
+            counts="realisations",
+        ),
+        Verb(
+            "limit",
+            "limits.limits",
+            """Find the limiting magnitude, smallest amplitude or exposure.
+
+    Of a star or flare that is seen with a wanted probability.
+
+    Starts from the closed form, settles it by simulation, and simulates the answer again with a fresh seed.
+
+    Example: mauvecl limit --star G2V --amplitude 0.24 --exposure 50
+    """,
+            ("limit", "flare", *DRAWS, *DETECTION, *NUISANCES, *UNKNOWN, "sweep"),
+            counts="limits",
+            older=("limiting_magnitude",),
+        ),
+        Verb(
+            "map",
+            "detection.maps",
+            """Map the detection probability over two quantities, for one star.
+
+    Quantities: magnitude, amplitude, flare_temperature, exposure, detector_temperature, sky, star. All cells are drawn
+    with the same random numbers.
+
+    Example: mauvecl map --star G2V --x magnitude:4:10:16 --y amplitude:0.01:1:16:log
+    """,
+            ("map", "flare", *DRAWS, *DETECTION, *NUISANCES, *UNKNOWN),
+            counts="cells",
+            older=("detection_map",),
+            defaults=FEWER,
+        ),
+        Verb(
+            "gaussian",
+            "detection.gaussian",
+            """Find where the usual root-of-N formula is wrong.
+
+    Its S/N, its intervals and its false alarms, beside those of realisations.
+
+    Without a sweep: magnitudes from 4 to 12, exposures of 5, 50 and 600 s.
+
+    Example: mauvecl gaussian --star G2V --sweep magnitude=6,10 --sweep exposure=5,50
+    """,
+            (*DRAWS, *DETECTION, *SIGNAL, "sweep"),
+            counts="realisations",
+            older=("gaussian_report",),
+            defaults=FEWER,
+        ),
+        Verb(
+            "measure",
+            "measurements.measure",
+            """Measure simulated spectra of flares, and how well that works.
+
+    Temperature, area, energy, Balmer jump and lines: errors in advance, simulated fits with the coverage of their
+    intervals, the same for flares that a search detects, and what a too simple model makes of the flare.
+
+    Examples: mauvecl measure --star M3V -m 9 -a 0.5 --balmer-jump 2 --nuisance dark=free --nuisance light=free
+
+    mauvecl measure --star M3V --magnitude 9 --amplitude 0.5 --sweep exposure=50,300 --distance 5 --radius 0.4
+
+    mauvecl measure --star M3V --magnitude 9 --amplitude 2 --snr-per-bin 20 --duration 1800 --distance 5
+    """,
+            ("flare", "measure", *STARE, *NUISANCES, *SIZE, "run.fap", "run.seed", "sweep"),
+            counts="flares",
+        ),
+        Verb(
+            "stare",
+            "stares.stare",
+            """Simulate a stare: light curves, spectra, flares, a search.
+
+    Without arguments: the paper's two stars over one orbit, four flares each. The FITS files are read by lightkurve.
+
+    Examples: mauvecl stare --star M3V --magnitude 9 --amplitude 0.5 --half-width 60 --thermal 0.5
+
+    mauvecl stare --star G2V --magnitude 7.4 --distance 14.1 --energy 1e33 --energy 1e34 --orbit-gap 2100
+    """,
+            ("flare", *STARE, *SIZE, "run.seed", "sweep"),
+            counts="stares",
+            without="observation.exposure_s",
+        ),
+        Verb(
+            "inject",
+            "stares.inject",
+            """Find which flares a search detects: completeness, false alarms.
+
+    Over energy (or amplitude) and half-width, with the errors of what is recovered.
+
+    Flares are injected into drawn stares and searched for with a bank of filters. A stare of a day unless told.
+
+    Examples: mauvecl inject --star G2V --magnitude 7.4 --distance 14.1 --false-alarms 1 --alarms-per month
+
+    mauvecl inject --star M3V --magnitude 9 --orbit-gap 2100 --with-unknowns --sweep flare_temperature=7000,10000,15000
+    """,
+            (
+                "flare.temperature_k",
+                "flare.band",
+                "flare.geometry",
+                "flare.photosphere_temperature_k",
+                "flare.spectrum",
+                "stare.duration_s",
+                "stare.gaps",
+                "stare.orbit_gap_s",
+                "stare.thermal",
+                "nuisances.usual",
+                *SIZE,
+                "search",
+                "injections",
+                "run.seed",
+                "sweep",
+            ),
+            counts="injections",
+            without="observation.exposure_s",
+            defaults={"stare.duration_s": 86_400.0},
+        ),
+        Verb(
+            "analyse",
+            "observations.analyse",
+            """Flares in observed frames, with their false alarms.
+
+    Reads light curves of mauvecl, TESS and Kepler as they are, and other tables through a mapping (TOML). Nothing is
+    deleted in silence: the table of frames states why a frame is not searched.
+
+    Example: mauvecl analyse light-curve-1.fits --false-alarms 1 --alarms-per month
+    """,
+            ("data", "search.false_alarms", "search.per", "run.seed"),
+            observation=(),
+        ),
+        Verb(
+            "visible",
+            "campaigns.visible",
+            """Find when targets can be seen from the orbit.
+
+    Windows, hours by day and month, the Sun's distance, zodiacal light, a calendar.
+
+    Example: mauvecl visible --look-at "eps Eri" --look-at "AU Mic" --start 2027-01-01 --days 365
+    """,
+            ("orbit.targets", "plan.targets"),
+            observation=ORBIT,
+        ),
+        Verb(
+            "plan",
+            "campaigns.plan",
+            """Plan a campaign: hours, expected flares, false alarms; a report.
+
+    The table has a column name, and what is known of each star: ra and dec, V, spectral_type, distance_pc, mass_msun
+    and age_myr, or other rates of flares. Stars of the embedded list need their names only.
+
+    Example: mauvecl plan targets.csv --hours 200 --start 2027-01-01
+    """,
+            (
+                "plan",
+                "search.false_alarms",
+                "observation.instrument",
+                "observation.temperature_c",
+                "flare.temperature_k",
+                "flare.band",
+                "flare.spectrum",
+            ),
+            counts="targets",
+            observation=ORBIT,
+        ),
     )
 }
 #: Where every public name of a verb is at home, older names among them.

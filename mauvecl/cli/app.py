@@ -18,7 +18,7 @@ import typer
 from mauvecl.answers.verbs import VERBS
 from mauvecl.cli import verbs
 from mauvecl.cli.boundary import EXIT_CODES, guarded
-from mauvecl.cli.verb import COMMANDS
+from mauvecl.cli.verb import COMMANDS, add_plain_commands
 from mauvecl.cli.verbs.about import devices, schema, selftest
 from mauvecl.cli.verbs.bulk import export, realise, verify
 from mauvecl.cli.verbs.library import app as library
@@ -56,6 +56,7 @@ def _broken(command: str, most: int = 72) -> str:
 
 for module in iter_modules(verbs.__path__, f"{verbs.__name__}."):
     import_module(module.name)
+add_plain_commands()
 # In the order of `--help`: the questions, bulk, mauvecl itself.
 for name in VERBS:
     app.command(name, help=_help(COMMANDS[name]))(COMMANDS[name])

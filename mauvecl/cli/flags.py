@@ -36,45 +36,6 @@ SetFlag = Annotated[
     ),
 ]
 
-#: Default of verbs that need fewer realisations than a detection.
-FEWER = {"run.realisations": 100_000}
-
-# Keys that verbs take, in the order of `--help`.
-
-#: What every verb that observes takes.
-OBSERVATION = (
-    "star.library",
-    "star.magnitude",
-    "star.band",
-    "star.magnitude_system",
-    "star.ebv",
-    "star.wavelength_unit",
-    "star.flux_unit",
-    "star.extend",
-    "star.bin_nm",
-    "observation.exposure_s",
-    "observation.instrument",
-    "observation.temperature_c",
-    "sky",
-)
-SIZE = ("star.distance_pc", "star.radius_rsun", "star.effective_temperature_k")
-SIGNAL = ("observation.signal",)
-DRAWS = ("run.realisations", "run.seed")
-DETECTION = ("run.statistics", "run.fap", "run.tails", "run.reference", "run.variances")
-NUISANCES = ("nuisances.own", "nuisances.usual")
-UNKNOWN = ("unknowns.draws", "unknowns.known")
-STARE = (
-    "stare.duration_s",
-    "stare.gaps",
-    "stare.orbit_gap_s",
-    "stare.thermal",
-    "stare.half_width_s",
-    "stare.shape",
-    "stare.energies_erg",
-    "stare.search",
-    "nuisances.usual",
-)
-
 
 class StudyFlag(NamedTuple):
     """Flag of the command line, and the key of the study that it sets."""

@@ -8,8 +8,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, get_type_hints
 
+from mauvecl.answers.verbs import OBSERVATION, VERBS
 from mauvecl.cli.flags import (
-    OBSERVATION,
     PICTURES,
     RESUMING,
     TELLING,
@@ -23,6 +23,7 @@ from mauvecl.cli.question import holds_study, is_star, study_of
 from mauvecl.cli.values import as_text
 
 if TYPE_CHECKING:
+    from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
 
 #: The command of each verb that takes a study, by its name; `takes_study` fills it.
@@ -32,6 +33,7 @@ COMMANDS: dict[str, Callable[..., None]] = {}
 def takes_study(
     *keys: str,
     name: str = "",
+    help: str = "",
     without: str = "",
     defaults: Mapping[str, Any] = MappingProxyType({}),
     writes: str = "",
@@ -47,8 +49,8 @@ def takes_study(
     ----------
     *keys : str
         Keys and sections of the study whose flags the verb takes, in addition to those of the observation.
-    name : str
-        Name of the verb, if it differs from the function's.
+    name, help : str
+        The command's name and help text, where they are not the function's name and docstring.
     without : str
         A key of the observation that the verb does not take.
     defaults : mapping
@@ -140,10 +142,48 @@ def takes_study(
                 readers[parameter.name] = shown or "--" + parameter.name.replace("_", "-"), read
                 default_text = None if parameter.default is None else f"{parameter.default:g}"
                 parameters[place] = parameter.replace(annotation=kind, default=default_text)
-        command.__name__, command.__doc__ = verb.__name__, verb.__doc__
+        command.__name__, command.__doc__ = called, help or verb.__doc__
         command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         command.__annotations__ = {p.name: p.annotation for p in parameters}
         COMMANDS[called] = command
         return command
 
     return decorate
+
+
+def command_of(
+    name: str, *, draws: bool | None = None, resumes: bool = False
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Make a function of the study and the session the command of a verb of the registry.
+
+    Parameters
+    ----------
+    name : str
+    draws : bool, optional
+        Whether a pool draws; by default if the verb counts something.
+    resumes : bool
+        As in `takes_study`.
+    """
+    verb = VERBS[name]
+    return takes_study(
+        *verb.takes,
+        name=name,
+        help=verb.help,
+        without=verb.without,
+        defaults=verb.defaults or {},
+        default=verb.default,
+        draws=bool(verb.counts) if draws is None else draws,
+        resumes=resumes,
+        observation=verb.observation,
+    )
+
+
+def add_plain_commands() -> None:
+    """Add the commands of verbs that have no function of their own: they ask, and print the answer."""
+
+    def ask(study: Study, session: Session) -> None:
+        session.answer(session.ask(study))
+
+    for name in VERBS:
+        if name not in COMMANDS:
+            command_of(name)(ask)

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mauvecl.cli.flags import DRAWS, FEWER, DeviceFlag, JsonFlag, QuietFlag
+from mauvecl.answers.verbs import DRAWS, FEWER
+from mauvecl.cli.flags import DeviceFlag, JsonFlag, QuietFlag
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:

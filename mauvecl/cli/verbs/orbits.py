@@ -1,52 +1,19 @@
-"""Verbs of the orbit: when targets are visible, and what a campaign would find."""
+"""The command that plans campaigns: its report and its closed form have needs of their own."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mauvecl.cli.verb import takes_study
+from mauvecl.cli.verb import command_of
 
 if TYPE_CHECKING:
     from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
 
 
-#: Keys of the orbit that both verbs take; targets are given in a way of their own.
-ORBIT = (
-    *(f"orbit.{key}" for key in ("start", "days", "step_s", "tle", "kind", "simbad")),
-    "orbit.limits",
-)
-
-
-@takes_study("orbit.targets", "plan.targets", observation=ORBIT, draws=False)
-def visible(study: Study, session: Session) -> None:
-    """Find when targets can be seen from the orbit.
-
-    Windows, hours by day and month, the Sun's distance, zodiacal light, a calendar.
-
-    Example: mauvecl visible --look-at "eps Eri" --look-at "AU Mic" --start 2027-01-01 --days 365
-    """
-    session.answer(session.ask(study))
-
-
-@takes_study(
-    "plan",
-    "search.false_alarms",
-    "observation.instrument",
-    "observation.temperature_c",
-    "flare.temperature_k",
-    "flare.band",
-    "flare.spectrum",
-    observation=ORBIT,
-)
+@command_of("plan")
 def plan(study: Study, session: Session) -> None:
-    """Plan a campaign: hours, expected flares, false alarms; a report.
-
-    The table has a column name, and what is known of each star: ra and dec, V, spectral_type, distance_pc, mass_msun
-    and age_myr, or other rates of flares. Stars of the embedded list need their names only.
-
-    Example: mauvecl plan targets.csv --hours 200 --start 2027-01-01
-    """
+    """Plan a campaign; a report needs matplotlib for PDF, and a closed form needs no pool."""
     from mauvecl.answers.campaigns.plan import plan as compute
     from mauvecl.pictures.style import available
 
