@@ -32,11 +32,13 @@ TURNED = {"map": "cell by cell in the file", "visible": "months are rows of the 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", VERBS)
+# Observed frames of `analyse` take too long for this test; its tables are made by `table_of` as the next test holds.
+@pytest.mark.parametrize("name", [name for name in VERBS if name != "analyse"])
 def test_files_json_terminal_and_page_agree(
     name: str, engine: Engine, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    answer = VERBS[name].ask(Study().with_settings([*FEW, *(QUICK | SLOW)[name]]))
+    settings = (QUICK | SLOW)[name]
+    answer = VERBS[name].ask(Study().with_settings([*FEW, *settings]))
     answer.write(tmp_path)
     for file, table in answer.tables.items():
         read = QTable.read(tmp_path / f"{file}.ecsv")
