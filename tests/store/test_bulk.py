@@ -353,7 +353,7 @@ def test_the_fits_export(tmp_path: Path, engine: Engine) -> None:
 def test_fits_holds_studies_with_any_names() -> None:
     name = f'/{"long/" * 30}ein "Stern" \\ λ Vir 🌟.txt'
     asked = Study.build({"star": [{"file": name, "magnitude": 5.0}]}, "test")
-    lines = "\n".join(_study(asked).data["LINE"])
+    lines = "\n".join(_study(asked.toml()).data["LINE"])
     assert lines.isascii()
     assert Study.build(tomllib.loads(lines), "fits") == asked
 
