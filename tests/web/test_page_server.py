@@ -123,6 +123,34 @@ def test_a_target_to_see_is_a_name_or_coordinates(text: str) -> None:
         assert "expected a name such as eps Eri" in state.faults["see"], wrong
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("lines", "Mg II"), ("lines", "Mg II=x"), ("lines", "spots=0.1"), ("lines", "Mg II=0.1, mg ii=0.2"),
+     ("lines", "Mg II=-1"), ("balmer_jump", "0.5"), ("balmer_jump", "2,5"), ("second_temperature_k", "12"),
+     ("second_area", "")],
+)  # fmt: skip
+def test_a_spectrum_that_is_wrong_is_a_fault(name: str, text: str) -> None:
+    state = State()
+    state.enter({name: text})
+    assert state.faults.keys() == {name}
+    assert "expected" in state.faults[name]
+    state.enter({name: FIELDS[name].first})
+    assert not state.faults
+
+
+def test_the_flares_spectrum_is_that_of_the_study() -> None:
+    state = State()
+    assert state.question().study().flare.is_blackbody
+    state.enter({"balmer_jump": "2.5", "lines": " mg ii = 0.03, 280=0.01"})
+    spectrum = state.question().study().flare.spectrum
+    assert (spectrum.balmer_jump, spectrum.lines) == (2.5, {"Mg II": 0.03, "280": 0.01})
+    state.enter({"second_temperature_k": "30000"})
+    with pytest.raises(InputError, match="balmer_jump and second_area"):
+        state.question().study()
+    state.enter({"balmer_jump": ""})
+    assert state.question().study().flare.spectrum.second_area == 0.05
+
+
 def test_a_plan_needs_a_target_that_is_known() -> None:
     state = State()
     state.enter({"see": "12 34", "hours": "50"})
