@@ -37,7 +37,7 @@ class InCell:
 
 
 class Answer(Drawable, ContentEquality, ABC):
-    """The answer to one question of a study."""
+    """The answer of a verb to a study: tables and how people read them, messages, pictures and files."""
 
     #: Endings of the files of each table; the first table's alone in some answers.
     ENDINGS: ClassVar[tuple[str, ...]] = ("ecsv",)
@@ -101,7 +101,7 @@ class Answer(Drawable, ContentEquality, ABC):
 
         Raises InputError if a file cannot be written; an earlier file of that name is then unchanged.
         """
-        from mauvecl.answers.report import make_folder, write_document, write_study, write_table
+        from mauvecl.answers.files import make_folder, write_document, write_study, write_table
 
         place = make_folder(Path(folder))
         return [

@@ -78,7 +78,7 @@ def verify_answer(folder: str | Path) -> list[FileFault]:
     list of FileFault
         Empty if everything is as it was written.
     """
-    from mauvecl.answers.report import json_text
+    from mauvecl.answers.files import json_text
 
     folder = Path(folder)
     if not is_answer(folder):

@@ -97,7 +97,7 @@ class Session:
     @cached_property
     def folder(self) -> Path:
         """Where everything is written; held from now on."""
-        from mauvecl.answers.report import make_folder
+        from mauvecl.answers.files import make_folder
         from mauvecl.runs.durable import locked
 
         folder = make_folder(self.output or Path(f"mauvecl-{self.verb}"))
@@ -190,12 +190,12 @@ class Session:
 
     def write(self, table: Table, name: str) -> None:
         """Write a table into the folder, in the format of its name's ending."""
-        from mauvecl.answers.report import write_table
+        from mauvecl.answers.files import write_table
 
         self.leave(lambda: write_table(table, self.folder / name))
 
     def _document(self, name: str, content: Callable[[], bytes]) -> Path:
-        from mauvecl.answers.report import write_document
+        from mauvecl.answers.files import write_document
 
         return write_document(content(), self.folder / name)
 
@@ -212,7 +212,7 @@ class Session:
 
     def record(self, study: Study, inputs: Sequence[Expectation], messages: Sequence[str]) -> None:
         """Write the study and the run record into the folder, and remove what was kept for a resume."""
-        from mauvecl.answers.report import write_record, write_study
+        from mauvecl.answers.files import write_record, write_study
 
         if self.folder / "study.toml" not in self.files:
             self.leave(lambda: write_study(study, self.folder))
@@ -274,7 +274,7 @@ class Session:
 
     def print_json(self, content: dict[str, Any]) -> None:
         """Print the answer as JSON."""
-        from mauvecl.answers.report import json_text
+        from mauvecl.answers.files import json_text
 
         print(json_text(content))
 

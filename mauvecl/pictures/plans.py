@@ -24,10 +24,10 @@ from mauvecl.study.labels import full_label
 from mauvecl.study.quantities import QUANTITIES
 
 if TYPE_CHECKING:
-    from mauvecl.answers.detection.gaussian import GaussianReport
-    from mauvecl.answers.detection.maps import MapResult
-    from mauvecl.answers.limits.limits import LimitResult
-    from mauvecl.answers.signal.exposures import ExposureResult
+    from mauvecl.answers.detection.gaussian import GaussianAnswer
+    from mauvecl.answers.detection.maps import MapAnswer
+    from mauvecl.answers.limits.limits import LimitAnswer
+    from mauvecl.answers.signal.exposures import ExposureAnswer
     from mauvecl.answers.signal.snr import SnrAnswer
     from mauvecl.host.expectation import Expectation
 
@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 STROKES = (":", "--", "-", "-.")
 
 
-@picture_of("MapResult", "map")
+@picture_of("MapAnswer", "map")
 @styled_picture
-def detection_map(plt: Any, answer: MapResult) -> Any:
+def detection_map(plt: Any, answer: MapAnswer) -> Any:
     """Plot the detection probability over two quantities, one panel per statistic."""
     question = answer.study.map
     figure, axes = plt.subplots(
@@ -83,9 +83,9 @@ def detection_map(plt: Any, answer: MapResult) -> Any:
     return figure
 
 
-@picture_of("LimitResult", "limit")
+@picture_of("LimitAnswer", "limit")
 @styled_picture
-def limits(plt: Any, answer: LimitResult) -> Any:
+def limits(plt: Any, answer: LimitAnswer) -> Any:
     """Plot the detection probability at every simulated value, and the limits."""
     of, power = answer.study.limit.of, answer.study.limit.power
     figure, axis = plt.subplots(figsize=(COLUMN, 3.0 + 0.17 * len(answer.limits)))
@@ -209,9 +209,9 @@ def snr_sweep(plt: Any, answer: SnrAnswer) -> Any:
     return figure
 
 
-@picture_of("GaussianReport", "gaussian")
+@picture_of("GaussianAnswer", "gaussian")
 @styled_picture
-def gaussian(plt: Any, answer: GaussianReport) -> Any:
+def gaussian(plt: Any, answer: GaussianAnswer) -> Any:
     """Plot how well each prediction of the Gaussian formula holds in every cell."""
     from matplotlib.ticker import MaxNLocator
 
@@ -242,9 +242,9 @@ def gaussian(plt: Any, answer: GaussianReport) -> Any:
     return figure
 
 
-@picture_of("ExposureResult", "exposure")
+@picture_of("ExposureAnswer", "exposure")
 @styled_picture
-def exposures(plt: Any, answer: ExposureResult) -> Any:
+def exposures(plt: Any, answer: ExposureAnswer) -> Any:
     """Plot the S/N of each star against exposure."""
     figure, axis = plt.subplots(figsize=(COLUMN, 2.9 + 0.17 * len(answer.exposures)))
     for k, e in enumerate(answer.exposures):

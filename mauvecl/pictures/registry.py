@@ -63,7 +63,7 @@ def picture_of(kind: str, name: str, **how: Any) -> Callable[[F], F]:
     Parameters
     ----------
     kind : str
-        Name of the class, as in ``"LimitResult"``.
+        Name of the class, as in ``"LimitAnswer"``.
     name : str
         Name of the picture's file without its ending.
     **how

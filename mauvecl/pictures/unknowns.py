@@ -12,12 +12,12 @@ from mauvecl.pictures.style import COLOURS, styled_picture
 from mauvecl.study.quantities import QUANTITIES
 
 if TYPE_CHECKING:
-    from mauvecl.answers.detection.unknown_table import UnknownTable
+    from mauvecl.answers.detection.unknown_table import UnknownAnswer
 
 
-@picture_of("UnknownTable", "unknowns")
+@picture_of("UnknownAnswer", "unknowns")
 @styled_picture
-def unknowns(plt: Any, answer: UnknownTable) -> Any:
+def unknowns(plt: Any, answer: UnknownAnswer) -> Any:
     """Plot closed-form power per star (dashed plain, solid marginalised), and the smallest amplitudes."""
     from mauvecl.answers.detection.unknown_table import power
 

@@ -62,7 +62,7 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
     InputError
         If there is no such table, or it is not simulated yet.
     """
-    from mauvecl.answers.report import write_table
+    from mauvecl.answers.files import write_table
 
     if name not in tab.files or ending not in ("ecsv", "fits", "study"):
         raise InputError(

@@ -37,7 +37,7 @@ def detect_and_snr(study: Study, pool: Pool) -> tuple[DetectAnswer, SnrAnswer]:
     return detect(study, pool), snr(study, pool)
 
 
-def map_around(study: Study, pool: Pool) -> maps.MapResult:
+def map_around(study: Study, pool: Pool) -> maps.MapAnswer:
     """Simulate a coarse map around the question's star."""
     star, amplitude = study.star[0], study.flare.amplitudes[0]
     middle = 7.0 if star.magnitude is None else star.magnitude

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from astropy.table import MaskedColumn, QTable, Table
 
-from mauvecl.answers.report import ecsv_text
+from mauvecl.answers.files import ecsv_text
 
 FLOATS = [0.1, -0.0, 1e-5, 9.9999e-5, 1e16, 123456789012345680.0, 1e22, 5e-324, 1.7976931348623157e308, 1 / 3, 2.0]
 WORDS = ["G2V", "", "K3V V = 3.7", 'said "so"', "a,b", "#", "-", "two  spaces", "tab\there", "\u03bb", "0.1"]

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from mauvecl.answers.report import json_text
+from mauvecl.answers.files import json_text
 from mauvecl.answers.signal.simulate import simulate
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study

@@ -14,7 +14,7 @@ from mauvecl.answers.campaigns.plan import PlanAnswer
 from mauvecl.answers.campaigns.plan_text import target_lines
 from mauvecl.answers.campaigns.planned import TargetObservation
 from mauvecl.answers.campaigns.planned_injections import injection_case
-from mauvecl.answers.report import write_study, write_table
+from mauvecl.answers.files import write_study, write_table
 from mauvecl.lightcurve.flares.energies import EnergyScale, quiescent_luminosity
 from mauvecl.lightcurve.flares.rates import davenport2019
 from mauvecl.lightcurve.search.completeness import Completeness

@@ -36,7 +36,7 @@ def test_the_unforeseen_is_one_sentence_and_a_file(tmp_path: Path) -> None:
     def fail(*_: object, **__: object) -> None:
         raise KeyError("what nobody foresaw")
 
-    with mock.patch("mauvecl.answers.report.write_record", fail):
+    with mock.patch("mauvecl.answers.files.write_record", fail):
         code, _, told = ended(*OBSERVE, "-o", "there", folder=tmp_path)
     assert code == 70
     (line,) = told.splitlines()

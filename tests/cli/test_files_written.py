@@ -133,7 +133,7 @@ def test_one_process_writes_a_folder_from_beginning_to_end(tmp_path: Path, monke
             held.append(True)
         write_whole(path, *parts)
 
-    monkeypatch.setattr("mauvecl.answers.report.write_whole", noted)
+    monkeypatch.setattr("mauvecl.answers.files.write_whole", noted)
     app([*VERBS["detect"], "--no-pictures", "--output", str(out)], standalone_mode=False)
     assert held == [True] * 6
     with locked(out, "output folder"):
@@ -239,7 +239,7 @@ def test_an_interruption_while_tables_are_written_is_a_sentence(
             raise KeyboardInterrupt
         real(path, *parts)
 
-    monkeypatch.setattr("mauvecl.answers.report.write_whole", write)
+    monkeypatch.setattr("mauvecl.answers.files.write_whole", write)
     with pytest.raises(SystemExit) as end:
         app([*VERBS["simulate"], "--no-pictures", "--output", str(tmp_path / "out")], standalone_mode=False)
     assert end.value.code == 130

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from mauvecl.answers import report
+from mauvecl.answers import files
 from mauvecl.cli.app import app
 from mauvecl.device import program, selftest
 from mauvecl.device.engine import Engine
@@ -121,7 +121,7 @@ def test_selftest_command_reports_and_records_outcome(
     assert kept["checks"][0]["name"] == "one thing"
     assert selftest.read_outcome(engine.device) == kept
     pool = Pool(LocalWorkers([None], make=lambda device, progress: engine))
-    record = report.write_record("detect", Study(), [], tmp_path, pool=pool, seconds=0.0, messages=[])
+    record = files.write_record("detect", Study(), [], tmp_path, pool=pool, seconds=0.0, messages=[])
     assert json.loads(record.read_text())["selftest"] == [kept]
     checks.append(selftest.Check("another", False, "wrong"))
     bad = CliRunner().invoke(app, ["selftest", "--quiet"])

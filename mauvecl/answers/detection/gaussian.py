@@ -162,7 +162,7 @@ def _promises(result: SnrResult) -> QTable:
 
 
 @dataclass(eq=False)
-class GaussianReport(Answer):
+class GaussianAnswer(Answer):
     """The answer of `gaussian_report`.
 
     Attributes
@@ -266,7 +266,7 @@ def _of_thresholds(tested: QTable, flares: QTable) -> dict[str, float | str]:
 @public
 def gaussian(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> GaussianReport:
+) -> GaussianAnswer:
     """Compare the usual formula with the simulation, over magnitude and exposure or the study's sweep.
 
     Parameters
@@ -290,8 +290,10 @@ def gaussian(
 
         return report
 
-    return GaussianReport(study, snr(study, engine, progress_of(0)), detect(study, engine, progress_of(1)))
+    return GaussianAnswer(study, snr(study, engine, progress_of(0)), detect(study, engine, progress_of(1)))
 
 
 #: The older name.
 gaussian_report = gaussian
+#: The older name of the class.
+GaussianReport = GaussianAnswer

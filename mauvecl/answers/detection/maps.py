@@ -48,7 +48,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True, eq=False)
-class MapResult(Answer):
+class MapAnswer(Answer):
     """The answer of `detection_map`, for the study's first star.
 
     Attributes
@@ -140,7 +140,7 @@ class MapResult(Answer):
 @public
 def map(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> MapResult:
+) -> MapAnswer:
     """Compute the detection probability of the study's first star and flare over two quantities.
 
     Parameters
@@ -184,7 +184,7 @@ def map(
     star = study.star[0]
     if "magnitude" in names:
         star = star.model_copy(update={"magnitude": None})
-    return MapResult(
+    return MapAnswer(
         study=study,
         star="stars of the axis" if "star" in names else label(star, quiet),
         x=x,
@@ -347,3 +347,5 @@ def _fill(
 
 #: The older name, which does not hide Python's own `map`.
 detection_map = map
+#: The older name of the class.
+MapResult = MapAnswer

@@ -53,7 +53,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True, eq=False)
-class UnknownTable(Answer):
+class UnknownAnswer(Answer):
     """The answer of `unknown_table`.
 
     Attributes
@@ -120,7 +120,7 @@ class UnknownTable(Answer):
         return list(self.quiets)
 
 
-def unknown_table(study: Study, unknowns: Mapping[str, NuisanceChoice] = SHOWN) -> UnknownTable:
+def unknown_table(study: Study, unknowns: Mapping[str, NuisanceChoice] = SHOWN) -> UnknownAnswer:
     """Compute the S/N of a study's flares under each of several unknowns, which are given by name."""
     costs: dict[tuple[str, float], dict[str, Cost]] = {}
     quiets = []
@@ -132,7 +132,7 @@ def unknown_table(study: Study, unknowns: Mapping[str, NuisanceChoice] = SHOWN) 
                 unknown: unknown_cost(case.label, case.quiet, flare, choice, comparison)
                 for unknown, choice in unknowns.items()
             }
-    return UnknownTable(study, costs, tuple(quiets))
+    return UnknownAnswer(study, costs, tuple(quiets))
 
 
 def power(snr: NDArray[np.float64], fap: float) -> NDArray[np.float64]:

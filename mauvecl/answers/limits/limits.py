@@ -107,7 +107,7 @@ class Limit:
 
 
 @dataclass(eq=False)
-class LimitResult(Answer):
+class LimitAnswer(Answer):
     """The answer of `limit`.
 
     Attributes
@@ -283,7 +283,7 @@ def solve(case: Case, statistic: str, engine: Engine | Pool) -> Limit:
 @public
 def limit(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> LimitResult:
+) -> LimitAnswer:
     """Compute the limits of a study's stars and flares, by every statistic.
 
     Parameters
@@ -297,13 +297,13 @@ def limit(
     Raises
     ------
     InputError
-        As `solve`, if it holds of every limit; else `LimitResult.failed` tells.
+        As `solve`, if it holds of every limit; else `LimitAnswer.failed` tells.
     """
     from mauvecl.device.engine import Engine as Default
     from mauvecl.runs.pool import map_in_order
 
     engine = engine or Default()
-    result = LimitResult(study)
+    result = LimitAnswer(study)
     if any(axis.quantity == study.limit.of for axis in study.sweep.axes):
         raise InputError(
             f"the sweep runs over the {study.limit.of} that is asked for",
@@ -337,16 +337,18 @@ def limit(
 
 #: The older name.
 limiting_magnitude = limit
+#: The older name of the class.
+LimitResult = LimitAnswer
 
 
 @public
-def smallest_amplitude(study: Study, engine: Engine | Pool | None = None) -> LimitResult:
+def smallest_amplitude(study: Study, engine: Engine | Pool | None = None) -> LimitAnswer:
     """Compute the smallest flare that is detected; see `limit`."""
     return limit(_asking(study, "amplitude"), engine)
 
 
 @public
-def shortest_exposure(study: Study, engine: Engine | Pool | None = None) -> LimitResult:
+def shortest_exposure(study: Study, engine: Engine | Pool | None = None) -> LimitAnswer:
     """Compute the shortest exposure in which the flares are detected; see `limit`."""
     return limit(_asking(study, "exposure"), engine)
 

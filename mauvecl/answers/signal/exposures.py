@@ -71,7 +71,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True)
-class ExposureResult(Answer):
+class ExposureAnswer(Answer):
     """The answer of `exposure_for`, one row per star.
 
     Attributes
@@ -130,7 +130,7 @@ def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
 @public
 def exposure(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
-) -> ExposureResult:
+) -> ExposureAnswer:
     """Compute the fewest frames whose closed-form S/N at a wavelength reaches a wanted one.
 
     Parameters
@@ -172,13 +172,13 @@ def exposure(
     long = [f"{e.star} needs more than a day: {np.ceil(e.exposure_s / DAY_S):.0f} exposures of a day at most, added up."
             for e in exposures if e.exposure_s > DAY_S]  # fmt: skip
     messages = [*(f"NO ANSWER: {error}." for error in failed), *collect_messages(list(seen)), *long]
-    return ExposureResult(study, exposures, tuple(messages), seen)
+    return ExposureAnswer(study, exposures, tuple(messages), seen)
 
 
 @public
 def exposure_for(
     study: Study, snr: float | None = None, wavelength_nm: Wavelength | None = None, *, per: Per | None = None
-) -> ExposureResult:
+) -> ExposureAnswer:
     """Compute `exposure` for another S/N or wavelength than the study's.
 
     Parameters

@@ -67,13 +67,13 @@ def selftest(
     """
     from dataclasses import asdict
 
-    from mauvecl.answers import report
+    from mauvecl.answers import files
     from mauvecl.cli.console import Meter, show, show_table
     from mauvecl.device import selftest
     from mauvecl.device.engine import Engine
 
     started = time.perf_counter()
-    folder = None if output is None else report.make_folder(output)
+    folder = None if output is None else files.make_folder(output)
     with Meter(quiet=quiet or as_json) as meter:
         engine = Engine(device, progress=meter)
         checks = selftest.run(engine)
@@ -88,7 +88,7 @@ def selftest(
         outcome = f"{failed} of {len(checks)} checks FAILED" if failed else f"All {len(checks)} checks passed"
         show([f"{outcome} in {seconds:.0f} s. Promise: {engine.device.promise}."])
     if folder is not None:
-        report.write_json(selftest.read_outcome(engine.device), folder / "selftest.json")
+        files.write_json(selftest.read_outcome(engine.device), folder / "selftest.json")
     if failed:
         raise typer.Exit(1)
 

@@ -1,4 +1,4 @@
-"""Write answers down: tables, the study itself, and a record of the run. Nothing is computed here."""
+"""Files of answers: tables, the study, and the record of a run. Nothing is computed here."""
 
 from __future__ import annotations
 
