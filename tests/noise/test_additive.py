@@ -86,7 +86,7 @@ from mauvecl.device.stares import Stares
 from mauvecl.lightcurve.stares.components import Components
 from mauvecl.lightcurve.stares.scene import Flares, StareScene
 from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.lightcurve.stares import twin
+from mauvecl.lightcurve.stares import reference as twin
 from mauvecl.noise import reference
 from mauvecl.noise.components import components
 from mauvecl.noise.processes import NONE, CosmicRays, Processes
@@ -105,7 +105,8 @@ gain = quiet.gain_dn_per_electron
 one = toy(64, 1)
 c, stare = Components.of(one, [], np.ones((1, 64))), Stare.of(50.0)
 frames = Stares(engine.open_device).frames(c, stare, count=8, seed=2, processes=both)
-slow = twin.pixels(StareScene.of(c, stare, both), Flares.of(c, stare, None, None, 8), few, range(stare.n_frames), 2)[0]
+scene = StareScene.of(c, stare, both)
+slow = twin.pixels(scene, Flares.of(c, stare, None, None, 8), few, range(stare.n_frames), 2)[0]
 
 def same(drawn, processes):
     return bool((drawn[:8] == reference.realise(prepare([quiet], processes=processes), few, 2)).all())
