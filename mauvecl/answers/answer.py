@@ -72,7 +72,12 @@ class Answer(Drawable, ContentEquality, ABC):
         """One line with the study's assumptions about the parts that the answer uses."""
         from mauvecl.study.assumptions import assumption_line
 
-        return assumption_line(self.study, self.USES)
+        return assumption_line(self.study, self.uses)
+
+    @property
+    def uses(self) -> tuple[Use, ...]:
+        """Parts of the study that this answer uses."""
+        return self.USES
 
     @property
     def views(self) -> list[View]:

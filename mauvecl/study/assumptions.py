@@ -5,11 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Literal
 
+from mauvecl.noise.unknowns import COURSES
+
 if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 #: Parts of a study that answers use.
-Use = Literal["instrument", "sky", "flare", "orbit", "unknowns", "templates", "seed"]
+Use = Literal["instrument", "sky", "flare", "orbit", "processes", "nuisances", "stare", "values", "templates", "seed"]
+#: Parts that hold unknowns: processes of draws, nuisance parameters of statistics, changes during a stare, and
+#: instrument values that are averaged over.
+UNKNOWN_USES: tuple[Use, ...] = ("processes", "nuisances", "stare", "values")
+#: Known changes during a stare.
+KNOWN_CHANGES = ("thermal", "variability", "throughput", "sky")
 
 
 def assumption_line(study: Study, uses: Collection[Use], varied: Collection[str] = ()) -> str:
@@ -24,16 +31,19 @@ def assumption_line(study: Study, uses: Collection[Use], varied: Collection[str]
         Quantities that the answer varies in addition to those that the study sweeps.
     """
     swept = {axis.quantity for axis in study.sweep.axes} | set(varied)
-    words: dict[Use, Callable[[], str]] = {
+    words: dict[str, Callable[[], str]] = {
         "instrument": lambda: _instrument(study, swept),
         "sky": lambda: _sky(study, swept),
         "flare": lambda: _flare(study, swept),
         "orbit": lambda: _orbit(study),
-        "unknowns": lambda: _unknowns(study),
+        "unknowns": lambda: _unknowns(study, uses),
         "templates": lambda: f"flares of the shape {study.search.shape}; noise as measured",
         "seed": lambda: f"seed {study.run.seed}",
     }
-    return f"Assumed: {'; '.join(words[use]() for use in words if use in uses)}."
+    told = {*uses, *(("unknowns",) if {*UNKNOWN_USES} & {*uses} else ())}
+    unused = unused_unknowns(study, uses)
+    ignored = [f"not used: {', '.join(unused)}"] if unused else []
+    return f"Assumed: {'; '.join([*(words[use]() for use in words if use in told), *ignored])}."
 
 
 def _instrument(study: Study, swept: set[str]) -> str:
@@ -81,17 +91,32 @@ def _orbit(study: Study) -> str:
     return f"orbit of {source}; least angles: {', '.join(kept) or 'none'}"
 
 
-def _unknowns(study: Study) -> str:
-    """List the unknowns: those drawn, those marginalised over, and those of the instrument."""
+def _unknowns(study: Study, uses: Collection[Use]) -> str:
+    """List the unknowns that an answer draws, marginalises over or averages over."""
     n, s = study.nuisances, study.stare
-    named = [name for name in type(n).model_fields if name not in ("usual", "own") and getattr(n, name) is not None]
-    drawn = [name.replace("_", " ") for name, value in study.processes if value is not None]
-    drawn += [name for name in ("thermal", "variability", "throughput", "sky") if getattr(s, name) is not None]
-    drawn += [
-        f"{how} of {', '.join(of)}" for how in ("jitters", "offsets", "drifts", "cycles") if (of := getattr(s, how))
-    ]
-    parts = ["the usual unknowns drawn and marginalised"] if n.usual else []
+    drawn = [name.replace("_", " ") for name, value in study.processes if value is not None and "processes" in uses]
+    if "stare" in uses:
+        drawn += [name for name in KNOWN_CHANGES if getattr(s, name) is not None]
+        drawn += [f"{course} of {', '.join(of)}" for course in COURSES if (of := getattr(s, course))]
+    usual = "drawn and marginalised" if {"nuisances", "stare"} & {*uses} else "drawn"
+    parts = [f"the usual unknowns {usual}"] if n.usual else []
     parts += [f"drawn: {', '.join(drawn)}"] if drawn else []
-    parts += [f"marginalised: {', '.join([*named, *n.own])}"] if named or n.own else []
-    parts += [f"{study.unknowns.draws} draws of the instrument's unknowns"] if study.unknowns.draws else []
+    named = [*n.spreads(), *n.own] if "nuisances" in uses else []
+    parts += [f"marginalised: {', '.join(named)}"] if named else []
+    if study.unknowns.draws and "values" in uses:
+        parts.append(f"{study.unknowns.draws} draws of the instrument's unknowns")
     return "; ".join(parts) or "everything known"
+
+
+def unused_unknowns(study: Study, uses: Collection[Use]) -> list[str]:
+    """Return the keys of the study's unknowns that an answer ignores."""
+    n, s = study.nuisances, study.stare
+    given: dict[Use, list[str]] = {
+        "processes": [f"processes.{name}" for name, value in study.processes if value is not None],
+        "nuisances": [f"nuisances.{name}" for name in n.spreads()] + [f"nuisances.own.{name}" for name in n.own],
+        "stare": [f"stare.{name}" for name in KNOWN_CHANGES if getattr(s, name) is not None]
+        + [f"stare.{course}" for course in COURSES if getattr(s, course)],
+        "values": ["unknowns.draws"] if study.unknowns.draws else [],
+    }
+    usual = ["nuisances.usual"] if n.usual and not {"processes", "stare"} & {*uses} else []
+    return [key for use, keys in given.items() if use not in uses for key in keys] + usual

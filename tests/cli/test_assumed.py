@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from marks import long_but
 from typer.main import get_command
 
 from mauvecl.cli.app import app
-from mauvecl.study.assumptions import assumption_line
+from mauvecl.study.assumptions import Use, assumption_line
 from mauvecl.study.study import Study
 
 USUAL = "instrument mauve, detector at 21 deg C; sky of V = 22.1 mag/arcsec2; "
@@ -37,7 +37,7 @@ ASKED = {
                 "orbit of embedded elements; least angles: Earth's limb 25 deg, Sun 46 deg, Moon 25 deg"),
     "plan": ("targets.csv --days 3 --completeness 'closed form' --report html",
              "instrument mauve, detector at 21 deg C; " + FLARE + "orbit of embedded elements; "
-             "least angles: Earth's limb 25 deg, Sun 46 deg, Moon 25 deg; seed 1"),
+             "least angles: Earth's limb 25 deg, Sun 46 deg, Moon 25 deg; " + REST),
     "analyse": ("frames.csv --mapping mapping.toml", "flares of the shape davenport2014; noise as measured; seed 1"),
     "measure": ("--star G2V -m 7.4 --set measure.fits=100", USUAL + FLARE + REST),
     "realise": ("--star G2V -m 7.4 -n 10 --output r.zarr", USUAL + FLARE + REST),
@@ -66,7 +66,7 @@ def test_every_verb_says_what_it_assumed(verb: str, tmp_path: Path) -> None:
         assert json.loads(run(*words, "--json", *again, folder=tmp_path).stdout)["assumed"] == f"Assumed: {expected}."
 
 
-ALL = ("instrument", "sky", "flare", "orbit", "unknowns", "seed")
+ALL = get_args(Use)
 
 
 @pytest.mark.parametrize(

@@ -120,7 +120,7 @@ class PlanAnswer(Answer):
     planned : tuple of Planned
     """
 
-    USES: ClassVar[tuple[Use, ...]] = ("instrument", "flare", "orbit", "seed")
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "flare", "orbit", "processes", "stare", "seed")
 
     study: Study
     seen: VisibleAnswer
@@ -265,6 +265,8 @@ class PlanAnswer(Answer):
                 "FALSE ALARMS may be more than stated: the closed form takes the stare for known, and it has unknowns; "
                 "plan.completeness = 'injections' allows for them."
             )
+        if study.plan.along_orbit and study.processes.particle_processes:
+            lines.append("The rate of particles in [processes] is not used: it follows the orbit (plan.along_orbit).")
         lines += self.seen.messages
         return list(dict.fromkeys(lines))
 

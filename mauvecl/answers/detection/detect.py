@@ -77,7 +77,7 @@ class DetectAnswer(Answer):
         Comparison with the paper's values, if the study has its G2V star.
     """
 
-    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "processes", "nuisances", "seed")
     JSON = MappingProxyType({"rows": "table", "departures": "departures"})
 
     study: Study

@@ -172,7 +172,7 @@ class GaussianAnswer(Answer):
     detection : DetectAnswer
     """
 
-    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "processes", "nuisances", "seed")
 
     study: Study
     signal: SnrAnswer

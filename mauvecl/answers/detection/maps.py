@@ -69,7 +69,7 @@ class MapAnswer(Answer):
         The star of the first cell.
     """
 
-    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "processes", "nuisances", "values", "seed")
 
     study: Study
     star: str
@@ -124,7 +124,7 @@ class MapAnswer(Answer):
         """One line with the study's assumptions apart from the two quantities of the map."""
         from mauvecl.study.assumptions import assumption_line
 
-        return assumption_line(self.study, self.USES, (self.study.map.x.quantity, self.study.map.y.quantity))
+        return assumption_line(self.study, self.uses, (self.study.map.x.quantity, self.study.map.y.quantity))
 
     @property
     def tables(self) -> dict[str, Table]:

@@ -65,7 +65,7 @@ class UnknownAnswer(Answer):
         The stars without a flare.
     """
 
-    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "nuisances", "seed")
 
     study: Study
     costs: dict[tuple[str, float], dict[str, Cost]]

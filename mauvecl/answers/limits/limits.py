@@ -120,7 +120,7 @@ class LimitAnswer(Answer):
         Reasons for missing limits.
     """
 
-    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "processes", "nuisances", "values", "seed")
 
     study: Study
     limits: list[Limit] = field(default_factory=list)

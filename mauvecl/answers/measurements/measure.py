@@ -169,13 +169,18 @@ class MeasureAnswer(Answer):
         One stare of every star in every cell, if the study asks for bins of a stare.
     """
 
-    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "processes", "nuisances", "seed")
     JSON = MappingProxyType({"rows": "table", "fits": "fits"})
 
     study: Study
     flares: list[MeasuredFlare]
     messages: list[str]
     stares: list[MeasuredStare] = field(default_factory=list)
+
+    @property
+    def uses(self) -> tuple[Use, ...]:
+        """Parts of the study that this answer uses: the stare only if it is measured."""
+        return (*self.USES, "stare") if self.stares else self.USES
 
     @cached_property
     def table(self) -> QTable:

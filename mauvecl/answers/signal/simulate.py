@@ -57,7 +57,7 @@ SUMMARY_COLUMNS = (
 class SimulateAnswer(Answer):
     """The answer of `mauvecl simulate`: one table of components per star and stage."""
 
-    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "unknowns", "seed")
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "processes", "seed")
 
     JSON = MappingProxyType({"observations": "summary"})
     ENDINGS = ("ecsv", "fits")
@@ -67,12 +67,9 @@ class SimulateAnswer(Answer):
     messages: list[str]
 
     @property
-    def assumed(self) -> str:
-        """One line with what the study assumes, of flares too where the observations have any."""
-        from mauvecl.study.assumptions import assumption_line
-
-        flaring = len(self.observations) > len(self.study.star)
-        return assumption_line(self.study, (*self.USES, "flare") if flaring else self.USES)
+    def uses(self) -> tuple[Use, ...]:
+        """Parts of the study that this answer uses: flares only if observations have any."""
+        return (*self.USES, "flare") if len(self.observations) > len(self.study.star) else self.USES
 
     @property
     def tables(self) -> dict[str, Table]:

@@ -60,7 +60,7 @@ class SnrAnswer(Answer):
     messages : list of str
     """
 
-    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "unknowns", "seed")
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "processes", "seed")
     JSON = MappingProxyType({"snr-element": "element", "noise-budget": "noise_budget"})
 
     study: Study

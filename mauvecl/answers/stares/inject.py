@@ -197,7 +197,7 @@ class InjectAnswer(Answer):
     messages : list of str
     """
 
-    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "processes", "stare", "seed")
 
     study: Study
     stars: list[StarCompleteness]

@@ -223,7 +223,7 @@ class StareAnswer(Answer):
     messages : list of str
     """
 
-    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "processes", "stare", "seed")
     JSON = MappingProxyType({"stares": "table", "events": "events"})
 
     study: Study

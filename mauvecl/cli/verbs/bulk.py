@@ -80,7 +80,7 @@ def _tell(store: Store, place: Path, session: Session) -> None:
     from mauvecl.study.messages import collect_messages
 
     messages = collect_messages([scene.expectation for scene in store.scenes], store.study.processes)
-    assumed = assumption_line(store.study, ("instrument", "sky", "flare", "unknowns", "seed"))
+    assumed = assumption_line(store.study, ("instrument", "sky", "flare", "processes", "seed"))
     session.say([*messages, assumed])
     rows = [
         {

@@ -1,0 +1,129 @@
+"""Every unknown at every verb: it changes the answer, is refused, or the answer names it as not used."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from answers import small
+
+from mauvecl.answers.verbs import VERBS
+from mauvecl.device.engine import Engine
+from mauvecl.device.stares import Stares
+from mauvecl.noise.unknowns import ADDITIVE, NUISANCES, PROCESSES, STARE_CHANGES
+from mauvecl.schema.errors import InputError
+from mauvecl.study.assumptions import unused_unknowns
+from mauvecl.study.study import Study
+
+#: Normal priors that stares accept, near the expectation's values.
+PRIORS: dict[str, dict[str, Any]] = {
+    "jitter": {"normal": [0.025, 0.005], "between": [0.0, 0.05]},
+    "detector_temperature": {"normal": [21.0, 0.2], "between": [20.0, 22.0]},
+    "light_loss": {"normal": [0.34, 0.01], "between": [0.29, 0.39]},
+    "pointing_loss": {"normal": [0.02, 0.004], "between": [0.0, 0.04]},
+    "qe_scale": {"normal": [1.0, 0.01], "between": [0.95, 1.05]},
+    "sky_level": {"normal": [1.0, 0.1], "between": [0.5, 1.5]},
+}
+#: One study section for each unknown.
+UNKNOWNS: dict[str, dict[str, Any]] = (
+    {f"processes.{name}": {"processes": {name: PRIORS[name]}} for name in PROCESSES}
+    | {f"processes.{name}": {"processes": {name: {"rate_per_cm2_s": 300.0}}} for name in ADDITIVE}
+    | {f"nuisances.{name}": {"nuisances": {name: 0.1}} for name in NUISANCES}
+    | {
+        "nuisances.own.stray": {"nuisances": {"own": {"stray": {"points": [[200, 1], [450, 3], [700, 1]]}}}},
+        "nuisances.usual": {"nuisances": {"usual": True}},
+        "unknowns.draws": {"unknowns": {"draws": 2, "known": ["conversion_uv_per_electron", "read_noise_dn"]}},
+    }
+    | {
+        f"stare.{course}.{name}": {"stare": {course: {name: 0.01}}}
+        for course, rows in STARE_CHANGES.items()
+        for name in rows
+    }
+)
+FEW = {"realisations": 2000, "fap": 0.1, "seed": 2, "statistics": ["matched"]}
+#: Sections that each verb needs.
+NEEDS: dict[str, dict[str, Any]] = {
+    "snr": {"run": FEW | {"realisations": 200}},
+    "exposure": {"signal": {"snr": 10.0, "wavelength_nm": 330.0}},
+    "map": {
+        "map": {
+            "x": {"quantity": "amplitude", "values": [0.02, 0.05]},
+            "y": {"quantity": "exposure", "values": [50.0]},
+        }
+    },
+    "limit": {"limit": {"of": "magnitude", "power": 0.5}},
+    "measure": {"measure": {"fits": 50}},
+    "stare": {"stare": {"duration_s": 1200.0}},
+    "inject": {"stare": {"duration_s": 1200.0}, "injections": {"count": 20, "sizes": 2, "widths": 2}},
+    "visible": {"orbit": {"targets": ["eps Eri"], "days": 2.0}},
+    "plan": {"plan": {"targets": [{"name": "eps Eri"}], "completeness": "closed form"}, "orbit": {"days": 10.0}},
+}
+#: Verbs that take another engine, or none.
+ENGINES: dict[str, Any] = {"stare": Stares, "inject": Stares, "plan": Stares, "simulate": None, "visible": None}
+
+
+def asked(verb: str, unknown: dict[str, Any]) -> Study:
+    sections = {"star": [{"library": "G2V", "magnitude": 7.4}], "flare": {"amplitudes": [0.05]}, "run": FEW}
+    sections |= NEEDS.get(verb, {})
+    for name, section in unknown.items():
+        sections[name] = sections.get(name, {}) | section
+    return small(**sections)
+
+
+@cache
+def engine_of(verb: str) -> Any:
+    kind = ENGINES.get(verb, Engine)
+    return None if kind is None else kind()
+
+
+def answer(verb: str, unknown: dict[str, Any]) -> Any:
+    return VERBS[verb].ask(asked(verb, unknown), engine_of(verb))
+
+
+@cache
+def plain(verb: str) -> Any:
+    return answer(verb, {})
+
+
+def differ(one: Any, other: Any, *, messages: bool) -> bool:
+    """Return whether two answers have different numbers or, if `messages` count, messages."""
+    for name, table in one.tables.items():
+        there = other.tables.get(name)
+        if there is None or table.colnames != there.colnames or len(table) != len(there):
+            return True
+        for column in table.colnames:
+            if not np.array_equal(np.asarray(table[column]).astype(str), np.asarray(there[column]).astype(str)):
+                return True
+    return messages and set(one.messages) != set(other.messages)
+
+
+FAST = ("exposure", "visible", "simulate", "plan")
+
+
+@pytest.mark.parametrize("name", UNKNOWNS)
+@pytest.mark.parametrize(
+    "verb", [verb if verb in FAST else pytest.param(verb, marks=pytest.mark.long) for verb in VERBS]
+)
+def test_no_unknown_is_ignored_silently(verb: str, name: str) -> None:
+    unknown, base = UNKNOWNS[name], plain(verb)
+    unused = unused_unknowns(asked(verb, unknown), base.uses)
+    if unused:
+        assert any(name.startswith(key) for key in unused)
+        return
+    try:
+        found, reason = answer(verb, unknown), None
+    except InputError as error:
+        found, reason = None, error
+    if reason is not None:
+        assert name.split(".")[1] in f"{reason.key} {reason}", reason
+    else:
+        assert differ(found, base, messages=verb == "plan"), f"{name} changes nothing that {verb} answers"
+
+
+def test_answers_name_what_they_do_not_use() -> None:
+    base = plain("exposure")
+    assert "not used" not in base.assumed
+    found = answer("exposure", UNKNOWNS["processes.jitter"] | UNKNOWNS["stare.drifts.star"])
+    assert found.assumed.endswith("not used: processes.jitter, stare.drifts.")
