@@ -102,7 +102,7 @@ def fitting() -> dict[str, Any]:
         "path": "no such file", "peak": 0.1, "peak_k": 1e4, "peak_s": 0.0, "pixels": 5, "probability": 0.5,
         "quantity": "magnitude", "quiet": quiet, "radius_rsun": 1.0, "realisations": 50, "scale_of": None,
         "scale": things()["EnergyScale"], "sd": np.ones(1), "seconds": 5.0, "seed": 1, "settings": ["run.fap=0.1"],
-        "since_peak_s": 3.0, "source": star(), "sources": [star()], "spectra": pixels[None], "spectrum": None,
+        "rate_per_cm2_s": 1.0, "since_peak_s": 3.0, "source": star(), "sources": [star()], "spectra": pixels[None], "spectrum": None,
         "star": study().star[0], "stars": None, "statistic": "matched", "study": study(), "surface_brightness": 22.0,
         "target": "290.0 -11.2", "tau": np.linspace(-1, 5, 10), "temperature_k": 5700.0, "threshold": 3.0,
         "time": "2027-01-01", "value": 7.0, "values": np.r_[0, 1, np.linspace(1, 0, 8)], "wavelength": 7.0,

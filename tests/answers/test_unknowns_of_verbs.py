@@ -65,7 +65,9 @@ ENGINES: dict[str, Any] = {"stare": Stares, "inject": Stares, "plan": Stares, "s
 
 
 def asked(verb: str, unknown: dict[str, Any]) -> Study:
+    # The sky is bright, so that its level changes a map of few realisations.
     sections = {"star": [{"library": "G2V", "magnitude": 7.4}], "flare": {"amplitudes": [0.05]}, "run": FEW}
+    sections["sky"] = {"surface_brightness": 15.0}
     sections |= NEEDS.get(verb, {})
     for name, section in unknown.items():
         sections[name] = sections.get(name, {}) | section
