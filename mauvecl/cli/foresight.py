@@ -89,12 +89,7 @@ def question_time(study: Study, *, device: str | None, cluster: str | None, insi
     """
     count = study.run.realisations
     if count > MOST_REALISATIONS:
-        raise InputError(
-            f"realisations = {count}",
-            f"at most {MOST_REALISATIONS}: the index has 63 bits",
-            key="realisations",
-            value=count,
-        )
+        raise InputError.of("realisations", count, f"at most {MOST_REALISATIONS}: the index has 63 bits")
     if insist or count < 10**9:
         # A billion ends within hours anywhere: no need to look at the instrument.
         return

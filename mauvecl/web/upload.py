@@ -47,12 +47,7 @@ def read_upload(name: str, content: bytes) -> Source:
         raise InputError(too_large(len(content)), key="upload", value=len(content))
     source = read_limited(content)
     if source.wavelength_nm.size > MOST_POINTS:
-        raise InputError(
-            f"upload of {source.wavelength_nm.size} points",
-            f"at most {MOST_POINTS}",
-            key="points",
-            value=source.wavelength_nm.size,
-        )
+        raise InputError.of("points", source.wavelength_nm.size, f"at most {MOST_POINTS}")
     return replace(source, name=UPLOADED, origin="upload")
 
 

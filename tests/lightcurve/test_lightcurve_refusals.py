@@ -139,7 +139,7 @@ def test_bad_arguments_are_named(name: str) -> None:
         ("energy,rate\n1e31,1\n1e32,2\n", "per_day"),
         ("energy,rate\n1e32,2\n1e31,1\n", "energy_erg"),
         ("energy,number\n1e32,2\n", "columns"),
-        ("energy,rate\n1e32,a\n1e33,b\n", "columns"),
+        ("energy,rate\n1e32,a\n1e33,b\n", "rate"),
         ("energy,rate\n1e32,1\n", "per_day"),
     ],
 )

@@ -197,23 +197,11 @@ class RateTable(Rates):
             object.__setattr__(self, name, kept)
         energy, rate = self.energy_erg, self.per_day
         if energy.ndim != 1 or energy.shape != rate.shape or energy.size < 2:
-            raise InputError(
-                f"a table of rates has {energy.size} energies and {rate.size} rates",
-                "as many, 2 at least",
-                key="per_day",
-                value=rate.size,
-            )
+            raise InputError.of("per_day", rate.size, f"one rate for each of {energy.size} energies, at least 2")
         if not (np.isfinite(energy).all() and (energy > 0).all() and (np.diff(energy) > 0).all()):
-            raise InputError(
-                "energies of a table of rates do not ascend", "ascending ones above 0", key="energy_erg", value=energy
-            )
+            raise InputError("energies of a table of rates do not ascend", "ascending ones above 0", key="energy_erg")
         if not (np.isfinite(rate).all() and (rate > 0).all() and (np.diff(rate) <= 0).all()):
-            raise InputError(
-                "rates of a table do not fall",
-                "flares a day of each energy or more, above 0",
-                key="per_day",
-                value=rate,
-            )
+            raise InputError("rates of a table do not fall", "falling rates above 0, per day", key="per_day")
 
     @classmethod
     def read(cls, path: str | Path, band: str = "Kepler") -> Self:
@@ -232,12 +220,7 @@ class RateTable(Rates):
         for name in ("energy", "rate"):
             values = np.ma.filled(np.ma.asarray(table[name]), np.nan)
             if values.dtype.kind not in "iuf":
-                raise InputError(
-                    f"table of rates {shortened(path.name)}: {name} holds no plain numbers",
-                    "plain numbers",
-                    key="columns",
-                    value=name,
-                )
+                raise InputError.of(name, "text", "plain numbers", where=f"table of rates {shortened(path.name)}")
             columns.append(np.asarray(values, np.float64))
         energy, rate = columns
         rates = cls(energy_erg=energy, per_day=rate, band=band, source=path.name)

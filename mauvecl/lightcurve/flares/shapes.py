@@ -318,12 +318,7 @@ class TableShape(Shape):
         tau, values = np.array(self.tau, np.float64), np.array(self.values, np.float64)
         name = f"the flare shape {shortened(self.name)}"
         if tau.ndim != 1 or tau.shape != values.shape or tau.size < 2:
-            raise InputError(
-                f"{name} has {tau.size} times and {values.size} values",
-                "as many, at least 2",
-                key="values",
-                value=values.size,
-            )
+            raise InputError.of("values", values.size, f"one for each of {tau.size} times, at least 2", where=name)
         if not (np.isfinite(tau).all() and (np.diff(tau) > 0).all()):
             raise InputError(
                 f"{name} has times that do not ascend", "finite ones in ascending order", key="tau", value=tau

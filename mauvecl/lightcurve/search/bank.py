@@ -111,12 +111,7 @@ class Bank:
         kept = np.atleast_2d(np.array(self.directions, np.float64))
         length = np.linalg.norm(kept, axis=1, keepdims=True)
         if not (length > 0).all():
-            raise InputError(
-                "a direction of the bank is zero",
-                "flares that change a sum of a frame",
-                key="directions",
-                value=self.directions,
-            )
+            raise InputError("a direction of the bank is zero", "flares that change a sum of a frame", key="directions")
         kept = kept / length
         kept.setflags(write=False)
         object.__setattr__(self, "directions", kept)

@@ -87,20 +87,11 @@ class Completeness:
             object.__setattr__(self, name, kept)
         energy, p = self.energy_erg, self.probability
         if energy.ndim != 1 or energy.shape != p.shape or energy.size < 2:
-            raise InputError(
-                f"a completeness has {energy.size} energies and {p.size} probabilities",
-                "equal numbers",
-                key="probability",
-                value=p.size,
-            )
+            raise InputError.of("probability", p.size, f"one for each of {energy.size} energies, at least 2")
         if not ((energy > 0).all() and (np.diff(energy) > 0).all() and np.isfinite(energy).all()):
-            raise InputError(
-                "energies of a completeness do not ascend", "ascending energies above 0", key="energy_erg", value=energy
-            )
+            raise InputError("energies of a completeness do not ascend", "ascending ones above 0", key="energy_erg")
         if not ((p >= 0) & (p <= 1)).all():
-            raise InputError(
-                f"a completeness runs from {p.min():g} to {p.max():g}", "probabilities", key="probability", value=p
-            )
+            raise InputError.of("probability", (float(p.min()), float(p.max())), "0 to 1")
 
     def at(self, energy_erg: ArrayLike) -> Float:
         """Return the interpolated probability, constant outside the table, shape of the energy."""
@@ -226,12 +217,7 @@ def frame_signal(
         Additional variance, such as that of particle hits.
     """
     if quiet.n_frames != 1 or flare.n_frames != 1:
-        raise InputError(
-            f"expectations have {quiet.n_frames} and {flare.n_frames} frames",
-            "one frame each",
-            key="n_frames",
-            value=(quiet.n_frames, flare.n_frames),
-        )
+        raise InputError.of("n_frames", (quiet.n_frames, flare.n_frames), "one frame each")
     light = (flare.source_electrons - quiet.source_electrons) * quiet.gain_dn_per_electron / amplitude
     variance = quiet.unsaturated_variance_dn2 + (0.0 if added_variance_dn2 is None else added_variance_dn2)
     used = ~quiet.saturated

@@ -185,12 +185,7 @@ def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate
     tried = [np.flatnonzero(row.per_amplitude > 0) for row in rows]
     sizes = np.array([t.size for t in tried])
     if not sizes.any():
-        raise InputError(
-            "no template of the bank fits into the stare",
-            "a longer one",
-            key="half_widths_s",
-            value=search.bank.half_widths_s,
-        )
+        raise InputError.of("half_widths_s", search.bank.half_widths_s, "templates that fit into the stare")
     weights = TemplateGrid.from_bank(search.bank).peak_probabilities(WEIGHTING_THRESHOLD)
     weights = np.maximum(weights, MIN_WEIGHT * weights.max())
     shares = np.cumsum(weights * sizes[:, None])

@@ -63,12 +63,7 @@ class Injections:
         if not self.half_widths_s or not all(np.isfinite(w) and w > 0 for w in self.half_widths_s):
             raise InputError.of("half_widths_s", list(self.half_widths_s), "times above 0")
         if self.positions < 1 or not 1 <= self.draws <= NUMBERS:
-            raise InputError(
-                f"there are {self.positions} positions x {self.draws} draws",
-                f"at least one of each and at most {NUMBERS} draws",
-                key="draws",
-                value=(self.positions, self.draws),
-            )
+            raise InputError.of("draws", (self.positions, self.draws), f"a position and 1 to {NUMBERS} draws")
 
     @cached_property
     def peaks_s(self) -> Float:

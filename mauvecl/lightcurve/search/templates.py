@@ -85,9 +85,7 @@ class Templates:
         """
         used = ~quiet.saturated
         if not used.any():
-            raise InputError(
-                f"every pixel of {quiet.name} saturates", "some that do not", key="quiet", value=quiet.name
-            )
+            raise InputError.of("quiet", quiet.name, "a star that does not saturate every pixel")
         variance, flares = np.where(used, quiet.variance_dn2, 0.0), flares_dn * used
         plain = np.divide(flares, variance, out=np.zeros_like(flares), where=used)
         optimal = plain

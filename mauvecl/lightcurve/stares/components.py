@@ -55,12 +55,7 @@ class Components:
     def __post_init__(self) -> None:
         n_pixel = self.quiet.wavelength_nm.size
         if self.quiet.n_frames != 1:
-            raise InputError(
-                f"an exposure of {self.quiet.n_frames} frames",
-                "one frame of the stare",
-                key="n_frames",
-                value=self.quiet.n_frames,
-            )
+            raise InputError.of("n_frames", self.quiet.n_frames, "one frame of the stare")
         for name, what, least in (("flare_electrons", "flare spectra", 0), ("weights", "spectral weights", 1)):
             kept = np.array(getattr(self, name), np.float64)
             if kept.ndim != 2 or kept.shape[1] != n_pixel or len(kept) < least:
@@ -82,12 +77,7 @@ class Components:
                 value=pixel,
             )
         if len(self.flare_electrons) > MOST_FLARES:
-            raise InputError(
-                f"{len(self.flare_electrons)} flare spectra",
-                f"at most {MOST_FLARES}",
-                key="flare_electrons",
-                value=len(self.flare_electrons),
-            )
+            raise InputError.of("flare_electrons", len(self.flare_electrons), f"at most {MOST_FLARES} spectra")
         unusable = self.quiet.saturated & (self.weights != 0).any(axis=0)
         if unusable.any():
             raise InputError(

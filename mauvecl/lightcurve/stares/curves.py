@@ -45,16 +45,9 @@ class Table:
             kept.setflags(write=False)
             object.__setattr__(self, name, kept)
         if self.time_s.ndim != 1 or self.time_s.shape != self.values.shape or self.time_s.size < 2:
-            raise InputError(
-                f"a curve has {self.time_s.size} times and {self.values.size} values",
-                "as many, at least 2",
-                key="values",
-                value=self.values.size,
-            )
+            raise InputError.of("values", self.values.size, f"one for each of {self.time_s.size} times, at least 2")
         if not (np.isfinite(self.time_s).all() and np.isfinite(self.values).all()):
-            raise InputError(
-                "a curve holds a time or value that is not finite", "numbers", key="values", value=self.values
-            )
+            raise InputError("a curve holds a time or value that is not finite", "numbers", key="values")
         steps = np.diff(self.time_s)
         if not (steps > 0).all():
             place = int(np.argmin(steps > 0))

@@ -174,12 +174,7 @@ def checked_frames(frames: ArrayLike, quiet: Expectation, stare: Stare | None) -
     if not np.isfinite(raw).all():
         raise InputError("frames hold undefined values", "finite numbers", key="frames")
     if quiet.n_frames != 1:
-        raise InputError(
-            f"an exposure of {quiet.n_frames} frames",
-            "one frame of the quiescent star",
-            key="n_frames",
-            value=quiet.n_frames,
-        )
+        raise InputError.of("n_frames", quiet.n_frames, "one frame of the quiescent star")
     return raw, stare
 
 

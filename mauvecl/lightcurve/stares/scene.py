@@ -120,19 +120,9 @@ class StareScene:
         if abs(stare.frame_s - x.frame_s) > 1e-9 * x.frame_s:
             raise InputError.of("frame_s", stare.frame_s, f"the instrument's {x.frame_s:g} s")
         if components.n_statistics > MOST_STATISTICS:
-            raise InputError(
-                f"{components.n_statistics} spectral weights",
-                f"at most {MOST_STATISTICS}",
-                key="weights",
-                value=components.n_statistics,
-            )
+            raise InputError.of("weights", components.n_statistics, f"at most {MOST_STATISTICS} spectral weights")
         if len(stare.unknowns) > MOST_UNKNOWNS:
-            raise InputError(
-                f"{len(stare.unknowns)} unknowns of a stare",
-                f"at most {MOST_UNKNOWNS}",
-                key="unknowns",
-                value=len(stare.unknowns),
-            )
+            raise InputError.of("unknowns", len(stare.unknowns), f"at most {MOST_UNKNOWNS} of a stare")
         for name, _ in processes.modulations:
             raise InputError(f"{name} is a prior of exposures", "an unknown of the stare", key=name)
         scene = prepare([x], processes=processes)

@@ -190,7 +190,7 @@ class Stare:
         start: Float = np.arange(max(1, int(count)), dtype=np.float64) * float(frame_s)
         start = start[_outside(gaps, start, float(frame_s))]
         if not start.size:
-            raise InputError(f"the gaps leave no frame of a stare of {duration_s:g} s", "some", key="gaps", value=gaps)
+            raise InputError.of("gaps", gaps, f"gaps that leave a frame of {duration_s:g} s")
 
         def over_frames(curve: Curve | None) -> Float:
             return np.zeros(start.size) if curve is None else curve.mean_over(start, float(frame_s))
