@@ -10,7 +10,7 @@ from typing import Any, Self
 from pydantic import create_model
 
 from mauvecl.noise.additive import AdditiveProcess
-from mauvecl.noise.cosmic_rays import CosmicRays
+from mauvecl.noise.cosmic_rays import CosmicRays, ParticleRate
 from mauvecl.noise.priors import Normal, Prior, PriorField, Uniform
 from mauvecl.noise.unknowns import ADDITIVE, PROCESSES, SignalPart
 from mauvecl.schema.calls import public
@@ -70,7 +70,7 @@ class Processes(create_model("_Processes", __base__=Section, **_keys)):  # type:
         """Largest rate of incident particles of the enabled processes; zero without any."""
         return max((process.particles_per_cm2_s or 0.0 for process in self.particle_processes), default=0.0)
 
-    def with_particles(self, rate_per_cm2_s: float) -> Self:
+    def with_particles(self, rate_per_cm2_s: ParticleRate) -> Self:
         """Return a copy in which all processes caused by incident particles have this rate, enabled if necessary."""
         every = {name: getattr(self, name) or kind() for name, kind in ADDITIVE.items()}
         caused = {name: process for name, process in every.items() if process.particles_per_cm2_s is not None}
