@@ -20,7 +20,6 @@ import mauvecl
 from mauvecl import bulk
 from mauvecl.device.errors import DeviceError
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.records import Record
 
 WRONG = {
     "a Quantity of another unit": 3 * u.kg,
@@ -182,33 +181,3 @@ def test_a_wrong_argument_is_one_sentence(path: str, tmp_path: Path, monkeypatch
             told = answer_to(lambda value=value, parameter=parameter: function(**good | {parameter: value}))
             assert told or free or kind not in NEVER, f"{path} takes {kind} for {parameter}"
             assert "\n" not in told, (path, parameter, kind)
-
-
-def records(record: type[Record] = Record) -> Iterator[type[Record]]:
-    for one in record.__subclasses__():
-        if not inspect.isabstract(one):
-            yield one
-        yield from records(one)
-
-
-@pytest.mark.parametrize("record", sorted(records(), key=lambda one: one.__name__), ids=lambda one: one.__name__)
-def test_a_records_wrong_field_is_one_sentence(record: type[Record]) -> None:
-    """Each section of a study and the instrument: what pydantic refuses is told as everything else is."""
-    for field in (*record.model_fields, "no_such_key"):
-        for kind, value in WRONG.items():
-            told = answer_to(lambda value=value, field=field: record(**{field: value}))
-            assert told or kind != "an object" or record.model_fields[field].annotation is Any, field
-            assert "\n" not in told, (field, kind)
-            assert not told or "expected" in told or "did you mean" in told, told
-
-
-def test_nothing_is_set_in_place() -> None:
-    for thing, name in ((study(), "star"), (study().run, "fap"), (things()["Instrument"], "light_loss")):
-        with pytest.raises(InputError, match=f"{name} is not set in place, expected a changed copy"):
-            setattr(thing, name, 1)
-
-
-def test_too_few_or_too_many_are_pythons_own_sentence() -> None:
-    for call in (lambda: star().flaring(), lambda: star().binned(1.0, 2.0), lambda: study().run.__class__(5)):
-        with pytest.raises(TypeError, match=r"argument"):
-            call()

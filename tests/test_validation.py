@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import pickle
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from typing import Any, get_args, get_origin
@@ -16,6 +17,7 @@ import mauvecl
 from mauvecl import bulk
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import AnyUnit, Range, Unit
+from mauvecl.schema.quantities import unit_of
 from mauvecl.schema.records import Record
 
 #: Modules below the validation, and the inner interface of statistics, whose methods public classes inherit.
@@ -165,3 +167,90 @@ def test_whole_numbers_may_be_floats(path: str, name: str) -> None:
         assert type(check(value)) is int
     with pytest.raises(InputError):
         check(7.5)
+
+
+@pytest.mark.parametrize(
+    "name", [n for n, f in mauvecl.Instrument.model_fields.items() if f.annotation in (float, int)]
+)
+def test_instruments_take_quantities(name: str) -> None:
+    mauve = mauvecl.Instrument.load("mauve")
+    value = getattr(mauve, name)
+    quantity = value * u.Unit(unit_of(name)) if unit_of(name) else value * u.one
+    assert getattr(mauve.with_(**{name: quantity}), name) == pytest.approx(value)
+    with pytest.raises(InputError) as error:
+        mauve.with_(**{name: 3 * u.kg})
+    assert error.value.key == name
+
+
+@pytest.mark.parametrize(
+    ("quantity", "value", "plain", "key"),
+    [
+        ("magnitude", 7000 * u.mmag, 7.0, lambda study: study.star[0].magnitude),
+        ("exposure", 2 * u.min, 120.0, lambda study: study.observation.exposure_s),
+        ("detector_temperature", 300 * u.K, 26.85, lambda study: study.observation.temperature_c),
+        ("flare_temperature", 12 * u.kK, 12_000.0, lambda study: study.flare.temperature_k),
+        ("sky", 22 * u.mag / u.arcsec**2, 22.0, lambda study: study.sky.surface_brightness),
+    ],
+)
+def test_studies_take_quantities(quantity: str, value: Any, plain: float, key: Callable[[Any], float]) -> None:
+    assert key(mauvecl.Study().at(quantity, value)) == pytest.approx(plain)
+    for wrong in (3 * u.kg, np.nan, "x"):
+        with pytest.raises(InputError):
+            mauvecl.Study().at(quantity, wrong)
+
+
+def test_quantities_give_the_same_results() -> None:
+    star, mauve = mauvecl.Source.from_library("G2V").at_magnitude(7.4 * u.mag), mauvecl.Instrument.load("mauve")
+    assert star == mauvecl.Source.from_library("G2V").at_magnitude(7.4)
+    assert star.flaring(24 * u.percent, 10 * u.kK) == star.flaring(0.24, 10_000)
+    assert mauvecl.expect(star, mauve, exposure=1 * u.min) == mauvecl.expect(star, mauve, exposure=60)
+    assert mauve.throughput(0.3 * u.um) == pytest.approx(float(mauve.throughput(300.0)))
+    assert mauve.with_(temperature_c=13 * u.deg_C) == mauve.with_(temperature_c=13.0)
+    assert pickle.loads(pickle.dumps(mauve)) == mauve
+    assert mauvecl.Uniform(283.15 * u.K, 300 * u.K).low == pytest.approx(10.0)
+    energy = mauvecl.EnergyScale.of_star(star, 32.6156 * u.lyr).erg_per_s
+    assert energy == pytest.approx(mauvecl.EnergyScale.of_star(star, 10.0).erg_per_s, rel=1e-4)
+
+
+def error_of(call: Callable[[], Any]) -> InputError | None:
+    """Return the InputError that a call raises, if any."""
+    try:
+        call()
+    except InputError as error:
+        return error
+    return None
+
+
+def records(record: type[Record] = Record) -> Iterator[type[Record]]:
+    for one in record.__subclasses__():
+        if not inspect.isabstract(one):
+            yield one
+        yield from records(one)
+
+
+@pytest.mark.parametrize("record", sorted(records(), key=lambda one: one.__name__), ids=lambda one: one.__name__)
+def test_wrong_fields_of_records_raise(record: type[Record]) -> None:
+    """Errors of pydantic never leave a section of a study or an instrument."""
+    wrong = (3 * u.kg, np.nan, [1, "a"], "no such thing", object(), np.ones((2, 3)), True, None)
+    for field in (*record.model_fields, "no_such_key"):
+        for value in wrong:
+            error = error_of(lambda field=field, value=value: record(**{field: value}))
+            if error is None:
+                assert type(value) is not object or record.model_fields[field].annotation is Any, field
+            else:
+                assert "\n" not in str(error)
+                assert error.expected or "did you mean" in str(error), error
+
+
+def test_attributes_cannot_be_set() -> None:
+    study = mauvecl.Study()
+    for thing, name in ((study, "star"), (study.run, "fap"), (mauvecl.Instrument.load("mauve"), "light_loss")):
+        with pytest.raises(InputError, match=name):
+            setattr(thing, name, 1)
+
+
+def test_python_reports_missing_and_superfluous_arguments() -> None:
+    star = mauvecl.Source.from_library("G2V")
+    for call in (lambda: star.flaring(), lambda: star.binned(1.0, 2.0), lambda: mauvecl.Study().run.__class__(5)):
+        with pytest.raises(TypeError, match="argument"):
+            call()
