@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Unit
 from mauvecl.schema.physical import Duration, Exposure, SkyBrightness
@@ -61,7 +61,7 @@ BUDGET_COLUMNS = (
 )  # fmt: skip
 
 
-@public
+@validated
 @dataclass(frozen=True, eq=False)
 class Expectation(Drawable, ContentEquality):
     """Means and noise per pixel of an exposure; the arrays are read-only and refer to a single frame.
@@ -399,7 +399,7 @@ def _ratio(signal: Float, variance: Float) -> Float:
     return np.divide(signal, np.sqrt(variance), out=np.zeros_like(signal), where=variance > 0)
 
 
-@public
+@validated
 def expect(
     source: Source | str,
     instrument: Instrument | str | Path,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Unit
 from mauvecl.schema.physical import DetectorTemperature
@@ -58,7 +58,7 @@ Count = Annotated[int, Field(ge=0, le=20)]
 Wavelengths = Annotated[ArrayLike, Unit("nm")]
 
 
-@public
+@validated
 class Instrument(Record):
     """A frozen description of an instrument, with units in the names.
 

@@ -11,7 +11,7 @@ import astropy.units as u
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Unit
 
@@ -32,7 +32,7 @@ COLUMNS = {
 }
 
 
-@public
+@validated
 @dataclass(frozen=True, eq=False)
 class PixelMap(ContentEquality):
     """Properties of each pixel of the whole array; None keeps the instrument's value.

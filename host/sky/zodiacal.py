@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import SkyBrightness, SolidAngle
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 Lookup = Literal["bilinear", "nearest"]
 
 
-@public
+@validated
 @dataclass(frozen=True)
 class Sky:
     """Zodiacal light of uniform surface brightness.

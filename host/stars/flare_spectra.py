@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Unit
 from mauvecl.schema.physical import AreaRatio, BalmerJump, LineFraction, Temperature
@@ -72,7 +72,7 @@ CONTINUED_NM, CONTINUED_RATIO = (50.0, 30_000.0), 1.01
 JOIN_NM, GAP_NM = 20.0, 5.0
 
 
-@public
+@validated
 class FlareSpectrum:
     """The light of a flare against wavelength, up to a factor.
 
@@ -122,7 +122,7 @@ class FlareSpectrum:
         raise NotImplementedError
 
 
-@public
+@validated
 @dataclass(frozen=True)
 class Blackbody(FlareSpectrum):
     """A flare that shines as one blackbody."""
@@ -142,7 +142,7 @@ class Blackbody(FlareSpectrum):
         return f"{self.temperature_k:g} K"
 
 
-@public
+@validated
 @dataclass(frozen=True)
 class TwoBlackbodies(FlareSpectrum):
     """A flare of two temperatures.
@@ -172,7 +172,7 @@ class TwoBlackbodies(FlareSpectrum):
         return f"{self.temperature_k:g} K and {self.second_area:g} of its area at {self.second_temperature_k:g} K"
 
 
-@public
+@validated
 @dataclass(frozen=True)
 class BalmerFlare(FlareSpectrum):
     """A blackbody with a Balmer continuum of optically thin hydrogen below 364.6 nm.
@@ -268,7 +268,7 @@ class EmissionLine:
         return np.asarray(triangles.mean(axis=1))
 
 
-@public
+@validated
 @dataclass(frozen=True)
 class FlareWithLines(FlareSpectrum):
     """A continuum with emission lines.
@@ -353,7 +353,7 @@ def _sum_of_lines(fluxes: Mapping[str, float], wavelength_nm: Float) -> Float:
     return total
 
 
-@public
+@validated
 @dataclass(frozen=True, eq=False)
 class ObservedFlare(ContentEquality, FlareSpectrum):
     """The spectrum of an observed or computed flare, without its star.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import AnyUnit, Unit
 from mauvecl.schema.physical import Amplitude, BinWidth, Magnitude, Reddening, Temperature
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 BRIGHTEST_V, SUN_V = -2.0, (-27.3, -26.2)
 
 
-@public
+@validated
 @dataclass(frozen=True, eq=False)
 class Source(Drawable, ContentEquality):
     """A stellar spectrum at the telescope.

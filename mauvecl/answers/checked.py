@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mauvecl.host.files.parsed import read_text
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.study.study_text import read_embedded_study
 
@@ -61,7 +61,7 @@ def _is_table_of_answer(path: Path) -> bool:
         return False
 
 
-@public
+@validated
 def verify_answer(folder: str | Path) -> list[FileFault]:
     """Compare an answer's folder with the digests in its run record.
 

@@ -33,7 +33,7 @@ from mauvecl.results.requests.requests import (
 )
 from mauvecl.results.snr import Counts, SnrResult, elements, observers
 from mauvecl.results.sums import Arrays, DetectionSums, SnrSums, pack_detection, pack_snr
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import OneOrMore
 from mauvecl.schema.physical import FirstRealisation, Realisations, Seed
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 __all__ = ["DeviceError", "DeviceRecord", "Engine", "devices"]
 
 
-@public
+@validated
 class Engine:
     """Engine that draws realisations on an OpenCL device and reduces them there.
 

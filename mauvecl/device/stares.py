@@ -18,7 +18,7 @@ from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.stares.sums import check_sums
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.results.requests.requests import Shard
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import Realisations, Seed
 
@@ -28,7 +28,7 @@ Floats = NDArray[np.float32]
 REDUCED_BYTES = 4 * 2**20
 
 
-@public
+@validated
 class Stares:
     """Simulator of stares on an OpenCL device.
 

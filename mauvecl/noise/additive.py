@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, ClassVar, Self
 
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.section import Section
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 NEGLIGIBLE = 2.0**-40
 
 
-@public
+@validated
 class AdditiveProcess(Section, ABC):
     """Charge that each pixel collects independently in each draw, and the study section that describes it.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal, Self
 
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range
 
@@ -13,7 +13,7 @@ from mauvecl.schema.fields import Range
 MAX_EXPOSURES = 1000
 
 
-@public
+@validated
 @dataclass(frozen=True)
 class Comparison:
     """Subtracted quiescent spectrum and the variances that weight the residuals.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Self
 from pydantic import model_validator
 
 from mauvecl.noise.additive import NEGLIGIBLE, AdditiveProcess
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Unit
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 ParticleRate = Annotated[float, Unit("1 / (cm2 s)"), Range(0, 1e6)]
 
 
-@public
+@validated
 class CosmicRays(AdditiveProcess):
     """Hits by charged particles; the defaults are assumptions (INSTRUMENT.md: outside the South Atlantic Anomaly).
 

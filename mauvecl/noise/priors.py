@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import PlainSerializer, PlainValidator, WithJsonSchema
 
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range
 from mauvecl.schema.quantities import is_quantity, without_unit
@@ -46,7 +46,7 @@ class PriorUnit:
 PriorValue = Annotated[float, PriorUnit(), Range()]
 
 
-@public
+@validated
 @dataclass(frozen=True)
 class Uniform:
     """Uniform prior between two values; temperatures may be Quantities and are stored in deg C."""
@@ -68,7 +68,7 @@ class Uniform:
         return np.asarray(np.where(below < above, from_low, self.high - (self.high - self.low) * above))
 
 
-@public
+@validated
 @dataclass(frozen=True)
 class Normal:
     """Normal prior truncated at `low` and `high`; values as for `Uniform`, with a plain `sd` in deg C."""

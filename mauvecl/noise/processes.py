@@ -13,7 +13,7 @@ from mauvecl.noise.additive import AdditiveProcess
 from mauvecl.noise.cosmic_rays import CosmicRays, ParticleRate
 from mauvecl.noise.priors import Normal, Prior, PriorField, Uniform
 from mauvecl.noise.unknowns import ADDITIVE, PROCESSES, SignalPart
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.section import Section
 
 __all__ = ["NONE", "CosmicRays", "Normal", "Prior", "Processes", "Uniform"]
@@ -23,7 +23,7 @@ _keys: Any = {name: (kind | None, None) for name, kind in ADDITIVE.items()} | di
 )
 
 
-@public
+@validated
 class Processes(create_model("_Processes", __base__=Section, **_keys)):  # type: ignore[misc]
     """Optional noise processes, and the study section that enables them; those that are None are disabled.
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Unit
 from mauvecl.schema.physical import Moment
@@ -41,7 +41,7 @@ class Reason(IntFlag):
         return ", ".join(str(one.name).lower().replace("_", " ") for one in cls if value & one)
 
 
-@public
+@validated
 @dataclass(frozen=True, eq=False)
 class Frames:
     """Observed frames of one star.

@@ -17,7 +17,7 @@ from mauvecl.host.files.text_table import text_table
 from mauvecl.host.spectra.fits_files import check_sizes
 from mauvecl.observations.frames import DAY_S, Frames
 from mauvecl.observations.mapping import FrameMapping
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shown
 
@@ -46,7 +46,7 @@ class FileTable:
     others: dict[str, Any]  # arrays of other extensions, by name
 
 
-@public
+@validated
 def read_frames(path: str | Path, mapping: FrameMapping | str | Path | None = None) -> Frames:
     """Read frames from a file.
 

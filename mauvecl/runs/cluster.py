@@ -24,7 +24,7 @@ from mauvecl.results.requests.requests import Countable, Shard
 from mauvecl.results.sums import Arrays
 from mauvecl.runs.pool import Stopped
 from mauvecl.runs.shards import Task
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
@@ -42,7 +42,7 @@ MAX_TRIES = 8
 RECOUNT_S, MAX_REQUESTS = 5.0, 32
 
 
-@public
+@validated
 class DaskWorkers:
     """Workers of a Dask cluster, each with its own engine.
 

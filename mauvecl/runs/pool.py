@@ -20,7 +20,7 @@ from mauvecl.lightcurve.stares.requests import StaresRequest, StareSums
 from mauvecl.results.requests.requests import DetectRequest, RealiseRequest, Shard, SnrRequest
 from mauvecl.results.sums import Arrays, DetectionSums, SnrSums
 from mauvecl.runs.shards import Task, fingerprint, shards
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range
 from mauvecl.schema.physical import Realisations
@@ -77,7 +77,7 @@ class Workers(Protocol):
         """Release all resources."""
 
 
-@public
+@validated
 class LocalWorkers:
     """OpenCL devices of this machine, each used by one thread.
 
@@ -175,7 +175,7 @@ class PoolProgress:
     resumed: int  # realisations taken from a checkpoint
 
 
-@public
+@validated
 class Pool:
     """Several workers with the interface of an `Engine`, which return bit-identical results.
 

@@ -23,7 +23,7 @@ from mauvecl.schema.text import shown
 Public = TypeVar("Public", bound=Callable[..., Any])
 
 
-def public(thing: Public) -> Public:
+def validated(thing: Public) -> Public:
     """Validate the arguments of a function, or of a class's constructor and public methods, when they are called.
 
     Arguments are checked against the annotations; `core_schemas` and `fields.Unit` state what is converted. Defaults

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.content import ContentEquality
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.statistic import Float, LinearStatistic, Setting
 
@@ -66,7 +66,7 @@ class UvExcess(LinearStatistic):
         return np.asarray(setting.used & (wavelength >= UV_NM[0]) & (wavelength <= UV_NM[1]))
 
 
-@public
+@validated
 @dataclass(frozen=True, eq=False)
 class Linear(ContentEquality, LinearStatistic):
     """A user-defined statistic: the sum over pixels of weight times (observed - reference), DN of the exposure.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mauvecl.host.content import ContentEquality
 from mauvecl.noise.unknowns import NUISANCES
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 
 
-@public
+@validated
 @dataclass(frozen=True, eq=False)
 class Nuisances(ContentEquality):
     """Unknown amplitudes of known spectra.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mauvecl.host.files.whole import UNFINISHED, write_whole
 from mauvecl.runs.durable import locked
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import FirstRealisation, Realisations
 from mauvecl.store.export import Selection, export
@@ -35,7 +35,7 @@ CHUNKS_AT_ONCE, WRITERS = 4, 2
 MAX_MISSING = 100_000
 
 
-@public
+@validated
 def draw(
     study: Study,
     scene: StoredScene,
@@ -72,7 +72,7 @@ def draw(
     return rows
 
 
-@public
+@validated
 def realise(
     study: Study,
     path: str | Path,
@@ -110,7 +110,7 @@ def realise(
     return store
 
 
-@public
+@validated
 def realise_file(
     study: Study,
     file: str | Path,
@@ -143,7 +143,7 @@ def realise_file(
     return store
 
 
-@public
+@validated
 def unfinished(file: Path) -> Path:
     """Return the path of the temporary store of a file."""
     return file.with_name(f"{UNFINISHED}{file.name}.zarr")
@@ -166,7 +166,7 @@ def _complete(store: Store, engine: Engine | Pool, resume: bool, restart: bool, 
     _fill(store, todo, engine, progress)
 
 
-@public
+@validated
 def forget(path: str | Path) -> None:
     """Remove a store.
 
@@ -269,7 +269,7 @@ class Fault:
     mended: bool
 
 
-@public
+@validated
 def state(store: Store, chunk: Chunk) -> str:
     """Return ``good``, or the fault of a chunk's file; see `Fault`."""
     try:
@@ -284,7 +284,7 @@ def state(store: Store, chunk: Chunk) -> str:
     return "good" if digest(data) == known else "foreign"
 
 
-@public
+@validated
 def verify(
     path: str | Path,
     engine: Engine | Pool | None = None,
@@ -398,7 +398,7 @@ def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
             yield Fault(name, seen, repair)
 
 
-@public
+@validated
 def read(path: str | Path, scene: str = "star-1/quiescent") -> Any:
     """Open an array of spectra, which is read from disk on access.
 

@@ -10,7 +10,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from mauvecl.host.files.parsed import possible, read_text, toml
 from mauvecl.noise.processes import NONE, Processes
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import AnyUnit
 from mauvecl.schema.records import input_error
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 PAPER_STARS = (Star(library="K3V", magnitude=3.7), Star(library="G2V", magnitude=7.4))
 
 
-@public
+@validated
 class Study(Section):
     """Everything that an answer depends on; the default is the paper's question.
 

@@ -27,7 +27,7 @@ from mauvecl.host.orbit.conditions import PARTICLES_SOURCE, THERMAL_SOURCE
 from mauvecl.lightcurve.search.counted_rate import DAY_S
 from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
 from mauvecl.runs.pool import map_in_order
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column, View, number, table_of
 from mauvecl.study.cases import Case
@@ -277,7 +277,7 @@ def _measured(one: Planned) -> str:
     return f"published for {low:.2g} to {high:.2g} erg, bolometric; scatter {one.rates.scatter_dex:g} dex (assumption)"
 
 
-@public
+@validated
 def plan(
     study: Study,
     engine: Stares | Pool | None = None,

@@ -18,7 +18,7 @@ from mauvecl.host.orbit.season import elongation_deg, zodiacal_light
 from mauvecl.host.orbit.targets import Target
 from mauvecl.host.orbit.time_grid import DAY_S, TimeGrid
 from mauvecl.host.orbit.visibility import Visibility, Windows
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.tables import Column, View, percent, table_of
 from mauvecl.study.orbits import targets_of
 from mauvecl.study.study import Study
@@ -309,7 +309,7 @@ class VisibleAnswer(Answer):
         return f"the limit of {alone[0]} alone leaves nothing" if alone else "its limits together leave nothing"
 
 
-@public
+@validated
 def visible(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> VisibleAnswer:

@@ -22,7 +22,7 @@ from mauvecl.results.detection.roc import AREA_COLUMNS, ROC_ROWS
 from mauvecl.results.detection.roc import COLUMNS as ROC_COLUMNS
 from mauvecl.results.requests.fap import check_fap, countable
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column, View, stacked, table_of
 from mauvecl.statistics.distributions import QuadraticForm
@@ -207,7 +207,7 @@ class DetectAnswer(Answer):
         return {"paper": self.paper} | super().as_json()
 
 
-@public
+@validated
 def detect(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> DetectAnswer:

@@ -20,7 +20,7 @@ from mauvecl.answers.detection.detect import DetectAnswer, detect
 from mauvecl.answers.signal.snr import SnrAnswer, snr
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.snr import steps_of
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.tables import Column, View, number, table_of
 from mauvecl.study.labels import place_columns
 from mauvecl.study.questions import Axis, Sweep
@@ -263,7 +263,7 @@ def _of_thresholds(tested: QTable, flares: QTable) -> dict[str, float | str]:
     }
 
 
-@public
+@validated
 def gaussian(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> GaussianAnswer:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
 from mauvecl.results.requests.fap import check_fap
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.tables import Column, View, table_of
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.cases import Case, cases
@@ -137,7 +137,7 @@ class MapAnswer(Answer):
         return [] if self.quiet is None else [self.quiet]
 
 
-@public
+@validated
 def map(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> MapAnswer:

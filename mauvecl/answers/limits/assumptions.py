@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from mauvecl.answers.limits.search import LimitSearch, single_flares
 from mauvecl.noise.priors import Uniform
 from mauvecl.noise.unknowns import INSTRUMENT_VALUES
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.tables import Column, table_of
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import amplitude_column, star_column
@@ -64,7 +64,7 @@ class Moved:
         return abs(self.at_ends[1] - self.at_ends[0])
 
 
-@public
+@validated
 def what_matters(study: Study) -> QTable:
     """Compute the closed-form limits of a study with each assumption at both ends of its range.
 

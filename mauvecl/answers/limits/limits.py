@@ -13,7 +13,7 @@ from mauvecl.answers.detection.unknown_cost import Cost, cost_lines, marginal_li
 from mauvecl.answers.limits.assumptions import assumption_columns
 from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle, single_flares
 from mauvecl.results.requests.fap import check_fap
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import INTERVAL, Column, View, interval, records, table_of
 from mauvecl.statistics.intervals import Interval
@@ -280,7 +280,7 @@ def solve(case: Case, statistic: str, engine: Engine | Pool) -> Limit:
     )
 
 
-@public
+@validated
 def limit(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> LimitAnswer:
@@ -341,13 +341,13 @@ limiting_magnitude = limit
 LimitResult = LimitAnswer
 
 
-@public
+@validated
 def smallest_amplitude(study: Study, engine: Engine | Pool | None = None) -> LimitAnswer:
     """Compute the smallest flare that is detected; see `limit`."""
     return limit(_asking(study, "amplitude"), engine)
 
 
-@public
+@validated
 def shortest_exposure(study: Study, engine: Engine | Pool | None = None) -> LimitAnswer:
     """Compute the shortest exposure in which the flares are detected; see `limit`."""
     return limit(_asking(study, "exposure"), engine)

@@ -22,7 +22,7 @@ from mauvecl.results.measurements.fit import LEVELS, Measurement, fit
 from mauvecl.results.measurements.reduction import variance_of
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column, View, percent, records, stacked, table_of
 from mauvecl.statistics.intervals import Interval, clopper_pearson
@@ -243,7 +243,7 @@ def _bin_columns(bins: MeasuredBins) -> list[Column]:
     return [*columns[:place], exact, *columns[place:]]
 
 
-@public
+@validated
 def measure(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> MeasureAnswer:

@@ -13,7 +13,7 @@ from mauvecl.observations.analysis import Analysis, analyse_frames
 from mauvecl.observations.events import ObservedEvent
 from mauvecl.observations.frames import DAY_S, Frames, Reason
 from mauvecl.observations.reading import read_frames
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column, View, interval, number, percent, table_of
 
@@ -254,7 +254,7 @@ class AnalyseAnswer(Answer):
         return []
 
 
-@public
+@validated
 def analyse(
     study: Study,
     engine: Engine | Pool | None = None,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 
 from mauvecl.answers.answer import Answer
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S, Wavelength
 from mauvecl.schema.tables import Column, View, table_of
@@ -127,7 +127,7 @@ def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
     return int(x.element[pixel]) if per == "element" else pixel
 
 
-@public
+@validated
 def exposure(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> ExposureAnswer:
@@ -175,7 +175,7 @@ def exposure(
     return ExposureAnswer(study, exposures, tuple(messages), seen)
 
 
-@public
+@validated
 def exposure_for(
     study: Study, snr: float | None = None, wavelength_nm: Wavelength | None = None, *, per: Per | None = None
 ) -> ExposureAnswer:

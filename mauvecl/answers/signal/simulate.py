@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from mauvecl.answers.answer import Answer
 from mauvecl.noise.components import components
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.physical import FirstRealisation
 from mauvecl.schema.tables import Column, View, table_of
 from mauvecl.study.cases import cases
@@ -94,7 +94,7 @@ class SimulateAnswer(Answer):
         return list(self.pictures.values())[number](path, ax=ax)
 
 
-@public
+@validated
 def simulate(
     study: Study,
     engine: Engine | Pool | None = None,

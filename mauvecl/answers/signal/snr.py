@@ -12,7 +12,7 @@ from mauvecl.answers.signal.exposures import Per, place_of
 from mauvecl.host.expectation import BUDGET_COLUMNS
 from mauvecl.results.snr import COLUMNS
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.tables import View, stacked
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import place_columns
@@ -113,7 +113,7 @@ class SnrAnswer(Answer):
         return stacked(place_columns(self.study), parts, realisations=run.realisations, study=self.study.text())
 
 
-@public
+@validated
 def snr(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> SnrAnswer:

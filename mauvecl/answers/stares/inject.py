@@ -18,7 +18,7 @@ from mauvecl.lightcurve.search.injected_completeness import InjectedCompleteness
 from mauvecl.lightcurve.search.injections import Injections
 from mauvecl.lightcurve.stares.requests import Arrays
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import INTERVAL, Column, View, interval, number, percent, stacked, table_of
 from mauvecl.statistics.intervals import Interval
@@ -249,7 +249,7 @@ class InjectAnswer(Answer):
         return [star.surveyed.quiet for star in self.stars]
 
 
-@public
+@validated
 def inject(
     study: Study, engine: Stares | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> InjectAnswer:

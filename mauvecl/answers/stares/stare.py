@@ -19,7 +19,7 @@ from mauvecl.lightcurve.flares.events import Event, coefficients, temperatures_o
 from mauvecl.lightcurve.search.alarms import Alarm, alarms
 from mauvecl.lightcurve.stares.light_curves import Draw, LightCurves, StareExpectation, draw_light_curves
 from mauvecl.runs.checkpoint import kept
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column, View, number, percent, records, table_of
 from mauvecl.study.cases import Case, cases
@@ -337,7 +337,7 @@ class StareAnswer(Answer):
         return super().as_json() | found
 
 
-@public
+@validated
 def stare(
     study: Study,
     engine: Stares | None = None,

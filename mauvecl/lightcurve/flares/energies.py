@@ -28,7 +28,7 @@ from mauvecl.host.stars.bands import photons
 from mauvecl.host.stars.flare import Geometry, added_light, blackbody
 from mauvecl.host.stars.flare_spectra import PARSEC_CM, STEFAN_BOLTZMANN, SUN_CM, Blackbody, FlareSpectrum
 from mauvecl.lightcurve.flares.shapes import Shape, shape_of
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Unit
 from mauvecl.schema.physical import Distance, Energy, Radius, Temperature
@@ -45,7 +45,7 @@ Kind = Literal["band", "bolometric"]
 POINTS = 20_001
 
 
-@public
+@validated
 @dataclass(frozen=True)
 class EnergyScale:
     """Energy of a flare's light per second of equivalent duration."""
@@ -215,7 +215,7 @@ class EnergyScale:
         return energy_erg / self.erg_per_s
 
 
-@public
+@validated
 def quiescent_luminosity(source: Source, distance_pc: Distance, band: str = "Kepler") -> float:
     """Return the luminosity of a star in a band, erg/s: 4 pi d^2 int R F dlambda, with R's highest value 1.
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.lightcurve.flares.energies import EnergyScale, amplitude_of, amplitude_of_peak, equivalent_duration
 from mauvecl.lightcurve.flares.shapes import SHAPES, Shape, shape_of
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Unit
 from mauvecl.schema.physical import Amplitude, Duration, Energy, Moment, Temperature
@@ -28,7 +28,7 @@ SAME_K = 0.5
 LEAST_LIGHT = 1e-9
 
 
-@public
+@validated
 @dataclass(frozen=True)
 class Cooling:
     """Temperature that is constant before the peak, and end + (peak - end) exp(-(t - t_peak) / fold) after it."""
@@ -54,7 +54,7 @@ class Cooling:
         return self.peak_k - self.end_k < SAME_K
 
 
-@public
+@validated
 @dataclass(frozen=True)
 class Event:
     """A flare in a stare.

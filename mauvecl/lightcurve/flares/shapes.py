@@ -16,14 +16,14 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.lightcurve.defaults import check_shape
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
 Float = NDArray[np.float64]
 
 
-@public
+@validated
 class Shape(ABC):
     """Time profile of a flare, in units of amplitude and half-width."""
 
@@ -295,7 +295,7 @@ class Fiducial(Shape):
         return self.BOX + self.FOLD * float(np.log(2))
 
 
-@public
+@validated
 @dataclass(frozen=True, eq=False)
 class TableShape(Shape):
     """User-defined shape, linear between its points and zero outside them.

@@ -23,7 +23,7 @@ from mauvecl.lightcurve.stares.measured import checked_frames, known_strengths
 from mauvecl.results.measurements.fit import LEVELS, Measurement
 from mauvecl.results.measurements.profile import Profile
 from mauvecl.results.measurements.reduction import Reduction
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import Duration, Moment, Probability
 
@@ -108,7 +108,7 @@ class _Data:
         return np.asarray(left - (shrink * (directions @ left)) @ directions)
 
 
-@public
+@validated
 def fit_cooling(
     frames: ArrayLike,
     quiet: Expectation,

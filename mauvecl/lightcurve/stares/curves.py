@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.lightcurve.defaults import ORBIT_S
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Unit
 from mauvecl.schema.physical import Duration
@@ -17,7 +17,7 @@ from mauvecl.schema.physical import Duration
 Float = NDArray[np.float64]
 
 
-@public
+@validated
 @dataclass(frozen=True)
 class Sinusoid:
     """The curve amplitude * sin(2 pi t / period + phase)."""

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.results.measurements.fit import LEVELS, Measurement, fit
 from mauvecl.results.measurements.reduction import Reduction
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range
 from mauvecl.schema.physical import Probability
@@ -105,7 +105,7 @@ class MeasuredBins:
         return lambda bins: np.asarray(getattr(bins.found, side)[level][:, q])
 
 
-@public
+@validated
 def measure_along(
     frames: ArrayLike,
     quiet: Expectation,

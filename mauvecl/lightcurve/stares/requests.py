@@ -15,7 +15,7 @@ from mauvecl.lightcurve.stares.scene import Flares
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.results.requests.requests import Countable
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.fields import Range
 from mauvecl.schema.physical import Realisations, Seed
 
@@ -49,7 +49,7 @@ class Reduction(Protocol):
         """Reduce stares; see the class."""
 
 
-@public
+@validated
 @dataclass(frozen=True, eq=False)
 class StaresRequest(Countable):
     """Request for stares; flares and amplitudes as for `Stares.frames`.

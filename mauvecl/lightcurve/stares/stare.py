@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mauvecl.lightcurve.defaults import ORBIT_S
 from mauvecl.lightcurve.stares.curves import Curve, Sinusoid
 from mauvecl.noise.unknowns import CHANGING, STARE_CHANGES, Changing
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Unit
 from mauvecl.schema.physical import Duration, Moment
@@ -46,7 +46,7 @@ class StareUnknown:
         _check_spread(self.name, self.of, self.sd)
 
 
-@public
+@validated
 @dataclass(frozen=True, eq=False)
 class Stare:
     """Frames of one star, with gaps; arrays are read-only.

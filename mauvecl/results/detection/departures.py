@@ -13,7 +13,7 @@ from scipy import special
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.noise.unknowns import ADDITIVE
 from mauvecl.results.requests.fap import countable
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.tables import INTERVAL, Column, interval, percent, table_of
 from mauvecl.statistics.distributions import Form
 from mauvecl.statistics.intervals import Interval
@@ -75,7 +75,7 @@ class Departure:
         return name if abs(size) > 0.2 * abs(self.ratio - 1.0) else "unexplained"
 
 
-@public
+@validated
 def departures(detection: Detection, fap: float) -> list[Departure]:
     """Return the departures of all statistics from the closed forms.
 

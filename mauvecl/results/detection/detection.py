@@ -17,7 +17,7 @@ from mauvecl.results.detection.roc import Roc
 from mauvecl.results.requests.channels import ChannelPlan, Key
 from mauvecl.results.requests.fap import NoThresholdError, Tails, check_atom, check_fap, countable
 from mauvecl.results.requests.hypotheses import Hypotheses
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.fields import Range
 from mauvecl.schema.tables import INTERVAL, Column, interval, number, table_of
 from mauvecl.statistics.detection_interval import detection_interval
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from mauvecl.results.detection.tails import Tail
 
 
-@public
+@validated
 @dataclass(eq=False)
 class Detection(Drawable, ContentEquality, Hypotheses):
     """Simulated null and flare distributions, as returned by `Engine.detect`.

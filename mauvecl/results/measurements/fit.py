@@ -14,7 +14,7 @@ from mauvecl.results.measurements.bounded import BoundedProfile, bounded_interva
 from mauvecl.results.measurements.model import FlareModel, derived_values
 from mauvecl.results.measurements.profile import Profile, covariance, covariance_of, intervals
 from mauvecl.results.measurements.reduction import Reduction, check_distinct, usable_variance
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import Probability, Temperature, Wavelength
 from mauvecl.statistics.nuisances import Nuisances
@@ -147,7 +147,7 @@ class Measurement:
         return table
 
 
-@public
+@validated
 def fit(
     frames: ArrayLike,
     expectation: Expectation,
@@ -367,7 +367,7 @@ class Forecast:
         return np.asarray(self.covariance / np.outer(self.errors, self.errors))
 
 
-@public
+@validated
 def forecast(
     expectation: Expectation,
     model: FlareModel,

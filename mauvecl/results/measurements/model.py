@@ -28,7 +28,7 @@ from mauvecl.host.stars.flare_spectra import (
     EmissionLine,
     balmer_continuum,
 )
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import range_of
 from mauvecl.schema.physical import Distance, Radius, Temperature, Wavelength
@@ -77,7 +77,7 @@ class Derived:
         return self.offset if self.ratio is not None else 0.0 if self.factors is not None else -np.inf
 
 
-@public
+@validated
 @dataclass(frozen=True, eq=False)
 class FlareModel:
     """The mean counts that a flare adds to an exposure.

@@ -19,7 +19,7 @@ from mauvecl.results.measurements.fit import LEVELS, Measurement, checked_excess
 from mauvecl.results.measurements.model import Derived, FlareModel, derived_values
 from mauvecl.results.measurements.profile import Best
 from mauvecl.results.measurements.reduction import Reduction
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import Probability, Wavelength
 
@@ -37,7 +37,7 @@ COARSE, TRIES = 36, 20
 APART = 4
 
 
-@public
+@validated
 def fit_two_temperatures(
     frames: ArrayLike,
     expectation: Expectation,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.factor_distributions import FactorDistributions
 from mauvecl.noise.scene import Scene
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.distributions import Form
 from mauvecl.statistics.linear import Linear, Matched
@@ -24,7 +24,7 @@ from mauvecl.statistics.statistic import LinearStatistic, Setting, Statistic
 LEAST_SHIFT = 1e-3
 
 
-@public
+@validated
 @dataclass(eq=False)
 class Hypotheses:
     """The null hypothesis, the flares, and the statistics that distinguish them.

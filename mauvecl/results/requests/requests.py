@@ -18,7 +18,7 @@ from mauvecl.noise.scene import BATCH, Scene, prepare
 from mauvecl.results.requests.channels import ChannelPlan, plan_channels
 from mauvecl.results.requests.fap import Tails
 from mauvecl.results.requests.hypotheses import Hypotheses
-from mauvecl.schema.calls import public
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import OneOrMore
 from mauvecl.schema.physical import FirstRealisation, Realisations, Seed
@@ -73,7 +73,7 @@ class _Drawn(Countable):
         check_last(vars(self)["start"], vars(self)["realisations"])
 
 
-@public
+@validated
 @dataclass(frozen=True, eq=False)
 class DetectRequest(_Drawn):
     """Arguments of `Engine.detect`."""
@@ -122,7 +122,7 @@ class DetectRequest(_Drawn):
         return self.hypotheses.scene.n_pixel * max(len(scene.levels) for _, scene in self.plans)
 
 
-@public
+@validated
 @dataclass(frozen=True, eq=False)
 class SnrRequest(_Drawn):
     """Arguments of `Engine.snr`."""
@@ -146,7 +146,7 @@ class SnrRequest(_Drawn):
         return self.scene.n_pixel
 
 
-@public
+@validated
 @dataclass(frozen=True, eq=False)
 class RealiseRequest(_Drawn):
     """Arguments of `Engine.realise`, computed as a single shard, so callers limit the number of realisations."""
