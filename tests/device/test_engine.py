@@ -432,7 +432,7 @@ def test_progress_is_reported_and_may_stop(engine: Engine) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "sentence"),
+    ("options", "refusal"),
     [
         ({"count": 0, "seed": 1}, ("count", "0")),
         ({"count": 1, "seed": -1}, ("seed", "-1")),
@@ -441,9 +441,9 @@ def test_progress_is_reported_and_may_stop(engine: Engine) -> None:
         ({"count": 1, "seed": 1, "mode": "fast"}, ("mode", "'fast'")),
     ],
 )
-def test_impossible_requests_are_refused(engine: Engine, options: dict, sentence: tuple[str, ...]) -> None:
+def test_impossible_requests_are_refused(engine: Engine, options: dict, refusal: tuple[str, ...]) -> None:
     (quiet, *_), _ = case("stack")
-    with refused(*sentence):
+    with refused(*refusal):
         engine.realise(quiet, **options)
 
 

@@ -197,7 +197,7 @@ def test_curve_units_in_any_spelling(
 
 
 @pytest.mark.parametrize(
-    ("length", "value", "sentence"),
+    ("length", "value", "refusal"),
     [
         ("nm", "FLAM", ("value", "'FLAM'", "A / W")),
         ("nm", "erg / (s cm2 Angstrom)", ("value", "erg", "A / W")),
@@ -205,8 +205,8 @@ def test_curve_units_in_any_spelling(
         ("s", "A / W", ("wavelength", "'s'", "nm")),
     ],
 )
-def test_spectrum_as_curve_raises(tmp_path: Path, length: str, value: str, sentence: tuple[str, ...]) -> None:
-    with refused(*sentence):
+def test_spectrum_as_curve_raises(tmp_path: Path, length: str, value: str, refusal: tuple[str, ...]) -> None:
+    with refused(*refusal):
         Curve.read(curve_file(tmp_path, length, value))
 
 

@@ -234,7 +234,7 @@ def test_any_collection_is_searched(archive: str, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize(
-    ("name", "below", "sentence"),
+    ("name", "below", "refusal"),
     [
         ("ngsl:HD 1", "ngsl", ("base", "h_stis_ngsl_hd000001_v2.fits")),
         ("ngsl:HD 2", "ngsl", ("base", "h_stis_ngsl_hd000002_v2.fits")),
@@ -246,20 +246,20 @@ def test_any_collection_is_searched(archive: str, monkeypatch: pytest.MonkeyPatc
     ],
 )
 def test_failed_downloads_raise(
-    archive: str, name: str, below: str, sentence: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+    archive: str, name: str, below: str, refusal: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(hst_collections, "TIMEOUT_S", 0.5)
     base = f"{archive}/{below}" if below != "hang" else f"{archive}/x"
     if below == "hang":
         collection = hst_collections.Collection("calspec", "CALSPEC", "", base, lambda star, listing: "hang")
         monkeypatch.setattr(hst_collections, "COLLECTIONS", (collection,))
-    with refused(*sentence):
+    with refused(*refusal):
         hst_collections.fetch(name, base=base, show_progress=False)
     assert own_stars.kept() == []
 
 
 @pytest.mark.parametrize(
-    ("name", "below", "sentence"),
+    ("name", "below", "refusal"),
     [
         ("ngsl:HD 1", "endless", ("MAUVECL_LARGEST_FILE_MIB", "_v2.fits", "1")),
         ("calspec:x", "endless", ("MAUVECL_LARGEST_FILE_MIB", "1")),
@@ -267,12 +267,12 @@ def test_failed_downloads_raise(
     ],
 )
 def test_endless_downloads_raise(
-    archive: str, name: str, below: str, sentence: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+    archive: str, name: str, below: str, refusal: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MAUVECL_LARGEST_FILE_MIB", "1")
     monkeypatch.setattr(hst_collections, "MAX_LISTING_BYTES", 1 << 20)
     monkeypatch.setattr(hst_collections, "MAX_DOWNLOAD_S", 0.3 if below == "slow" else 60.0)
-    with refused(*sentence):
+    with refused(*refusal):
         hst_collections.fetch(name, base=f"{archive}/{below}", show_progress=False)
     assert own_stars.kept() == []
 

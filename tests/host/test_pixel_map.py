@@ -53,7 +53,7 @@ def test_written_maps_are_read_back(tmp_path: Path) -> None:
 
 def test_files_that_are_not_maps_raise(tmp_path: Path) -> None:
     path = tmp_path / "map.ecsv"
-    for text, sentence in (
+    for text, refusal in (
         (None, ("file",)),
         ("nonsense", ("file",)),
         ("# %ECSV 1.0\n# ---\n# datatype:\n# - {name: heat, datatype: float64}\nheat\n1.0\n", ("pixel_map", "'heat'")),
@@ -70,7 +70,7 @@ def test_files_that_are_not_maps_raise(tmp_path: Path) -> None:
     ):
         if text is not None:
             path.write_text(text)
-        with refused(*sentence):
+        with refused(*refusal):
             PixelMap.read(path)
     PixelMap(dark=np.ones(7)).write(path)
     with refused("pixel_map", "7", "2048"):

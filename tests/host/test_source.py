@@ -288,7 +288,7 @@ GOOD = grid() * 1e-15
 
 
 @pytest.mark.parametrize(
-    ("text", "sentence"),
+    ("text", "refusal"),
     [
         ("", ("columns",)),
         ("200 1\n300\n400 1", ("columns", "2", "'300'")),
@@ -302,13 +302,13 @@ GOOD = grid() * 1e-15
         (rows(grid(), 0 * GOOD), ("flux",)),
     ],
 )
-def test_invalid_text_raises(tmp_path: Path, text: str, sentence: tuple[str, ...]) -> None:
-    with refused(*sentence):
+def test_invalid_text_raises(tmp_path: Path, text: str, refusal: tuple[str, ...]) -> None:
+    with refused(*refusal):
         Source.read(write(tmp_path / "star.dat", text))
 
 
 @pytest.mark.parametrize(
-    ("kept", "sentence"),
+    ("kept", "refusal"),
     [
         (slice(31, None), ("extend", "201-1099", "200-700")),
         (slice(25, None), ("extend", "195")),
@@ -316,11 +316,11 @@ def test_invalid_text_raises(tmp_path: Path, text: str, sentence: tuple[str, ...
         (slice(535), ("extend", "704")),
     ],
 )
-def test_short_spectra_raise_for_the_nominal_range(kept: slice, sentence: tuple[str, ...]) -> None:
+def test_short_spectra_raise_for_the_nominal_range(kept: slice, refusal: tuple[str, ...]) -> None:
     """And used by an instrument whose pixels see what is there."""
     star = Source.from_arrays(grid()[kept], GOOD[kept])
     mauve = Instrument.load("mauve")
-    with refused(*sentence):
+    with refused(*refusal):
         expect(star, mauve, exposure=5.0)
     narrow = mauve.with_(output_min_nm=250.0, output_max_nm=600.0)
     whole = expect(Source.from_arrays(grid(), GOOD), narrow, exposure=5.0)

@@ -142,7 +142,7 @@ def test_process_does_not_change_draws_of_others(engine: Engine) -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "sentence"),
+    ("make", "refusal"),
     [
         (lambda: Uniform(2.0, 1.0), ("low", "2")),
         (lambda: Normal(0.0, -1.0, 0.0, 1.0), ("sd", "0")),
@@ -165,8 +165,8 @@ def test_process_does_not_change_draws_of_others(engine: Engine) -> None:
         ),
     ],
 )
-def test_invalid_process_raises(make, sentence: tuple[str, ...]) -> None:
-    with refused(*sentence):
+def test_invalid_process_raises(make, refusal: tuple[str, ...]) -> None:
+    with refused(*refusal):
         make()
 
 

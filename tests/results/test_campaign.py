@@ -88,18 +88,18 @@ def test_overlapping_stacks_may_have_more_each() -> None:
 
 
 @pytest.mark.parametrize(
-    ("campaign_asked", "sentence"),
+    ("campaign_asked", "refusal"),
     [
         ({"fap": 0.01}, ("campaign",)),
         ({"frames": 10, "fap": 2.0}, ("campaign.fap", "2")),
         ({"frames": 17_280, "alarms": 1e5}, ("campaign.alarms", "100000", "1728")),
     ],
 )
-def test_wishes_that_cannot_be(campaign_asked: dict, sentence: tuple[str, ...], engine: Engine) -> None:
+def test_wishes_that_cannot_be(campaign_asked: dict, refusal: tuple[str, ...], engine: Engine) -> None:
     def ask() -> None:
         detect(Study.build({"campaign": campaign_asked}, "test"), engine)
 
-    with refused(*sentence):
+    with refused(*refusal):
         ask()
 
 

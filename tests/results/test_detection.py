@@ -250,7 +250,7 @@ def test_a_statistic_of_ones_own(engine: Engine) -> None:
 
 
 @pytest.mark.parametrize(
-    ("weights", "name", "sentence"),
+    ("weights", "name", "refusal"),
     [
         (np.ones(5), "mine", ("weights", "5")),
         (np.zeros(198), "mine", ("weights",)),
@@ -260,10 +260,10 @@ def test_a_statistic_of_ones_own(engine: Engine) -> None:
     ],
 )
 def test_impossible_weights_are_refused(
-    engine: Engine, weights: np.ndarray, name: str, sentence: tuple[str, ...]
+    engine: Engine, weights: np.ndarray, name: str, refusal: tuple[str, ...]
 ) -> None:
     quiet, flare = star(amplitudes=(0.1,), payload=instrument(part=True))
-    with refused(*sentence):
+    with refused(*refusal):
         engine.detect(quiet, [flare], realisations=10, seed=1, statistics=(Linear(name, weights),))
 
 
