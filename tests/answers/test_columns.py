@@ -18,7 +18,7 @@ from mauvecl.cli.console import show_view
 from mauvecl.device.engine import Engine
 from mauvecl.schema.tables import Column, View, records, stacked, table_of
 from mauvecl.web.tabs import TABS
-from mauvecl.web.tabs.tab import FIXED
+from mauvecl.web.tabs.tab import FIXED, Tab
 
 SLOW = {
     "measure": ["measure.fits=20"],
@@ -61,7 +61,7 @@ def test_files_json_terminal_and_page_agree(
         assert all(text in shown for row in cells for text in row)
         named = [one for one in view.columns if one.name and one.name not in ONLY_SHOWN]
         for tab in TABS.values():
-            if tab.answer and tab.view == number and getattr(tab, "verb", tab.answer) == name:
+            if tab.answer and tab.view == number and tab.verb == name:
                 titles, *rows = tab.rows(None, {tab.answer: answer})  # type: ignore[arg-type]
                 assert set(titles) <= {one.heading for one in view.columns if one.name not in FIXED}
                 assert len(rows) == len(cells)
@@ -91,6 +91,23 @@ def test_no_answer_makes_a_table_by_hand() -> None:
                 ):
                     found.append(f"{file.name}:{node.lineno}")
     assert not found
+
+
+def test_a_tab_needs_no_more_than_its_verb() -> None:
+    class Exposure(Tab):
+        """Tab of exposures."""
+
+        verb = "exposure"
+
+    tab = Exposure()
+    assert (tab.name, tab.title, tab.answer) == ("exposure", "Exposure", "exposure")
+    assert tab.about == VERBS["exposure"].help.split("\n")[0]
+    assert (tab.simulations, tab.files) == ({"exposure": "Exposure"}, {"exposure": "exposure"})
+    answer = VERBS["exposure"].ask(Study().with_settings([*FEW, *QUICK["exposure"]]))
+    headings, *rows = tab.rows(None, {"exposure": answer})  # type: ignore[arg-type]
+    assert headings == ["exposure (s)", "frames", "S/N", "a frame less"]
+    assert len(rows) == 1
+    assert tab.table("exposure", None, {"exposure": answer}).colnames == answer.table.colnames  # type: ignore[arg-type]
 
 
 class Row:

@@ -248,9 +248,8 @@ def _contours(x: Float, y: Float, p: Float, *levels: float) -> dict[str, Any]:
 class Limit(Tab):
     """Tab of limits."""
 
-    name, title = "limit", "Limit and map"
+    verb, title = "limit", "Limit and map"
     about = "How faint a star and how small a flare one would still see."
     pictures = (Curve(), Map())
     simulations = {"limit": "Simulate the limit", "map": "Simulate the map"}  # noqa: RUF012
-    answer = "limit"
     files = {"limit": "limit", "map": "map"}  # noqa: RUF012

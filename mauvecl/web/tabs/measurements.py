@@ -132,7 +132,7 @@ class Region(Picture):
 class Measurement(Tab):
     """Measurement of the flare's spectrum."""
 
-    name, title = "measure", "Measure"
+    verb = "measure"
     about = (
         "What is measured of the flare once it is detected: its temperature, size and light, with errors in closed "
         "form; simulated fits count how often their intervals hold the truth."

@@ -84,12 +84,10 @@ class Expected(Picture):
 class Plan(Tab):
     """Tab of campaigns."""
 
-    name, title = "plan", "Plan"
+    verb = "plan"
     about = (
         "What a campaign on the target of Visibility would find: hours, energies recovered, flares expected. Star and "
         "flare rates are the target's own; completeness is in closed form, and assumptions have a table."
     )
     pictures = (Recovered(), Expected())
-    simulations = {"plan": "Plan"}  # noqa: RUF012
-    answer = "plan"
     files = dict.fromkeys(("plan", "stars", "energies", "assumptions"), "plan")

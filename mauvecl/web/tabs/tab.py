@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from mauvecl.answers.verbs import VERBS
 from mauvecl.schema.tables import without_empty
 
 if TYPE_CHECKING:
@@ -79,10 +80,12 @@ class Picture(ABC):
 
 
 class Tab(ABC):
-    """Tab of the page.
+    """Tab of the page; a `verb` gives name, title, help, button, answer and file that the tab does not state itself.
 
     Attributes
     ----------
+    verb : str
+        Name of the verb that it shows, if any.
     name, title : str
     about : str
         What it shows, in a sentence.
@@ -95,6 +98,7 @@ class Tab(ABC):
         Number of that table among the answer's `views`.
     """
 
+    verb: ClassVar[str] = ""
     name: ClassVar[str]
     title: ClassVar[str]
     about: ClassVar[str]
@@ -104,6 +108,17 @@ class Tab(ABC):
     view: ClassVar[int] = 0
     #: Tables that can be taken along, with the simulation that each needs, or none.
     files: ClassVar[Mapping[str, str | None]] = {}
+
+    def __init_subclass__(cls, **words: Any) -> None:
+        super().__init_subclass__(**words)
+        if not cls.verb:
+            return
+        verb, title = cls.verb, cls.verb.capitalize()
+        about, *_ = VERBS[verb].help.split("\n")
+        of_verb = {"name": verb, "title": title, "about": about, "simulations": {verb: title}, "answer": verb}
+        for key, value in (of_verb | {"files": {verb: verb}}).items():
+            if key not in vars(cls):
+                setattr(cls, key, value)
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         """Return the table of one of `files`: by default that of the answer it needs."""

@@ -57,13 +57,13 @@ class Hours(Picture):
 class Visibility(Tab):
     """Tab of the visibility."""
 
-    name, title = "visibility", "Visibility"
+    verb, name, title = "visible", "visibility", "Visibility"
     about = (
         "When the satellite can look at a target: clear of Earth, Sun, Moon and radiation, for a year from 2027-01-01."
     )
     pictures = (Hours(),)
     simulations = {"visible": "Find when"}  # noqa: RUF012
-    answer, view = "visible", 1
+    view = 1
     files = {"visible": "visible", "months": "visible", "days": "visible"}  # noqa: RUF012
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
