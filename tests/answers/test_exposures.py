@@ -76,7 +76,7 @@ def test_the_answer_is_written_and_drawn(tmp_path: Path) -> None:
     assert [path.name for path in found.write(tmp_path)] == ["exposure.ecsv", "study.toml"]
     again = exposure_for(Study.read(tmp_path / "exposure.ecsv"))
     assert (again.study, again.exposures) == (found.study, found.exposures)
-    with refused("signal.per", value="line"):
+    with refused("per", value="line"):
         exposure_for(study(), 10.0, 300.0, per="line")
     found.plot(tmp_path / "exposure.png")
     assert (tmp_path / "exposure.png").read_bytes()[:4] == b"\x89PNG"
