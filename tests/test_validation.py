@@ -107,6 +107,8 @@ def wrong_values(path: str, name: str) -> Iterator[tuple[str, Any]]:
         yield "a truth", True
     if not arrays:
         yield "NaN", np.nan
+        if not accepted(hint, int):
+            yield "a number beyond the largest float", 10**400
         yield "an array", np.ones((2, 3))
     if not accepted(hint, type(None)):
         yield "nothing", None

@@ -96,7 +96,7 @@ class Frames:
         flux: ArrayLike,
         error: ArrayLike | None = None,
         *,
-        exposure_s: ArrayLike | None = None,
+        exposure_s: Annotated[ArrayLike, Unit("s")] | None = None,
         quality: ArrayLike | None = None,
         name: str = "frames",
         **how: Any,

@@ -71,11 +71,13 @@ def _leaf(take: Callable[[Any], Any], words: str) -> CoreSchema:
 
 
 def _number(value: Any) -> float:
-    if is_quantity(value):
-        value = without_unit(value, "")
-    if type(value) is not float:
+    if type(value) not in (float, int):
+        value = without_unit(value, "") if is_quantity(value) else value
         _require(not getattr(value, "ndim", 0) and _kind(value) in tuple("iuf"))
-    plain = float(value)
+    try:
+        plain = float(value)
+    except OverflowError as error:
+        raise ValueError from error
     # NaN differs from itself.
     _require(plain == plain)
     return plain

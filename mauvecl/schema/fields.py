@@ -47,6 +47,8 @@ class Unit:
 
     def plain(self, value: Any) -> Any:
         """Convert a Quantity, or each of a list of them, to plain numbers; return other values unchanged."""
+        if type(value) in (float, int):
+            return value
         if isinstance(value, list | tuple):
             return [self.plain(one) for one in value]
         return without_unit(value, self.name) if is_quantity(value) else value
