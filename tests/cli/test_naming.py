@@ -12,6 +12,7 @@ from commands import ended
 
 import mauvecl
 from mauvecl import Engine, Instrument, Sky, Source, Study
+from mauvecl.answers.verbs import VERBS
 from mauvecl.cli.naming import with_flags
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.quantities import count, number, numbers
@@ -46,11 +47,13 @@ def test_no_module_below_the_command_line_names_a_flag() -> None:
     files = [*ROOT.rglob("*.py"), *(ROOT / "host").rglob("*.py")]
     below = {file for file in files if not str(file.relative_to(ROOT)).startswith(OF_FLAGS)}
     assert len(below) > 200
+    # Help texts of the registry are the command line's own.
+    helps = {verb.help for verb in VERBS.values()}
     named = {
         (str(file.relative_to(ROOT)), text)
         for file in below
         for text in texts(file)
-        if FLAG.search(COMMAND.sub("", text))
+        if text not in helps and FLAG.search(COMMAND.sub("", text))
     }
     assert not named
 
