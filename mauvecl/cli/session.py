@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.runs.checkpoint import Checkpoint
     from mauvecl.runs.pool import Pool, Workers
+    from mauvecl.schema.errors import InputError
     from mauvecl.study.study import Study
 
 
@@ -73,7 +74,7 @@ class Session:
     opened: Device | None = None
     _pool: Pool | None = None
     _checkpoint: Checkpoint | None = None
-    _lost: list[str] = field(default_factory=list)
+    _lost: list[InputError] = field(default_factory=list)
     _held: ExitStack = field(default_factory=ExitStack)
 
     def __enter__(self) -> Self:
@@ -92,7 +93,10 @@ class Session:
         self._held.close()
         if kind is None and self._lost:
             others = f"; the same holds for {len(self._lost) - 1} more files of this answer" if self._lost[1:] else ""
-            raise InputError(self._lost[0] + others, key="file")
+            first = self._lost[0]
+            error = InputError(f"{first}{others}", key=first.key, value=first.value)
+            error.expected = first.expected
+            raise error
 
     @cached_property
     def folder(self) -> Path:
@@ -206,7 +210,7 @@ class Session:
         try:
             made = write()
         except InputError as error:
-            self._lost.append(str(error))
+            self._lost.append(error)
             return
         self.files += [made] if isinstance(made, Path) else made
 

@@ -97,7 +97,9 @@ def _read_apart(content: bytes) -> bytes:
     if done.returncode == 0:
         return done.stdout
     if done.returncode == _REFUSED:
-        raise InputError(done.stderr.decode("utf-8", "replace").strip(), key="upload")
+        # The reader prints its error as a sentence.
+        fault, _, expected = done.stderr.decode("utf-8", "replace").strip().partition(", expected ")
+        raise InputError(fault, expected or None, key="upload")
     if done.returncode == _NO_ROOM:
         raise InputError(
             f"the upload takes more than {MEMORY_MIB} MiB of memory to read",

@@ -118,7 +118,8 @@ class State:
             If some field is not right, with what each accepts.
         """
         if self.faults:
-            raise InputError(self.fault, key=next(iter(self.faults)))
+            fault, _, expected = self.fault.partition(", expected ")
+            raise InputError(fault, expected or None, key=next(iter(self.faults)))
         values = {name: self._values[name] for name in FIELDS}
         if values["own_unknown"] is None:
             values["own_unknown"] = self.unknown

@@ -22,11 +22,6 @@ MOST_UPLOADED, MOST_POINTS = 4 * 2**20, 200_000
 MOST_PAIRS_BYTES, MOST_PAIRS = 2**18, 4000
 
 
-def too_large(size: float) -> str:
-    """Return the error message of an upload of this many bytes."""
-    return f"upload of {size / 2**20:.1f} MiB, expected at most {MOST_UPLOADED / 2**20:g} MiB"
-
-
 def read_upload(name: str, content: bytes) -> Source:
     """Read an untrusted spectrum from a visitor.
 
@@ -44,7 +39,8 @@ def read_upload(name: str, content: bytes) -> Source:
         exception is told to the visitor too.
     """
     if len(content) > MOST_UPLOADED:
-        raise InputError(too_large(len(content)), key="upload", value=len(content))
+        size, most = len(content) / 2**20, MOST_UPLOADED / 2**20
+        raise InputError(f"upload of {size:.1f} MiB", f"at most {most:g} MiB", key="upload", value=len(content))
     source = read_limited(content)
     if source.wavelength_nm.size > MOST_POINTS:
         raise InputError.of("points", source.wavelength_nm.size, f"at most {MOST_POINTS}")
