@@ -43,9 +43,9 @@ PRIORS = [
     ("jitter", Uniform(0.0, 0.05)),
     ("jitter", Normal(0.02, 0.001, 0.0, 0.5)),
     ("detector_temperature", Uniform(13.0, 21.0)),
-    ("detector_temperature", Normal(21.0, 0.01, -100.0, 100.0)),
-    ("detector_temperature", Normal(13.0, 10.0, -100.0, 100.0)),
-    ("detector_temperature", Uniform(-100.0, 100.0)),
+    ("detector_temperature", Normal(21.0, 0.01, -40.0, 65.0)),
+    ("detector_temperature", Normal(13.0, 10.0, -40.0, 65.0)),
+    ("detector_temperature", Uniform(-40.0, 65.0)),
 ]
 
 

@@ -90,7 +90,7 @@ def test_overlapping_stacks_may_have_more_each() -> None:
 @pytest.mark.parametrize(
     ("campaign_asked", "refusal"),
     [
-        ({"fap": 0.01}, ("campaign",)),
+        ({"fap": 0.01}, ("campaign.fap",)),
         ({"frames": 10, "fap": 2.0}, ("campaign.fap", "2")),
         ({"frames": 17_280, "alarms": 1e5}, ("campaign.alarms", "100000", "1728")),
     ],

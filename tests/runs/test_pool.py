@@ -415,7 +415,7 @@ def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> Non
 
     def bad(number: int) -> int:
         if number == 2:
-            raise InputError("number = 2, expected another")
+            raise InputError.of("number", 2, "another")
         return number
 
     with refused("number", "2"):
