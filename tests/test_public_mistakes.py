@@ -35,7 +35,17 @@ WRONG = {
 NEVER = ("a Quantity of another unit", "a list of two kinds", "an object")
 FREE = ("Any", "object", "dict[str, Any]", "str")
 #: Made by functions that are tried, with fields of their own names; and what is a part of the engine's inner side.
-MADE = ("Detection", "Expectation", "FlareModel", "Instrument", "Measurement", "MeasuredBins", "Study", "Stare")
+MADE = (
+    "Detection",
+    "Expectation",
+    "FlareModel",
+    "Frames",
+    "Instrument",
+    "Measurement",
+    "MeasuredBins",
+    "Study",
+    "Stare",
+)
 INNER = (
     "Detection.collect", "Detection.of", "DaskWorkers", "LocalWorkers.submit", "Engine.count", "Linear.", "TableShape.",
     "Nuisances.rows", "Nuisances.finite", "Processes.factors", "Normal.quantile", "Uniform.quantile",
@@ -108,7 +118,8 @@ def fitting() -> dict[str, Any]:
         "time": "2027-01-01", "value": 7.0, "values": np.r_[0, 1, np.linspace(1, 0, 8)], "wavelength": 7.0,
         "wavelength_nm": 303.0, "weights": pixels, "where": "x", "width_nm": 3.0, "stares": None, "shape": "fiducial",
         "duration_s": 60.0, "distance_pc": 10.0, "description": "x", "temperature": 1e4, "period_s": 5000.0,
-        "device": None, "devices": (None,), "flare": 0, "description_": "", "nuisances": None,
+        "device": None, "devices": (None,), "flare": 0, "time_s": 5.0 * np.arange(30),
+        "Frames.of.flux": np.ones(30), "description_": "", "nuisances": None,
         "Detection.statistic.name": "chi2", "Expectation.per_element.values": pixels, "Source.wavelength_nm":
         np.linspace(170, 1200, 1200), "Source.from_arrays.wavelength": np.linspace(170, 1200, 1200),
         "Nuisances.of.sd": {"dark": 0.1}, "Normal.sd": 1.0, "Source.from_library.name": "G2V", "Linear.name": "mine",

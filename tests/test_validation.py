@@ -6,7 +6,7 @@ import inspect
 import pickle
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
-from typing import Any, get_args, get_origin
+from typing import Any, Union, get_args, get_origin
 
 import astropy.units as u
 import numpy as np
@@ -68,6 +68,10 @@ def annotation(path: str, name: str) -> Any:
 def parts(hint: Any) -> Iterator[Any]:
     """Yield an annotation and all that it consists of, metadata included."""
     yield hint
+    if get_origin(hint) is Union and type(None) in get_args(hint):
+        yield type(None)
+        hint = Union[tuple(one for one in get_args(hint) if one is not type(None))]  # noqa: UP007
+        yield hint
     if hint == ArrayLike or get_origin(hint) is np.ndarray:
         return
     for part in get_args(hint):

@@ -131,6 +131,8 @@ class Frames:
         flags = np.zeros(n, np.int64) if quality is None else np.asarray(quality, np.int64)
         if flags.shape != (n,):
             raise _bad(name, "quality", flags.shape, f"({n},)")
+        if exposure_s is not None and np.shape(exposure_s) not in ((), (1,), (n,)):
+            raise _bad(name, "exposure", np.shape(exposure_s), f"one exposure time, or one for each of {n} frames")
         exposure = None if exposure_s is None else np.array(np.broadcast_to(np.asarray(exposure_s, np.float64), (n,)))
         order = np.argsort(time, kind="stable")
         remarks: tuple[str, ...] = ()

@@ -40,14 +40,16 @@ def schema_of(hint: Any) -> CoreSchema:
         for metadata in args[1:]:
             schema = metadata.__get_pydantic_core_schema__(args[0], lambda _, inner=schema: inner)
         return schema
+    if origin in (Union, UnionType) and NoneType in args:
+        others = tuple(one for one in args if one is not NoneType)
+        return core_schema.nullable_schema(schema_of(Union[others]))  # noqa: UP007
     if _is_array(hint):
         return _leaf(
             _array if origin is Union else _real_array, "numbers" if origin is Union else "an array of numbers"
         )
     if origin in (Union, UnionType):
-        choices: Any = [(schema_of(one), ALTERNATIVE) for one in args if one is not NoneType]
-        schema = core_schema.union_schema(choices, mode="left_to_right") if len(choices) > 1 else choices[0][0]
-        return core_schema.nullable_schema(schema) if NoneType in args else schema
+        choices: Any = [(schema_of(one), ALTERNATIVE) for one in args]
+        return core_schema.union_schema(choices, mode="left_to_right")
     if origin is Literal:
         return core_schema.literal_schema(list(args))
     if origin in LEAVES:
