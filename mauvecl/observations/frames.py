@@ -128,6 +128,8 @@ class Frames:
         sd = None if error is None else np.asarray(error, np.float64)
         if sd is not None and sd.shape != light.shape:
             raise _bad(name, "error", sd.shape, f"the shape of the flux, {light.shape}")
+        if quality is not None and not np.isfinite(np.asarray(quality, np.float64)).all():
+            raise _bad(name, "quality", "a value that is not finite", "whole numbers")
         flags = np.zeros(n, np.int64) if quality is None else np.asarray(quality, np.int64)
         if flags.shape != (n,):
             raise _bad(name, "quality", flags.shape, f"({n},)")
