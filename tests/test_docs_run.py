@@ -141,12 +141,24 @@ def targets() -> None:
     Path("targets.csv").write_text(shown)
 
 
+def observed_frames() -> None:
+    """Write light curves: the one of the documentation, and a simulated one under two names."""
+    for name in ("gj65_galex_nuv_5s.csv", "gj65.toml"):
+        Path(name).write_bytes((ROOT / "tests" / "data" / "flares" / name).read_bytes())
+    time = np.arange(300) * 60.0 / 86_400
+    flux = np.random.default_rng(1).normal(100.0, 1.0, time.size)
+    columns = [fits.Column("TIME", "D", unit="d", array=time), fits.Column("FLUX", "D", array=flux)]
+    for name in ("frames.fits", "light-curve.fits"):
+        fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns(columns)]).writeto(name)
+
+
 BROUGHT: dict[str, tuple[Callable[[], None], ...]] = {
-    "README.md": (targets,),
+    "README.md": (targets, observed_frames),
     "cluster.md": (study_of_ones_own,),
     "long-runs.md": (study_of_ones_own,),
     "my-instrument.md": (efficiency,),
     "my-star.md": (spectra,),
+    "observations.md": (observed_frames,),
     "page.md": (study_of_ones_own,),
     "plan.md": (targets,),
     "tutorial.md": (own_star,),

@@ -6,10 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.table import QTable
 
+from mauvecl.answers.observations.analyse import AnalyseAnswer
 from mauvecl.observations.analysis import Analysis, analyse_frames
 from mauvecl.observations.frames import Reason
 from mauvecl.observations.reading import read_frames
+from mauvecl.study.study import Study
 
 DATA = Path(__file__).parent.parent / "data" / "flares"
 
@@ -64,3 +67,24 @@ def test_the_rates_of_false_alarms_are_stated_for_each_event(analysis: Analysis)
         normal, measured = analysis.false_alarms(event)
         assert 0 < normal <= 1.05
         assert 0 < measured <= 1.5
+
+
+def test_the_answer_writes_its_tables_and_shows_them(analysis: Analysis, tmp_path: Path) -> None:
+    answer = AnalyseAnswer(Study(), analysis)
+    answer.write(tmp_path)
+    for name, table in answer.tables.items():
+        read = QTable.read(tmp_path / f"{name}.ecsv")
+        assert read.colnames == table.colnames
+        assert len(read) == len(table) > 0
+        assert [read[column].unit for column in read.colnames] == [table[column].unit for column in table.colnames]
+    events = answer.events
+    assert len(events) == len(analysis.events)
+    reasons = answer.frames["reason"].tolist()
+    assert reasons[59] == "spike"
+    assert "below" in reasons[265]
+    titles = [view.texts()[0] for view in answer.views]
+    assert all(titles)
+    assert set(answer.as_json()) == {"messages", "events", "limits", "noise"}
+    # The end of the great flare is not observed, one bin within it is bad, and no template has its shape.
+    assert sum(events["note"] != "") >= 1
+    assert "1 missing frame" in str(events["note"][-1])

@@ -258,7 +258,7 @@ def test_no_answer_beside_a_field_that_is_wrong(page: Page) -> None:
     place = "document.querySelector('#plot-excess').getBoundingClientRect().y + scrollY"
     top = page.evaluate(place)
     for label, wrong, right, told in (
-        ("Magnitude", "99", "8.5", "'99' is out of range, expected a number from -2 to 25"),
+        ("Magnitude", "99", "8.5", "'99' is out of range, expected -30 to 40 mag"),
         ("Magnitude", "7,4", "8.5", "'7,4' is not a number"),
         ("Seed", "", "1", "nothing is entered, expected a whole number"),
         ("Star", "Proxima", "G2V", "'Proxima' is not in the library"),
