@@ -205,7 +205,7 @@ VERBS: dict[str, Verb] = {
             "detection.gaussian",
             """Find where the usual root-of-N formula is wrong.
 
-    Its S/N, its intervals and its false alarms, beside those of realisations.
+    Its S/N, intervals and false alarms are compared with those of realisations.
 
     Without a sweep: magnitudes from 4 to 12, exposures of 5, 50 and 600 s.
 

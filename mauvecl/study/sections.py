@@ -69,7 +69,7 @@ class Star(Section):
         Flag("--magnitude", "-m", kind=list[float]),
         Widget(
             label="Magnitude",
-            hint="How bright the star is without the flare, in the band beside it.",
+            hint="How bright the star is without the flare, in the band of the next field.",
             first="8.5",
             unit="",
             slider=Slider(0, 15, 0.1),
