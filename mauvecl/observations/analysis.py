@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mauvecl.lightcurve.defaults import Per, per_day
 from mauvecl.lightcurve.flares.shapes import shape_of
 from mauvecl.lightcurve.search.importance_sampling import SampledRate
+from mauvecl.observations.colour import Colour, event_colour
 from mauvecl.observations.completeness import Completeness, inject
 from mauvecl.observations.events import ObservedEvent, detect_events, measure_events
 from mauvecl.observations.frames import DAY_S, Frames
@@ -80,6 +81,19 @@ class Analysis:
             # Beyond the largest sampled threshold the rate is smaller than there.
             normal = self.normal.rate(float(self.normal.thresholds[-1])).value
         return normal, self.measured.rate(event.value)
+
+    def colour(self, event: ObservedEvent) -> Colour | None:
+        """Return the colour of an event in spectra with errors, against quiescent frames; None without these."""
+        frames = self.frames
+        if frames.flux.ndim == 1 or frames.error is None:
+            return None
+        used = np.flatnonzero(self.level.used)
+        inside, quiet = np.zeros((2, frames.n_frames), np.bool_)
+        inside[used[event.first : event.last + 1]] = True
+        quiet[used] = self.level.quiet[used]
+        for other in self.events:
+            quiet[used[other.first : other.last + 1]] = False
+        return event_colour(frames.flux, frames.error, inside, quiet)
 
     @property
     def messages(self) -> list[str]:

@@ -81,6 +81,14 @@ class EventRow:
         total = float(sum(one.recovered.equivalent_duration_s[0] for one in found))
         return (total, *(found[0].intervals["equivalent_duration_s"] if len(found) == 1 else (float("nan"),) * 2))
 
+    @cached_property
+    def colour(self) -> tuple[float, float, float]:
+        """Blue over red rise with its error, and the p-value of an event without colour; NaN in a light curve."""
+        found = self.analysis.colour(self.event)
+        if found is None:
+            return (float("nan"),) * 3
+        return found.blue_over_red, found.blue_over_red_error, found.p_value
+
     @property
     def note(self) -> str:
         """Statements about the event that a reader must know."""
@@ -130,6 +138,11 @@ EVENTS = (
            "the larger rate", "from noise", _rate),
     Column("significant", "significant", "", "whether the rate is at most the wanted one", "detected",
            lambda value: "yes" if value else "candidate", kind=bool),
+    Column("blue_over_red", lambda row: row.colour[0], "", "rise relative to the star in the blue half of the pixels "
+           "over that in the red half: 1 for a change of throughput; nan: no spectra", "blue/red", number(".3g")),
+    Column("blue_over_red_error", lambda row: row.colour[1], "", "its standard error"),
+    Column("p_no_colour", lambda row: row.colour[2], "", "probability of a spectrum at least as different from the "
+           "star's if the event has no colour, as a change of throughput"),
     Column("kind", "event.kind", "", "flare, or step of the level", "kind", kind=str),
     Column("note", "note", "", "what is special", kind=str),
 )  # fmt: skip
