@@ -149,7 +149,13 @@ class DaskWorkers:
                 return
         try:
             if sent.status == "finished":
-                awaited.set_result(sent.result())
+                try:
+                    counts = sent.result()
+                except OSError as broken:
+                    # The connection may break between the end of a shard and the transfer of its counts.
+                    awaited.set_exception(self._gone().with_traceback(broken.__traceback__))
+                    return
+                awaited.set_result(counts)
                 return
             error = sent.exception() if sent.status == "error" else None
             known = isinstance(error, InputError | DeviceError)

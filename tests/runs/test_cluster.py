@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
@@ -331,6 +331,24 @@ def test_a_scheduler_that_dies(tmp_path: Path, scene: list[Expectation]) -> None
             pool.detect(scene[0], scene[1:], realisations=1_000_000, seed=1)
         workers.stop()
         workers.close()
+
+
+def test_a_scheduler_that_dies_while_counts_are_fetched() -> None:
+    workers = DaskWorkers.__new__(DaskWorkers)
+    workers._lock, workers._where = threading.Lock(), "tcp://host:8786"
+    awaited: Future[Any] = Future()
+
+    class Lost:
+        status = "finished"
+
+        def result(self) -> None:
+            raise ConnectionResetError("Connection reset by peer")
+
+    sent: Any = Lost()
+    workers._sent = {sent: awaited}
+    workers._came(awaited, None, 1, sent)  # type: ignore[arg-type]
+    with pytest.raises(DeviceError, match="is gone"):
+        awaited.result(timeout=1)
 
 
 @pytest.mark.parametrize(
