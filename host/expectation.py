@@ -458,7 +458,7 @@ def expect(
     if source.unscaled:
         raise InputError(
             f"the spectrum of {source.name} is not as bright as the star is seen: {source.unscaled}",
-            "a magnitude beside it",
+            "a magnitude as well",
             key="magnitude",
         )
 

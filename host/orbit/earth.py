@@ -6,7 +6,7 @@ import erfa
 import numpy as np
 from numpy.typing import NDArray
 
-from .time_grid import DAY_S
+from mauvecl.schema.physical import DAY_S
 
 #: Equatorial radius, km, and gravitational parameter, km^3 s^-2, of WGS 72, as SGP4 uses (Hoots & Roehrich 1980).
 RADIUS_KM, GRAVITY = 6378.135, 398_600.8

@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DAY_S
 from mauvecl.schema.text import shortened
 
 from ..files.parsed import read_text
 from .earth import GRAVITY, J2, RADIUS_KM
-from .time_grid import DAY_S, utc_text
+from .time_grid import utc_text
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DAY_S
 
 from ..sky.helioecliptic import offline, parse_time
 
 if TYPE_CHECKING:
     from astropy.time import Time
 
-DAY_S = 86_400.0
 #: Largest number of steps of a plan: eight years of minutes.
 MAX_STEPS = 4_300_000
 

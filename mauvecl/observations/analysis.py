@@ -14,11 +14,12 @@ from mauvecl.lightcurve.search.importance_sampling import SampledRate
 from mauvecl.observations.colour import Colour, event_colour
 from mauvecl.observations.completeness import Completeness, inject
 from mauvecl.observations.events import ObservedEvent, detect_events, measure_events
-from mauvecl.observations.frames import DAY_S, Frames
+from mauvecl.observations.frames import Frames
 from mauvecl.observations.level import QuiescentLevel, quiescent_level
 from mauvecl.observations.noise import Scatter, binned_scatter
 from mauvecl.observations.search import MeasuredRate, SeriesSurvey
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DAY_S
 
 Float = NDArray[np.float64]
 

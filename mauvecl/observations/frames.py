@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Unit
-from mauvecl.schema.physical import Moment
+from mauvecl.schema.physical import DAY_S, Moment
 
 Float = NDArray[np.float64]
 
@@ -23,7 +23,6 @@ MIN_FRAMES = 20
 MAX_FRAMES = 2**22
 #: Shortest time between frames as a share of the cadence; frames that are closer overlap.
 MIN_STEP = 0.5
-DAY_S = 86_400.0
 
 
 class Reason(IntFlag):
@@ -150,9 +149,8 @@ class Frames:
             exposure = np.full(n, cadence)
         if not (np.isfinite(exposure) & (exposure > 0)).all():
             raise _bad(name, "exposure", f"{exposure[np.argmin(exposure)]:g} s", "exposure times above 0")
-        for key in ("temperature_c",):
-            if how.get(key) is not None:
-                how[key] = np.asarray(how[key], np.float64)[order]
+        if how.get("temperature_c") is not None:
+            how["temperature_c"] = np.asarray(how["temperature_c"], np.float64)[order]
         made = cls(
             time[order], exposure[order], light[order], None if sd is None else sd[order], flags[order],
             name=name, remarks=remarks, **how,

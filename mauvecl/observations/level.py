@@ -8,8 +8,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.observations.frames import DAY_S, Frames, Reason
+from mauvecl.observations.frames import Frames, Reason
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DAY_S
 
 Float = NDArray[np.float64]
 

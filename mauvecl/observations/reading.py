@@ -15,10 +15,11 @@ from mauvecl.host.files.bounded import read_bytes, unpacked
 from mauvecl.host.files.parsed import as_text, parsing
 from mauvecl.host.files.text_table import text_table
 from mauvecl.host.spectra.fits_files import check_sizes
-from mauvecl.observations.frames import DAY_S, Frames
+from mauvecl.observations.frames import Frames
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DAY_S
 from mauvecl.schema.text import shown
 
 if TYPE_CHECKING:

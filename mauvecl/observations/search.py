@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.lightcurve.search.bank import Bank, Level
-from mauvecl.lightcurve.search.counted_rate import DAY_S
 from mauvecl.lightcurve.search.importance_sampling import SampledRate, sample_rate
 from mauvecl.lightcurve.search.search import Search
+from mauvecl.lightcurve.search.survey import select_frames
 from mauvecl.lightcurve.search.templates import Templates
 from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.schema.physical import DAY_S
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.flares.shapes import Shape
@@ -171,9 +172,7 @@ class SeriesSurvey:
 
     def frames(self, kept: NDArray[np.bool_]) -> SeriesSurvey:
         """Return the survey of some of the frames."""
-        stare = self.stare
-        names = ("start_s", "star", "light", "sky", "temperature_c")
-        part = replace(stare, **{name: getattr(stare, name)[kept] for name in names})
+        part = select_frames(self.stare, kept)
         return replace(self, stare=part, sums=self.sums[kept], variance=self.variance[kept], time_s=self.time_s[kept])
 
     def normal_rate(self, rate: float, seed: int) -> SampledRate:
@@ -232,14 +231,6 @@ class SeriesSurvey:
                 residual.append(y[here] - np.polyval(np.polyfit(time - time.mean(), y[here], 1), time - time.mean()))
         every = np.concatenate(residual) if residual else y[quiet]
         return np.asarray(every)
-
-    def observed_time(self, stare_s: float) -> float:
-        """Return the observed time of a time of the stare's grid, s."""
-        return (
-            float(np.interp(stare_s, self.stare.middle_s, self.time_s, left=np.nan, right=np.nan))
-            if (self.stare.middle_s[0] <= stare_s <= self.stare.middle_s[-1])
-            else float(self.time_s[0] + stare_s - self.stare.middle_s[0])
-        )
 
 
 def half_widths(stare: Stare) -> tuple[float, ...]:

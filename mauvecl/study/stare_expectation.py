@@ -158,7 +158,8 @@ def unused_lines(case: Case) -> list[str]:
 
 def orbit_lines(case: Case) -> list[str]:
     """Return messages about the orbit of a stare with `along_orbit`."""
-    from mauvecl.host.orbit.time_grid import DAY_S, TimeGrid
+    from mauvecl.host.orbit.time_grid import TimeGrid
+    from mauvecl.schema.physical import DAY_S
 
     if not case.study.stare.along_orbit:
         return []

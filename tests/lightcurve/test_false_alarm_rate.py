@@ -10,11 +10,12 @@ from searches import DAVENPORT, KNOWN, ONE
 from mauvecl.lightcurve.defaults import HALF_WIDTHS_S
 from mauvecl.lightcurve.search.bank import Bank, Level
 from mauvecl.lightcurve.search.completeness import default_bank, search_threshold
-from mauvecl.lightcurve.search.counted_rate import DAY_S, CountedRate
+from mauvecl.lightcurve.search.counted_rate import CountedRate
 from mauvecl.lightcurve.search.false_alarm_rate import TemplateGrid
 from mauvecl.lightcurve.search.importance_sampling import sample_rate
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.schema.physical import DAY_S
 
 
 def test_bank_of_the_page():

@@ -24,11 +24,11 @@ from mauvecl.answers.campaigns.planned import (
 )
 from mauvecl.answers.campaigns.visible import VisibleAnswer, assumption_columns, visible
 from mauvecl.host.orbit.conditions import PARTICLES_SOURCE, THERMAL_SOURCE
-from mauvecl.lightcurve.search.counted_rate import DAY_S
 from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
 from mauvecl.runs.pool import map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DAY_S
 from mauvecl.schema.tables import Column, View, number, table_of
 from mauvecl.study.cases import Case
 from mauvecl.study.messages import SATURATED, collect_messages

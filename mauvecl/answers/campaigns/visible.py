@@ -16,9 +16,10 @@ from mauvecl.answers.campaigns.calendars import Entry, calendar_bytes
 from mauvecl.host.orbit.bodies import Bodies
 from mauvecl.host.orbit.season import elongation_deg, zodiacal_light
 from mauvecl.host.orbit.targets import Target
-from mauvecl.host.orbit.time_grid import DAY_S, TimeGrid
+from mauvecl.host.orbit.time_grid import TimeGrid
 from mauvecl.host.orbit.visibility import Visibility, Windows
 from mauvecl.schema.calls import validated
+from mauvecl.schema.physical import DAY_S
 from mauvecl.schema.tables import Column, View, percent, table_of
 from mauvecl.study.orbits import targets_of
 from mauvecl.study.study import Study

@@ -11,10 +11,11 @@ import numpy as np
 from mauvecl.answers.answer import Answer
 from mauvecl.observations.analysis import Analysis, analyse_frames
 from mauvecl.observations.events import ObservedEvent
-from mauvecl.observations.frames import DAY_S, Frames, Reason
+from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.reading import read_frames
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DAY_S
 from mauvecl.schema.tables import Column, View, interval, number, percent, table_of
 
 if TYPE_CHECKING:

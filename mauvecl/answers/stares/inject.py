@@ -12,7 +12,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, InCell
-from mauvecl.lightcurve.search.counted_rate import DAY_S, CountedRate, consecutive_alarm_rate
+from mauvecl.lightcurve.search.counted_rate import CountedRate, consecutive_alarm_rate
 from mauvecl.lightcurve.search.fit_accuracy import FitAccuracy, Refit
 from mauvecl.lightcurve.search.injected_completeness import InjectedCompleteness
 from mauvecl.lightcurve.search.injections import Injections
@@ -20,6 +20,7 @@ from mauvecl.lightcurve.stares.requests import Arrays
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DAY_S
 from mauvecl.schema.tables import INTERVAL, Column, View, interval, number, percent, stacked, table_of
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.cases import Case, cases

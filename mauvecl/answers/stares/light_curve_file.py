@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.host.version import VERSION
+from mauvecl.schema.physical import DAY_S
 
 if TYPE_CHECKING:
     from astropy.io import fits
 
     from mauvecl.answers.stares.stare import StareAnswer, StarStare
 
-DAY_S = 86_400.0
 #: Start of a stare whose study names no time: 2026-01-01, MJD. Any would do.
 NO_TIME_MJD = 61_041
 

@@ -14,9 +14,9 @@ from mauvecl.lightcurve.defaults import HALF_WIDTHS_S as BANK_S
 from mauvecl.lightcurve.flares.energies import EnergyScale
 from mauvecl.lightcurve.flares.shapes import Shape, shape_of
 from mauvecl.lightcurve.search.bank import Bank
-from mauvecl.lightcurve.search.counted_rate import DAY_S
 from mauvecl.lightcurve.search.false_alarm_rate import TemplateGrid
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DAY_S
 
 Float = NDArray[np.float64]
 

@@ -15,11 +15,11 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DAY_S
 from mauvecl.statistics.intervals import Interval, central_counts, clopper_pearson
 
 Float = NDArray[np.float64]
 
-DAY_S = 86_400.0
 #: Smallest number of alarms for a counted threshold.
 MIN_ALARMS = 10
 

@@ -22,10 +22,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.search.counted_rate import DAY_S
 from mauvecl.lightcurve.search.false_alarm_rate import WEIGHTING_THRESHOLD, TemplateGrid
 from mauvecl.lightcurve.search.search import BATCH
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DAY_S
 from mauvecl.statistics.intervals import CONFIDENCE, Interval
 
 if TYPE_CHECKING:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.search.counted_rate import DAY_S
 from mauvecl.lightcurve.search.importance_sampling import SampledRate, sample_rate
 from mauvecl.lightcurve.search.scatter import Scatter
 from mauvecl.lightcurve.search.search import Search
@@ -17,6 +16,7 @@ from mauvecl.lightcurve.search.trend import Trend
 from mauvecl.lightcurve.stares.requests import StaresRequest
 from mauvecl.lightcurve.stares.sums import method_for
 from mauvecl.noise.processes import NONE, Processes
+from mauvecl.schema.physical import DAY_S
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.search.bank import Bank
@@ -172,7 +172,7 @@ def subtract_known(sums: NDArray[Any], known: NDArray[Any], trend: Trend | None)
     return np.asarray(left if trend is None else trend.subtracted(left), np.float32)
 
 
-def select_frames(stare: Stare, part: slice) -> Stare:
+def select_frames(stare: Stare, part: slice | NDArray[np.bool_]) -> Stare:
     """Return a stare with some of the frames."""
     names = ("start_s", "star", "light", "sky", "temperature_c")
     unknowns = tuple(replace(unknown, curve=unknown.curve[part]) for unknown in stare.unknowns)

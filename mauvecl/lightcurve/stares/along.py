@@ -13,10 +13,11 @@ from mauvecl.host.orbit.constraints import sunlight
 from mauvecl.host.orbit.limits import Limits
 from mauvecl.host.orbit.orbit import Orbit, Track
 from mauvecl.host.orbit.targets import Target
-from mauvecl.host.orbit.time_grid import DAY_S, TimeGrid
+from mauvecl.host.orbit.time_grid import TimeGrid
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.lightcurve.stares.stare import MOST_FRAMES, Stare
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DAY_S
 
 Float = NDArray[np.float64]
 
