@@ -8,38 +8,31 @@ import inspect
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache
 from importlib import import_module
 from pkgutil import iter_modules
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_command
 
 from mauvecl.answers.verbs import VERBS
 from mauvecl.cli import verbs
 from mauvecl.cli.boundary import EXIT_CODES, guarded
 from mauvecl.cli.verb import COMMANDS, add_plain_commands
 from mauvecl.cli.verbs.about import devices, schema, selftest
-from mauvecl.cli.verbs.bulk import export, realise, verify
+from mauvecl.cli.verbs.bulk import export, verify
 from mauvecl.cli.verbs.library import app as library
+from mauvecl.cli.verbs.library import library as show_library
 from mauvecl.cli.verbs.serve import serve
 from mauvecl.host.version import VERSION
 
-app = typer.Typer(
-    name="mauvecl",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
-    help="Would the Mauve satellite see this stellar flare, and how sure can one be?\n\n"
-    "Start with `mauvecl detect`, which answers the question of the MauveSim paper. The throughput is nominal, not a "
-    f"flight calibration. {EXIT_CODES}",
-)
 
-
-def _help(verb: Callable[..., None]) -> str:
-    """Return what `--help` says, with each example on lines of its own that fit 80 columns and can be pasted."""
-    text = re.sub(r"(?m)^(Examples?:) (?=mauvecl )", r"\1\n\n", inspect.getdoc(verb) or "")
+def _help(text: str | None) -> str:
+    """Return a help text with each example on lines of its own, which fit 80 columns and can be pasted."""
+    text = re.sub(r"(?m)^(Examples?:) (?=mauvecl )", r"\1\n\n", inspect.cleandoc(text or ""))
     return re.sub(r"(?m)^mauvecl .*$", lambda found: "\b\n" + _broken(found[0]), text)
 
 
@@ -57,14 +50,69 @@ def _broken(command: str, most: int = 72) -> str:
 for module in iter_modules(verbs.__path__, f"{verbs.__name__}."):
     import_module(module.name)
 add_plain_commands()
-# In the order of `--help`: the questions, bulk, mauvecl itself.
-for name in VERBS:
-    app.command(name, help=_help(COMMANDS[name]))(COMMANDS[name])
-for verb in (realise, verify, export, serve, devices, selftest, schema):
-    app.command(help=_help(verb))(verb)
-for command in library.registered_commands:
-    command.help = _help(command.callback) if command.callback else None
-app.add_typer(library, name="library")
+#: Functions of the commands without a study.
+OTHERS: dict[str, Callable[..., None]] = {
+    function.__name__: function for function in (verify, export, serve, devices, selftest, schema)
+}
+#: Help text of every command, in the order of `--help`: the questions, bulk, mauvecl itself.
+HELP = {
+    **{name: _help(COMMANDS[name].help) for name in (*VERBS, "realise")},
+    **{name: _help(function.__doc__) for name, function in OTHERS.items()},
+    "library": _help(show_library.__doc__),
+}
+
+
+@cache
+def _command(name: str) -> Any:
+    """Build a command, with its flags."""
+    if name == "library":
+        one = library
+        for inner in one.registered_commands:
+            inner.help = _help(inner.callback and inner.callback.__doc__)
+    else:
+        one = typer.Typer(add_completion=False, rich_markup_mode=None)
+        one.command(name, help=HELP[name])(COMMANDS[name].build() if name in COMMANDS else OTHERS[name])
+    return get_command(one)
+
+
+class _Commands(Mapping[str, Any]):
+    """All commands by name; each is built when it is looked up."""
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(HELP)
+
+    def __len__(self) -> int:
+        return len(HELP)
+
+    def __getitem__(self, name: str) -> Any:
+        return _command(name)
+
+
+class _Group(TyperGroup):
+    """Group that builds only the command that is called, so that `mauvecl --help` needs no flags of a study."""
+
+    def __init__(self, **how: Any) -> None:
+        super().__init__(**how)
+        self.commands = _Commands()  # type: ignore[assignment]
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the names and the first sentences of the help texts."""
+        TyperGroup(commands=[TyperCommand(name, help=text) for name, text in HELP.items()]).format_commands(
+            ctx, formatter
+        )
+
+
+app = typer.Typer(
+    name="mauvecl",
+    cls=_Group,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Would the Mauve satellite see this stellar flare, and how sure can one be?\n\n"
+    "Start with `mauvecl detect`, which answers the question of the MauveSim paper. The throughput is nominal, not a "
+    f"flight calibration. {EXIT_CODES}",
+)
 
 
 def _version(wanted: bool) -> None:

@@ -6,15 +6,14 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
 import typer
-from pydantic import BaseModel
-from pydantic.fields import FieldInfo
 
 from mauvecl.schema.fields import Flag, Help, Unit, first, found
-from mauvecl.schema.section import fields_of
-from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from pydantic.fields import FieldInfo
 
 StudyFile = Annotated[
     Path | None,
@@ -81,6 +80,10 @@ def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, StudyFlag]
 @cache
 def _all_flags() -> tuple[tuple[str, FieldInfo, Flag], ...]:
     """Return the path, field and metadata of every flag of a study."""
+    # `mauvecl --help` shows no flags, and begins twice as fast without the study.
+    from mauvecl.schema.section import fields_of
+    from mauvecl.study.study import Study
+
     return tuple((".".join(path), field, flag) for path, field in fields_of(Study) for flag in found(field, Flag))
 
 
@@ -147,7 +150,7 @@ def _text(default: Any) -> str:
     """Return a default in the form in which it is typed; nothing for none."""
     if isinstance(default, tuple):
         return ",".join(map(_text, default))
-    if default is None or isinstance(default, bool | dict | BaseModel | Path):
+    if isinstance(default, bool) or not isinstance(default, str | int | float):
         return ""
     return f"{default:g}" if isinstance(default, float) else str(default)
 

@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, get_type_hints
+from typing import TYPE_CHECKING, Any, NamedTuple, get_type_hints
 
 from mauvecl.answers.verbs import OBSERVATION, VERBS
 from mauvecl.cli.flags import (
@@ -26,8 +26,16 @@ if TYPE_CHECKING:
     from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
 
+
+class StudyCommand(NamedTuple):
+    """Command with the flags of a study, which are made when it is called."""
+
+    help: str
+    build: Callable[[], Callable[..., None]]
+
+
 #: The command of each verb that takes a study, by its name; `takes_study` fills it.
-COMMANDS: dict[str, Callable[..., None]] = {}
+COMMANDS: dict[str, StudyCommand] = {}
 
 
 def takes_study(
@@ -72,10 +80,14 @@ def takes_study(
         A decorator for functions whose first parameters are the study and the session. One named `given` receives the
         flags; others are options of its own.
     """
-    flags = study_flags(*(key for key in (*observation, *keys) if key != without), defaults=defaults)
 
     def decorate(verb: Callable[..., None]) -> Callable[..., None]:
         called = name or verb.__name__
+        COMMANDS[called] = StudyCommand(help or inspect.getdoc(verb) or "", lambda: build(called, verb))
+        return verb
+
+    def build(called: str, verb: Callable[..., None]) -> Callable[..., None]:
+        flags = study_flags(*(key for key in (*observation, *keys) if key != without), defaults=defaults)
         output = output_flag(writes or f"the folder mauvecl-{called}")
         around = (
             {"output": (output, None)}
@@ -142,10 +154,9 @@ def takes_study(
                 readers[parameter.name] = shown or "--" + parameter.name.replace("_", "-"), read
                 default_text = None if parameter.default is None else f"{parameter.default:g}"
                 parameters[place] = parameter.replace(annotation=kind, default=default_text)
-        command.__name__, command.__doc__ = called, help or verb.__doc__
+        command.__name__ = called
         command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         command.__annotations__ = {p.name: p.annotation for p in parameters}
-        COMMANDS[called] = command
         return command
 
     return decorate

@@ -478,3 +478,11 @@ def test_nothing_heavy_is_loaded_early() -> None:
     heavy = "('pyopencl', 'synphot', 'astropy', 'scipy')"
     code = f"import sys, mauvecl, mauvecl.cli.app; print([m for m in {heavy} if m in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+def test_help_imports_no_study() -> None:
+    """Models of a study take longer to build than all else that `mauvecl --help` does."""
+    code = "import sys; sys.argv[1:] = ['--help']; from mauvecl.cli.app import app; app(standalone_mode=False)"
+    code += "; print('pydantic' in sys.modules, 'mauvecl.study.study' in sys.modules)"
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert shown.endswith("False False\n")

@@ -13,10 +13,7 @@ from mauvecl.cli.flags import JsonFlag, QuietFlag, option_of
 if TYPE_CHECKING:
     from mauvecl.host.stars.own_stars import OwnStar
 
-WavelengthUnitFlag = Annotated[str | None, option_of("star.wavelength_unit")]
-FluxUnitFlag = Annotated[str | None, option_of("star.flux_unit")]
-ExtendFlag = Annotated[str | None, option_of("star.extend")]
-app = typer.Typer(invoke_without_command=True, rich_markup_mode=None)
+app = typer.Typer(invoke_without_command=True, rich_markup_mode=None, add_completion=False)
 ReplaceFlag = Annotated[bool, typer.Option("--replace", help="Take the place of what has that name.")]
 
 
@@ -77,9 +74,9 @@ def add(
         str | None, typer.Option(metavar="TEXT", help="For one file: another name.", show_default=False)
     ] = None,
     replace: ReplaceFlag = False,
-    wavelength_unit: WavelengthUnitFlag = None,
-    flux_unit: FluxUnitFlag = None,
-    extend: ExtendFlag = None,
+    wavelength_unit: Annotated[str | None, option_of("star.wavelength_unit")] = None,
+    flux_unit: Annotated[str | None, option_of("star.flux_unit")] = None,
+    extend: Annotated[str | None, option_of("star.extend")] = None,
     quiet: QuietFlag = False,
 ) -> None:
     """Keep spectra of your own under a name, for --star.
@@ -106,7 +103,7 @@ def fetch(
         typer.Option("--from", metavar="TEXT", help="Another address of the collection: a mirror.", show_default=False),
     ] = None,
     replace: ReplaceFlag = False,
-    extend: ExtendFlag = None,
+    extend: Annotated[str | None, option_of("star.extend")] = None,
     quiet: QuietFlag = False,
 ) -> None:
     """Fetch stars of public collections of HST spectra and keep them.
