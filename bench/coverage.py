@@ -17,7 +17,7 @@ from astropy.table import Table
 from tables import processor, versions, write
 
 from mauvecl import BalmerFlare, Engine, FlareModel, Instrument, Nuisances, Source, expect, fit, forecast
-from mauvecl.results.measurements.model import derived_values
+from mauvecl.results.measurements.flare_model import derived_values
 from mauvecl.results.measurements.reduction import Reduction
 from mauvecl.statistics.intervals import clopper_pearson
 

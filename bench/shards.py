@@ -25,7 +25,7 @@ from tables import write
 
 from mauvecl.device.engine import Engine
 from mauvecl.results.requests.requests import DetectRequest, Shard
-from mauvecl.results.sums import DetectionSums
+from mauvecl.results.shard_sums import DetectionSums
 from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.runs.cluster import DaskWorkers
 from mauvecl.runs.pool import LocalWorkers, Pool

@@ -25,10 +25,10 @@ from astropy.table import Table
 from tables import processor, versions, write
 
 from mauvecl import Instrument, Sky, Source, __version__, expect
-from mauvecl.device.stares import Stares
-from mauvecl.lightcurve.stares.components import Components
-from mauvecl.lightcurve.stares.requests import StaresRequest
+from mauvecl.device.stare_engine import Stares
+from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.lightcurve.stares.stare_requests import StaresRequest
 
 REPEATS, FRAMES = 5, 200
 STARE = Stare.of(

@@ -21,15 +21,15 @@ from mauvecl.schema.physical import Duration, Exposure, SkyBrightness
 from mauvecl.schema.tables import Column, table_of
 
 from ..drawable import Drawable
-from .content import ContentEquality
+from .content_equality import ContentEquality
 from .instrument.instrument import Instrument
-from .instrument.line import Line
+from .instrument.line_spread import Line
 from .measured_noise import negative_means_message
 from .response import Order, electrons_per_second
 from .sky import DEFAULT_SKY
 from .sky.zodiacal import Sky
-from .spectra.ends import check_covers, continued
-from .spectra.range import SPAN_NM
+from .spectra.coverage import check_covers, continued
+from .spectra.wavelength_range import SPAN_NM
 
 if TYPE_CHECKING:
     from astropy.table import QTable

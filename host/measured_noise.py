@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
 
-from .instrument.line import Line
+from .instrument.line_spread import Line
 from .response import Order, electrons_per_second
-from .spectra.scatter import point_noise
+from .spectra.point_noise import point_noise
 
 if TYPE_CHECKING:
     from .instrument.instrument import Instrument

@@ -26,7 +26,7 @@ from scipy.sparse import csr_array
 from mauvecl.schema.errors import InputError
 
 from .instrument.instrument import Instrument
-from .instrument.line import Line
+from .instrument.line_spread import Line
 
 Order = Literal["paper", "physical"]
 Float = NDArray[np.float64]

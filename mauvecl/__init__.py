@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.stares.inject import inject
     from mauvecl.answers.stares.stare import stare
     from mauvecl.device.engine import Engine
-    from mauvecl.device.stares import Stares
+    from mauvecl.device.stare_engine import Stares
     from mauvecl.host.expectation import Expectation, expect
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.instrument.pixel_map import PixelMap
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from mauvecl.lightcurve.flares.shapes import SHAPES, TableShape
     from mauvecl.lightcurve.stares.cooling_fit import fit_cooling
     from mauvecl.lightcurve.stares.curves import Sinusoid
-    from mauvecl.lightcurve.stares.measured import measure_along
+    from mauvecl.lightcurve.stares.measured_bins import measure_along
     from mauvecl.lightcurve.stares.stare import Stare
     from mauvecl.noise.comparison import Comparison
     from mauvecl.noise.priors import Normal, Uniform
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from mauvecl.results.detection.departures import departures
     from mauvecl.results.detection.detection import Detection
     from mauvecl.results.measurements.fit import fit, forecast
-    from mauvecl.results.measurements.model import FlareModel
+    from mauvecl.results.measurements.flare_model import FlareModel
     from mauvecl.results.measurements.two_temperatures import fit_two_temperatures
     from mauvecl.runs.cluster import DaskWorkers
     from mauvecl.runs.pool import LocalWorkers, Pool
@@ -140,7 +140,7 @@ __all__ = [
 _HOMES = HOMES | {
     "BalmerFlare": "host.stars.flare_spectra",
     "Blackbody": "host.stars.flare_spectra",
-    "FlareModel": "results.measurements.model",
+    "FlareModel": "results.measurements.flare_model",
     "FlareWithLines": "host.stars.flare_spectra",
     "ObservedFlare": "host.stars.flare_spectra",
     "TwoBlackbodies": "host.stars.flare_spectra",
@@ -172,7 +172,7 @@ _HOMES = HOMES | {
     "Sky": "host.sky.zodiacal",
     "Source": "host.stars.source",
     "Stare": "lightcurve.stares.stare",
-    "Stares": "device.stares",
+    "Stares": "device.stare_engine",
     "Study": "study.study",
     "TableShape": "lightcurve.flares.shapes",
     "Uniform": "noise.priors",
@@ -182,7 +182,7 @@ _HOMES = HOMES | {
     "exposure_for": "answers.signal.exposures",
     "fit_cooling": "lightcurve.stares.cooling_fit",
     "fit_two_temperatures": "results.measurements.two_temperatures",
-    "measure_along": "lightcurve.stares.measured",
+    "measure_along": "lightcurve.stares.measured_bins",
     "shortest_exposure": "answers.limits.limits",
     "smallest_amplitude": "answers.limits.limits",
     "what_matters": "answers.limits.assumptions",

@@ -10,9 +10,9 @@ from mauvecl.host.expectation import Expectation, expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.host.stars.source import Source
-from mauvecl.lightcurve.stares.components import Components
-from mauvecl.lightcurve.stares.requests import StaresRequest
+from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.lightcurve.stares.stare_requests import StaresRequest
 
 #: Of `flaring_stares`: around the boundary of the counter's first word.
 N_STARES, FIRST_STARE = 200, 2**32 - 70

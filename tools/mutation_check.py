@@ -50,7 +50,7 @@ MUTATIONS = {
         "tests/device/test_marginal.py::test_marginalised_statistics_keep_false_alarms_and_power[0.1]",
     ),
     "a sky that follows no level": Mutation(
-        (("mauvecl/noise/pixels.py", "factors.light * factors.sky * share / light", "0.0 * share / light"),),
+        (("mauvecl/noise/pixel_tables.py", "factors.light * factors.sky * share / light", "0.0 * share / light"),),
         "tests/noise/test_processes.py::test_sky_follows_its_level[level0]",
     ),
     "unknowns marginalised without their prior": Mutation(
@@ -60,7 +60,7 @@ MUTATIONS = {
     "sums of stares without their skewness": Mutation(
         (
             ("kernels/stare_sums.cl.mako", "x${a} = FMA(s${name(a, b, c)}, q${b}${c}, x${a});", ";"),
-            ("mauvecl/lightcurve/stares/reference.py", "total = fma(of(skew, a, b, d), q, total)", "pass"),
+            ("mauvecl/lightcurve/stares/stare_reference.py", "total = fma(of(skew, a, b, d), q, total)", "pass"),
         ),
         "tests/lightcurve/test_draws.py::test_sums_by_cumulants_are_distributed_as_by_pixels[cold]",
     ),
@@ -68,7 +68,7 @@ MUTATIONS = {
         (
             ("kernels/stare_sums.cl.mako", "(uintv)first_high, number,", "(uintv)first_high, number & (uintv)0u,"),
             (
-                "mauvecl/lightcurve/stares/reference.py",
+                "mauvecl/lightcurve/stares/stare_reference.py",
                 'words_at(numbers, int(scene.numbers[frame]), "stare_',
                 'words_at(numbers, 0, "stare_',
             ),
@@ -87,7 +87,7 @@ MUTATIONS = {
                 "FMA(0.0f * light, (floatv)m->photon_variance, FMA(strengths.dark",
             ),
             (
-                "mauvecl/lightcurve/stares/reference.py",
+                "mauvecl/lightcurve/stares/stare_reference.py",
                 'fma(light, m["photon_variance"], fma(',
                 'fma(0 * light, m["photon_variance"], fma(',
             ),
@@ -97,7 +97,7 @@ MUTATIONS = {
     "frames counted without their gaps": Mutation(
         (
             (
-                "mauvecl/lightcurve/stares/scene.py",
+                "mauvecl/lightcurve/stares/stare_scene.py",
                 "_padded(stare.numbers, np.uint32)",
                 "_padded(np.arange(stare.n_frames), np.uint32)",
             ),
@@ -105,7 +105,13 @@ MUTATIONS = {
         "tests/lightcurve/test_stare_reference.py::test_a_split_changes_no_bit[cumulants]",
     ),
     "a shard's flares from the first": Mutation(
-        (("mauvecl/device/stares.py", "request.flares.part(first - request.start,", "request.flares.part(done,"),),
+        (
+            (
+                "mauvecl/device/stare_engine.py",
+                "request.flares.part(first - request.start,",
+                "request.flares.part(done,",
+            ),
+        ),
         "tests/runs/test_stares.py::test_shards_join_to_the_same_bits[None-cumulants]",
     ),
     "a shard under another's name": Mutation(
@@ -161,7 +167,7 @@ MUTATIONS = {
         "tests/kernels/test_joint.py::test_pearson_of_raw_counts",
     ),
     "skew-only expansion of the dark": Mutation(
-        (("mauvecl/noise/pixels.py", "= -1 / (72 * root)", "= 0.0"),),
+        (("mauvecl/noise/pixel_tables.py", "= -1 / (72 * root)", "= 0.0"),),
         "tests/kernels/test_poisson.py::test_expansion_cannot_be_distinguished_from_exact_draws",
     ),
     "joint draw allowed by its skew alone": Mutation(
@@ -184,7 +190,7 @@ MUTATIONS = {
         "tests/kernels/test_joint_bound.py::test_factors_follow_the_cumulants",
     ),
     "pairs of two ways": Mutation(
-        (("mauvecl/noise/pixels.py", "_both_of_a_pair(mean >= SMALLEST_EXPANDED)", "mean >= SMALLEST_EXPANDED"),),
+        (("mauvecl/noise/pixel_tables.py", "_both_of_a_pair(mean >= SMALLEST_EXPANDED)", "mean >= SMALLEST_EXPANDED"),),
         "tests/noise/test_correlations.py::test_draws_are_uncorrelated",
     ),
     "skew-only expansion of the joint draw": Mutation(

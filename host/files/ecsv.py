@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
-from .bounded import limit_bytes, read_bytes, unpacked
-from .parsed import as_text, parsing
+from .parsing import as_text, parsing
+from .size_limits import limit_bytes, read_bytes, unpacked
 
 if TYPE_CHECKING:
     import numpy as np

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
-from .bounded import read_bytes, unpacked
 from .ecsv import check_cells, parse_ecsv
-from .parsed import as_text, parsing
+from .parsing import as_text, parsing
+from .size_limits import read_bytes, unpacked
 
 if TYPE_CHECKING:
     from astropy.table import Table

@@ -9,7 +9,7 @@ from typing import Any
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
-from ..files.parsed import read_text, toml
+from ..files.parsing import read_text, toml
 from .curve import Curve
 from .instrument import CURVES, LABELS, Instrument
 from .paths import instrument_path, shipped_names

@@ -10,7 +10,7 @@ from pathlib import Path
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
-from ..files.parsed import is_file
+from ..files.parsing import is_file
 
 
 def shipped_names() -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
 from mauvecl.schema.text import shortened
 
-from ..files.parsed import read_text
+from ..files.parsing import read_text
 from .earth import GRAVITY, J2, RADIUS_KM
 from .time_grid import utc_text
 

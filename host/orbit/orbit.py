@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
 
-from .bodies import Bodies
 from .earth import GRAVITY, Vectors, subsatellite_point, to_j2000, unit
 from .elements import Elements
+from .sun_and_moon import Bodies
 from .time_grid import TimeGrid
 
 Kind = Literal["auto", "tle", "mean"]

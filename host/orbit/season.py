@@ -9,8 +9,8 @@ from mauvecl.schema.errors import InputError
 
 from ..sky.helioecliptic import HelioEcliptic
 from ..sky.zodiacal import zodiacal_brightness
-from .bodies import Bodies
 from .earth import Vectors, unit
+from .sun_and_moon import Bodies
 
 
 def elongation_deg(sun: Vectors, target: NDArray[np.float64]) -> NDArray[np.float64]:

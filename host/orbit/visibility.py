@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from . import constraints
 from .constraints import Flags
 from .earth import Vectors
-from .limits import Limits
+from .observing_limits import Limits
 from .orbit import Track
 from .radiation import proton_map
 

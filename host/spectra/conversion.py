@@ -14,9 +14,9 @@ from mauvecl.schema.errors import InputError
 
 from ..files.units import flux_kind, is_spectral, is_stated, linear, unit_of
 from .air import vacuum_wavelengths
-from .range import check_assumed_unit
-from .roles import Role
+from .column_roles import Role
 from .selection import RawSpectrum
+from .wavelength_range import check_assumed_unit
 
 Float = NDArray[np.float64]
 

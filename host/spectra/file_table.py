@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.schema.errors import InputError
 
-from .roles import Role, role_of
+from .column_roles import Role, role_of
 
 Float = NDArray[np.float64]
 

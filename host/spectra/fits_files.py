@@ -10,10 +10,10 @@ from typing import Any
 
 from mauvecl.schema.errors import InputError
 
-from ..files.parsed import parsing
+from ..files.parsing import parsing
+from .column_roles import role_of
 from .file_table import Column, FileTable
 from .fits_images import axis_of, is_spectrum_image, paired_images, rows_of
-from .roles import role_of
 
 #: Units that the archives' tables imply: CALSPEC's.
 IMPLIED_UNITS = ("Angstrom", "erg / (s cm2 Angstrom)")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
-from ..files.bounded import read_bytes, unpacked
+from ..files.size_limits import read_bytes, unpacked
 
 if TYPE_CHECKING:
     import astropy.units as u

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
 
-from .choice import choose, listed, plain
+from .array_cells import holds_arrays, no_such, selected_rows
+from .column_choice import choose, listed, plain
+from .column_roles import Role
 from .file_table import FileTable, numbers
-from .roles import Role
-from .rows import holds_arrays, no_such, selected_rows
 
 Float = NDArray[np.float64]
 

@@ -13,10 +13,10 @@ import numpy as np
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
-from .choice import AXES
+from .column_choice import AXES
+from .column_roles import Role
 from .file_table import Column, FileTable
 from .header_units import stated_units
-from .roles import Role
 from .text_header import Header, Split, names_of
 
 #: Units of a text file that states none: the paper's rule.

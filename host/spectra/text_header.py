@@ -12,8 +12,8 @@ from collections.abc import Callable, Sequence
 from mauvecl.schema.errors import InputError
 
 from ..files.units import flux_kind, is_spectral, is_stated, unit_of
-from .choice import AXES, listed
-from .roles import divided, role_of, words_of
+from .column_choice import AXES, listed
+from .column_roles import divided, role_of, words_of
 
 #: Lines of a header, and whether each was a remark.
 Header = list[tuple[str, bool]]

@@ -21,10 +21,10 @@ from mauvecl.schema.fields import Range, Unit
 from mauvecl.schema.physical import AreaRatio, BalmerJump, LineFraction, Temperature
 from mauvecl.schema.quantities import number
 
-from ..content import ContentEquality
-from ..spectra.ends import check_points
+from ..content_equality import ContentEquality
+from ..spectra.coverage import check_points
 from ..spectra.formats import read_spectrum
-from ..spectra.range import NEEDED_NM
+from ..spectra.wavelength_range import NEEDED_NM
 from .flare import blackbody
 
 Float = NDArray[np.float64]

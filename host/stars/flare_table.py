@@ -11,8 +11,8 @@ import numpy as np
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened, shown
 
-from ..files.bounded import read_bytes, unpacked
-from ..files.parsed import LARGEST, SMALLEST, as_text, parsing
+from ..files.parsing import LARGEST, SMALLEST, as_text, parsing
+from ..files.size_limits import read_bytes, unpacked
 from ..files.text_table import text_table
 
 if TYPE_CHECKING:

@@ -17,8 +17,8 @@ from urllib.parse import urljoin, urlsplit
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
-from ..files.bounded import limit_bytes
-from ..files.parsed import parsing
+from ..files.parsing import parsing
+from ..files.size_limits import limit_bytes
 from ..version import VERSION
 from .own_stars import OwnStar, add
 

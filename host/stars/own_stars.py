@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 
 from mauvecl.schema.errors import InputError
 
-from ..files.bounded import read_bytes
+from ..files.atomic import write_whole
 from ..files.ecsv import read_ecsv
-from ..files.whole import write_whole
+from ..files.size_limits import read_bytes
 from ..spectra.formats import without_columns
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ def add(
     """
     from astropy.table import Table
 
-    from ..spectra.ends import check_covers
+    from ..spectra.coverage import check_covers
     from . import catalogue
     from .source import Source
 

@@ -18,8 +18,8 @@ from mauvecl.schema.fields import AnyUnit, Unit
 from mauvecl.schema.physical import Amplitude, BinWidth, Magnitude, Reddening, Temperature
 
 from ...drawable import Drawable
-from ..content import ContentEquality
-from ..spectra.ends import (
+from ..content_equality import ContentEquality
+from ..spectra.coverage import (
     check_flux,
     check_measured,
     check_points,
@@ -31,7 +31,7 @@ from ..spectra.ends import (
     without_undefined_ends,
 )
 from ..spectra.formats import read_spectrum
-from ..spectra.range import SPAN_NM
+from ..spectra.wavelength_range import SPAN_NM
 from . import bands, catalogue, own_stars
 from .flare import Geometry, with_flare
 from .flare_spectra import Blackbody, FlareSpectrum

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from mauvecl.drawable import Drawable, documents_of
-from mauvecl.host.content import ContentEquality
+from mauvecl.host.content_equality import ContentEquality
 from mauvecl.schema.tables import View, records
 from mauvecl.study.labels import full_label
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mauvecl.host.files.parsed import read_text
+from mauvecl.host.files.parsing import read_text
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.study.study_text import read_embedded_study

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.checked import OWN_DIGEST, RECORD, digest_of, record_digest
-from mauvecl.host.files.parsed import read_text
-from mauvecl.host.files.whole import write_whole
+from mauvecl.host.files.atomic import write_whole
+from mauvecl.host.files.parsing import read_text
 from mauvecl.host.version import VERSION
 from mauvecl.schema.errors import InputError
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
-    from mauvecl.store.form import Store
+    from mauvecl.store.layout import Store
     from mauvecl.study.study import Study
 
 YEAR_S = 365.25 * 86_400.0
@@ -36,7 +36,7 @@ def question_values(study: Study, *, detects: bool) -> None:
     """
     from mauvecl.host.instrument.paths import instrument_path
     from mauvecl.host.stars.band_names import known_band
-    from mauvecl.results.requests.fap import check_fap
+    from mauvecl.results.requests.fap_checks import check_fap
     from mauvecl.statistics.names import check_statistic
     from mauvecl.study.star_names import check_spectrum
 
@@ -57,7 +57,7 @@ def question_values(study: Study, *, detects: bool) -> None:
 
 
 def _check_file(file: Path) -> None:
-    from mauvecl.host.files.bounded import read_bytes
+    from mauvecl.host.files.size_limits import read_bytes
     from mauvecl.host.spectra.formats import without_columns
 
     try:

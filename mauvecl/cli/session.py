@@ -102,7 +102,7 @@ class Session:
     def folder(self) -> Path:
         """Where everything is written; held from now on."""
         from mauvecl.answers.files import make_folder
-        from mauvecl.runs.durable import locked
+        from mauvecl.runs.locks import locked
 
         folder = make_folder(self.output or Path(f"mauvecl-{self.verb}"))
         writes_to(folder)

@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 from mauvecl.device.device import Device
 from mauvecl.device.errors import DeviceError
 from mauvecl.device.program import DeviceRecord, devices
-from mauvecl.device.stares import Stares
+from mauvecl.device.stare_engine import Stares
 from mauvecl.device.tiles import Progress, Tile, Tiles
 from mauvecl.device.variants import ELEMENT_CHUNK, detection_launches, scene_launches
-from mauvecl.lightcurve.stares.requests import StaresRequest
+from mauvecl.lightcurve.stares.stare_requests import StaresRequest
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.drawing import Drawing, DrawingOptions
 from mauvecl.noise.scene import BATCH, prepare
 from mauvecl.results.counts.tally import TailSamples, Tally
 from mauvecl.results.detection.detection import Detection
 from mauvecl.results.requests.channels import plan_channels
-from mauvecl.results.requests.fap import Tails
+from mauvecl.results.requests.fap_checks import Tails
 from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.results.requests.requests import (
     Countable,
@@ -31,8 +31,8 @@ from mauvecl.results.requests.requests import (
     SnrRequest,
     check_last,
 )
+from mauvecl.results.shard_sums import Arrays, DetectionSums, SnrSums, pack_detection, pack_snr
 from mauvecl.results.snr import Counts, SnrResult, elements, observers
-from mauvecl.results.sums import Arrays, DetectionSums, SnrSums, pack_detection, pack_snr
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import OneOrMore
@@ -224,7 +224,7 @@ class Engine:
         return sums.answer()
 
     def count(self, request: Countable, shard: Shard, *, out: NDArray[Any] | None = None) -> Arrays:
-        """Compute the sums of one shard of a request, as accumulated by `results.sums`.
+        """Compute the sums of one shard of a request, as accumulated by `results.shard_sums`.
 
         Parameters
         ----------

@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
-from mauvecl.host.files.bounded import read_bytes
+from mauvecl.host.files.size_limits import read_bytes
 from mauvecl.host.version import VERSION
 
 #: Free space that PoCL needs to build the kernels of a session, bytes.

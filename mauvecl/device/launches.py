@@ -14,7 +14,7 @@ from mauvecl.device.errors import DeviceError
 from mauvecl.device.program import out_of_memory
 from mauvecl.device.tiles import Tile
 from mauvecl.noise import layout
-from mauvecl.noise.pixels import PIXEL_BLOCK
+from mauvecl.noise.pixel_tables import PIXEL_BLOCK
 from mauvecl.noise.scene import Scene
 from mauvecl.results.counts.tally import Grid, Tally
 from mauvecl.results.snr import Counts

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from mauvecl.device.engine import Engine
 from mauvecl.device.program import SAME_BITS
 from mauvecl.device.selftest import COUNT, SEED, START, Check, toy
-from mauvecl.device.stares import Stares
-from mauvecl.lightcurve.stares import reference
-from mauvecl.lightcurve.stares.components import Components
-from mauvecl.lightcurve.stares.requests import Arrays, StaresRequest
-from mauvecl.lightcurve.stares.scene import Flares, StareScene
+from mauvecl.device.stare_engine import Stares
+from mauvecl.lightcurve.stares import stare_reference
+from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.lightcurve.stares.stare_requests import Arrays, StaresRequest
+from mauvecl.lightcurve.stares.stare_scene import Flares, StareScene
 from mauvecl.noise.processes import NONE, CosmicRays, Processes
 
 #: Small stares that run every branch: options of `toy`, unknowns of the stare, number of sums.
@@ -40,7 +40,7 @@ def stares(engine: Engine) -> Iterator[Check]:
         stare = Stare.of(100.0, gaps=[(10.0, 40.0)], **wobble)
         given = np.linspace(0.0, 2.0, COUNT * stare.n_frames).reshape(COUNT, stare.n_frames, 1)
         flares, frames = Flares.of(components, stare, given, None, COUNT), range(stare.n_frames)
-        for method, slow in (("pixels", reference.pixels), ("cumulants", reference.sums)):
+        for method, slow in (("pixels", stare_reference.pixels), ("cumulants", stare_reference.sums)):
             processes = Processes(cosmic_rays=CosmicRays(rate_per_cm2_s=300.0)) if method == "pixels" else NONE
             how: dict[str, Any] = {"seed": SEED, "method": method, "processes": processes}
             ours = Stares(engine.open_device).frames(components, stare, given, first=START, count=COUNT, **how)
@@ -53,7 +53,7 @@ def stares(engine: Engine) -> Iterator[Check]:
             yield Check(f"same bits as the NumPy reference: {name}, by {method}", passed, text)
         request = StaresRequest(components, stare, COUNT, SEED, start=START, reduction=Glow(), glow=True)
         ours = Stares(engine.open_device).reduced(request)["glow"]
-        theirs = reference.glow(StareScene.of(components, stare), index, frames, SEED)
+        theirs = stare_reference.glow(StareScene.of(components, stare), index, frames, SEED)
         apart = float(np.abs(ours - theirs).max())
         passed = bool((ours == theirs).all()) if engine.device.promise == SAME_BITS else apart < 0.2
         yield Check(f"same bits as the NumPy reference: {name}, noise of flares", passed, f"{apart:.2g} apart")

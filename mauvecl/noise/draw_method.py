@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from mauvecl.noise.cumulants import Cumulants, joint_is_exact, needs_fourth_power, stack_is_exact
 from mauvecl.noise.drawing import Drawing, Mode, Recipe
-from mauvecl.noise.factors import Factors
-from mauvecl.noise.pixels import sky_share
+from mauvecl.noise.factor_tables import Factors
+from mauvecl.noise.pixel_tables import sky_share
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:

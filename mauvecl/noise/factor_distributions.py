@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.noise.factors import Factors
+from mauvecl.noise.factor_tables import Factors
 from mauvecl.noise.prior_tables import nodes
 
 if TYPE_CHECKING:

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.noise import layout, pixels
+from mauvecl.noise import layout, pixel_tables
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.cumulants import polynomial
 from mauvecl.noise.draw_method import DrawMethod, check_reach, choose_method
 from mauvecl.noise.drawing import Drawing, DrawingOptions
-from mauvecl.noise.factors import Factors
+from mauvecl.noise.factor_tables import Factors
 from mauvecl.noise.poisson import AliasTable, table_of
 from mauvecl.noise.unknowns import ADDITIVE, SignalPart
 
@@ -175,10 +175,11 @@ def prepare(
     used = ~np.any([scenarios[t].saturated for t in np.unique(compared)], axis=0)
     n_pixel, tables = used.size, list[AliasTable]()
 
-    darks, dark_centre = np.zeros(pixels.padded(n_pixel), layout.POISSON), np.zeros(n_pixel)
+    darks, dark_centre = np.zeros(pixel_tables.padded(n_pixel), layout.POISSON), np.zeros(n_pixel)
     if not method.joint:
         step = quiet.dark_step_dn
-        dark_centre = pixels.fill_poisson_counts(darks[:n_pixel], method.each * quiet.dark_dn / step, step, tables)
+        dark_dn = method.each * quiet.dark_dn
+        dark_centre = pixel_tables.fill_poisson_counts(darks[:n_pixel], dark_dn / step, step, tables)
     arrays = _PerScenario.empty(scenarios, method, comparison, modulated=bool(drawing.processes.modulations))
     for k, x in enumerate(scenarios):
         arrays.fill_draw(k, x, method, factors, quiet.dark_step_dn * dark_centre, tables)
@@ -194,7 +195,7 @@ def prepare(
         clip=method.each == 1,
         modulations=drawing.processes.modulations,
         job=job,
-        pixels=pixels.detector_pixels(quiet, used),
+        pixels=pixel_tables.detector_pixels(quiet, used),
         dark_counts=darks,
         tables=np.concatenate([np.zeros(0, np.uint32), *(t.entries for t in tables)]).astype(np.uint32),
         priors=factors.tables,
@@ -224,7 +225,7 @@ class _PerScenario:
     ) -> _PerScenario:
         """Return arrays filled with the values of padding."""
         n_pixel = scenarios[0].wavelength_nm.size
-        shape = (len(scenarios), pixels.padded(n_pixel))
+        shape = (len(scenarios), pixel_tables.padded(n_pixel))
         arrays = cls(
             levels=np.zeros(shape, layout.LEVEL),
             edges=np.zeros(shape, layout.EDGE),
@@ -234,7 +235,7 @@ class _PerScenario:
             estimates=np.zeros(shape if comparison.estimated else 0, layout.ESTIMATE),
             base_dn=np.zeros((len(scenarios), n_pixel), np.int64),
         )
-        arrays.responses["other_variance"] = pixels.NO_VARIANCE
+        arrays.responses["other_variance"] = pixel_tables.NO_VARIANCE
         for name, array in (("shift", arrays.levels), ("low", arrays.edges), ("high", arrays.edges)):
             array[name] = layout.MAGIC
         return arrays
@@ -247,7 +248,7 @@ class _PerScenario:
         mean = self._mean(k, x, method, factors, dark_dn, tables)
         base = self.base_dn[k] = np.clip(np.rint(mean), 0, x.highest_dn if method.each == 1 else np.inf)
         if self.responses.size:
-            pixels.fill_responses(self.responses[k, : dark_dn.size], x, c, factors)
+            pixel_tables.fill_responses(self.responses[k, : dark_dn.size], x, c, factors)
             check_reach(x, c, factors)
         elif method.joint:
             for name, coefficient in zip(("c0", "c1", "c2", "c3", "c4"), polynomial(c), strict=True):
@@ -262,12 +263,12 @@ class _PerScenario:
         """Return the mean, DN, to which a draw is relative; separate Poisson counts are relative to integers."""
         c, gain = method.cumulants[k], x.gain_dn_per_electron
         if method.joint:
-            light = factors.on_light(factors.light, factors.sky, pixels.sky_share(x))
+            light = factors.on_light(factors.light, factors.sky, pixel_tables.sky_share(x))
             return np.asarray(c.mean + (light - 1.0) * c.light_dn + (factors.dark - 1.0) * c.dark_dn)
         mean = method.each * x.bias_dn + dark_dn
         if method.photons:
             out = self.photon_counts[k, : dark_dn.size]
-            return np.asarray(mean + gain * pixels.fill_poisson_counts(out, c.photons, gain, tables))
+            return np.asarray(mean + gain * pixel_tables.fill_poisson_counts(out, c.photons, gain, tables))
         return np.asarray(mean + gain * c.photons)
 
     def fill_comparison(
@@ -294,8 +295,8 @@ class _PerScenario:
         edge["low"] = layout.MAGIC - base
         edge["high"] = layout.MAGIC + (x.highest_dn - base)
         if comparison.estimated:
-            pixels.fill_estimates(self.estimates[k], reference, self.fraction[k], np.rint(mean_sum))
-        ends = pixels.element_ends(x)
+            pixel_tables.fill_estimates(self.estimates[k], reference, self.fraction[k], np.rint(mean_sum))
+        ends = pixel_tables.element_ends(x)
         element_variance = np.bincount(x.element, variance * used)
         with np.errstate(divide="ignore"):
             edge["inverse_element_variance"][ends] = np.where(element_variance > 0, 1.0 / element_variance, 0.0)
@@ -319,7 +320,8 @@ def _job(
     quiet = scenarios[0]
     job = np.zeros((), layout.JOB)
     n_pixel = quiet.wavelength_nm.size
-    job["pixel_count"], job["padded_count"], job["scenario_count"] = n_pixel, pixels.padded(n_pixel), len(scenarios)
+    job["pixel_count"], job["padded_count"] = n_pixel, pixel_tables.padded(n_pixel)
+    job["scenario_count"] = len(scenarios)
     job["draw_count"], job["frame_count"] = quiet.n_frames if method.frames else 1, quiet.n_frames
     job["first_frame"], job["first_group"] = drawing.first_frame, first_group
     job["reference_count"], job["reference_weight"] = comparison.exposures, comparison.added_variance

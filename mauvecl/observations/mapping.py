@@ -7,7 +7,7 @@ from typing import Literal, Self
 
 from pydantic import model_validator
 
-from mauvecl.host.files.parsed import read_text, toml
+from mauvecl.host.files.parsing import read_text, toml
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.records import Record
 from mauvecl.schema.text import shortened

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.files.bounded import read_bytes, unpacked
-from mauvecl.host.files.parsed import as_text, parsing
+from mauvecl.host.files.parsing import as_text, parsing
+from mauvecl.host.files.size_limits import read_bytes, unpacked
 from mauvecl.host.files.text_table import text_table
 from mauvecl.host.spectra.fits_files import check_sizes
 from mauvecl.observations.frames import Frames

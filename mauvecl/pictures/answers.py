@@ -21,7 +21,7 @@ from mauvecl.pictures.style import (
     plain_numbers,
     styled_picture,
 )
-from mauvecl.results.requests.fap import NoThresholdError
+from mauvecl.results.requests.fap_checks import NoThresholdError
 from mauvecl.statistics.registry import label
 from mauvecl.statistics.statistic import LinearStatistic
 from mauvecl.study.parts import First, note_of, part_note

@@ -11,7 +11,7 @@ from typing import Any, Concatenate, ParamSpec
 
 import numpy as np
 
-from mauvecl.host.files.whole import write_whole
+from mauvecl.host.files.atomic import write_whole
 from mauvecl.schema.errors import InputError
 
 P = ParamSpec("P")

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.drawable import Drawable
-from mauvecl.host.content import ContentEquality
+from mauvecl.host.content_equality import ContentEquality
 from mauvecl.noise import layout
 from mauvecl.noise.reference import Floats, fma
 from mauvecl.noise.scene import Scene
-from mauvecl.results.counts.far import SparseCounts
+from mauvecl.results.counts.sparse_counts import SparseCounts
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column, table_of
 

@@ -24,16 +24,16 @@ from typing import TYPE_CHECKING, Protocol, Self
 
 import numpy as np
 
-from mauvecl.host.files.bounded import read_bytes
-from mauvecl.host.files.parsed import json_data, read_text
-from mauvecl.host.files.whole import UNFINISHED, write_whole
+from mauvecl.host.files.atomic import UNFINISHED, write_whole
+from mauvecl.host.files.parsing import json_data, read_text
+from mauvecl.host.files.size_limits import read_bytes
 from mauvecl.host.version import VERSION
-from mauvecl.runs.durable import differing_keys, locked
+from mauvecl.runs.locks import differing_keys, locked
 from mauvecl.runs.shards import FORM, fingerprint
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
-    from mauvecl.results.sums import Arrays
+    from mauvecl.results.shard_sums import Arrays
 
 FOLDER, MANIFEST = "checkpoint", "manifest.json"
 #: Names of shards: fingerprint, part, start, count.

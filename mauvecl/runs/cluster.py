@@ -18,10 +18,10 @@ from urllib.parse import urlsplit
 from mauvecl.device.errors import DeviceError
 from mauvecl.device.first_build import THREADS
 from mauvecl.device.program import DeviceRecord
-from mauvecl.host.files.parsed import is_file, json_data, read_text
+from mauvecl.host.files.parsing import is_file, json_data, read_text
 from mauvecl.host.version import VERSION
 from mauvecl.results.requests.requests import Countable, Shard
-from mauvecl.results.sums import Arrays
+from mauvecl.results.shard_sums import Arrays
 from mauvecl.runs.pool import Stopped
 from mauvecl.runs.shards import Task
 from mauvecl.schema.calls import validated

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 from numpy.typing import NDArray
 
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
-from mauvecl.device.stares import Stares
+from mauvecl.device.stare_engine import Stares
 from mauvecl.device.tiles import Progress
-from mauvecl.lightcurve.stares.requests import StaresRequest, StareSums
+from mauvecl.lightcurve.stares.stare_requests import StaresRequest, StareSums
 from mauvecl.results.requests.requests import DetectRequest, RealiseRequest, Shard, SnrRequest
-from mauvecl.results.sums import Arrays, DetectionSums, SnrSums
+from mauvecl.results.shard_sums import Arrays, DetectionSums, SnrSums
 from mauvecl.runs.shards import Task, fingerprint, shards
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError

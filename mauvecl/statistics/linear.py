@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.content import ContentEquality
+from mauvecl.host.content_equality import ContentEquality
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.statistic import Float, LinearStatistic, Setting

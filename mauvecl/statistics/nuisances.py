@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.content import ContentEquality
+from mauvecl.host.content_equality import ContentEquality
 from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.files.whole import UNFINISHED, write_whole
-from mauvecl.runs.durable import locked
+from mauvecl.host.files.atomic import UNFINISHED, write_whole
+from mauvecl.runs.locks import locked
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import FirstRealisation, Realisations
 from mauvecl.store.export import Selection, export
-from mauvecl.store.form import CRC_BYTES, Chunk, Store, StoredScene, crc, digest
+from mauvecl.store.layout import CRC_BYTES, Chunk, Store, StoredScene, crc, digest
 from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 

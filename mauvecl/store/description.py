@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.files.bounded import read_bytes
+from mauvecl.host.files.size_limits import read_bytes
 from mauvecl.host.version import VERSION
 from mauvecl.schema.errors import InputError
 from mauvecl.study.messages import collect_messages as messages_of
 
 if TYPE_CHECKING:
-    from mauvecl.store.form import Store
+    from mauvecl.store.layout import Store
 
 #: Units of the calibration per pixel and frame, which each star's group contains.
 CALIBRATION = {

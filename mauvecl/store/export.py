@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.files.whole import UNFINISHED, write_whole
+from mauvecl.host.files.atomic import UNFINISHED, write_whole
 from mauvecl.host.version import VERSION
 from mauvecl.schema.errors import InputError
 from mauvecl.store.description import CALIBRATION, COMMON_DRAWS, NOMINAL
-from mauvecl.store.form import Store, StoredScene
+from mauvecl.store.layout import Store, StoredScene
 
 if TYPE_CHECKING:
     from astropy.io.fits import BinTableHDU, HDUList, ImageHDU

@@ -18,7 +18,7 @@ from mauvecl.schema.text import shortened, shown
 from mauvecl.study.sections import Section
 
 if TYPE_CHECKING:
-    from mauvecl.host.orbit.limits import Limits
+    from mauvecl.host.orbit.observing_limits import Limits
     from mauvecl.host.orbit.orbit import Orbit
     from mauvecl.host.orbit.targets import Target
     from mauvecl.host.orbit.time_grid import TimeGrid
@@ -85,7 +85,7 @@ class LimitsText(Section):
 
     def limits(self) -> Limits:
         """Return the limits for the host, with None for no limit."""
-        from mauvecl.host.orbit.limits import Limits
+        from mauvecl.host.orbit.observing_limits import Limits
 
         given = {name: getattr(self, name) for name in type(self).model_fields}
         values: dict[str, Any] = {name: None if value == "none" else value for name, value in given.items()}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from mauvecl.host.files.parsed import possible, read_text, toml
+from mauvecl.host.files.parsing import possible, read_text, toml
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError

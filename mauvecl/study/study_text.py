@@ -8,9 +8,9 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from mauvecl.host.files.bounded import read_bytes
 from mauvecl.host.files.ecsv import read_ecsv
-from mauvecl.host.files.parsed import parsing, read_text, toml
+from mauvecl.host.files.parsing import parsing, read_text, toml
+from mauvecl.host.files.size_limits import read_bytes
 from mauvecl.host.spectra.formats import without_columns
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened

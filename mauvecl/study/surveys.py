@@ -13,7 +13,7 @@ from mauvecl.lightcurve.search.bank import Bank
 from mauvecl.lightcurve.search.flare_fit import Fit
 from mauvecl.lightcurve.search.survey import Survey
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates, frame_nuisances
-from mauvecl.lightcurve.stares.components import Components
+from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.schema.errors import InputError
 from mauvecl.study.flare_light import FlareLight
 from mauvecl.study.stare_expectation import energy_scale

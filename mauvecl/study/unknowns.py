@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.noise.unknowns import INSTRUMENT_VALUES
-from mauvecl.results.requests.fap import MIN_IN_TAIL
+from mauvecl.results.requests.fap_checks import MIN_IN_TAIL
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column
 from mauvecl.statistics.intervals import CONFIDENCE, Interval

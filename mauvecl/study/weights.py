@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.files.parsed import LARGEST, SMALLEST, parsing, read_text
+from mauvecl.host.files.parsing import LARGEST, SMALLEST, parsing, read_text
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 

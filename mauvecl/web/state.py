@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl, urlencode
 
-from mauvecl.results.requests.fap import check_fap
+from mauvecl.results.requests.fap_checks import check_fap
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 from mauvecl.web.fields import FIELDS, MOST_CHARACTERS, UPLOADED, UPLOADED_UNKNOWN, Choice, Field, several

@@ -10,7 +10,7 @@ from refusals import refused
 import mauvecl
 from mauvecl import Study
 from mauvecl.device.engine import Engine
-from mauvecl.device.stares import Stares
+from mauvecl.device.stare_engine import Stares
 from mauvecl.noise.unknowns import PROCESSES
 
 FEW = ["star=[{library='G2V', magnitude=7.4}]", "run={realisations=10_000, fap=0.01, statistics=['matched']}"]

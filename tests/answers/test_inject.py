@@ -11,7 +11,7 @@ from refusals import refused
 
 from mauvecl.answers.stares.inject import inject
 from mauvecl.device.engine import Engine
-from mauvecl.device.stares import Stares
+from mauvecl.device.stare_engine import Stares
 from mauvecl.lightcurve.search.injected_completeness import InjectedCompleteness
 from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.runs.pool import LocalWorkers, Pool

@@ -18,7 +18,7 @@ from mauvecl.answers.files import write_study, write_table
 from mauvecl.lightcurve.flares.energies import EnergyScale, quiescent_luminosity
 from mauvecl.lightcurve.flares.rates import davenport2019
 from mauvecl.lightcurve.search.completeness import Completeness
-from mauvecl.lightcurve.stares.along import stare_along
+from mauvecl.lightcurve.stares.orbit_stare import stare_along
 from mauvecl.schema.tables import records
 from mauvecl.study.cases import Case
 from mauvecl.study.orbits import read_targets

@@ -20,7 +20,7 @@ from mauvecl.answers.signal.snr import snr
 from mauvecl.answers.stares.inject import inject
 from mauvecl.answers.stares.stare import stare
 from mauvecl.device.engine import Engine
-from mauvecl.device.stares import Stares
+from mauvecl.device.stare_engine import Stares
 from mauvecl.schema.errors import InputError
 from mauvecl.store.bulk import realise_file
 from mauvecl.study.messages import collect_messages

@@ -16,7 +16,7 @@ from commands import run
 
 from mauvecl.answers.stares.stare import StareAnswer, stare
 from mauvecl.device.engine import Engine
-from mauvecl.device.stares import Stares
+from mauvecl.device.stare_engine import Stares
 from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 

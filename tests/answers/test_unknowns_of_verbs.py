@@ -11,7 +11,7 @@ from answers import small
 
 from mauvecl.answers.verbs import VERBS
 from mauvecl.device.engine import Engine
-from mauvecl.device.stares import Stares
+from mauvecl.device.stare_engine import Stares
 from mauvecl.noise.unknowns import ADDITIVE, NUISANCES, PROCESSES, STARE_CHANGES
 from mauvecl.schema.errors import InputError
 from mauvecl.study.assumptions import unused_unknowns

@@ -389,7 +389,7 @@ def test_what_the_disk_has_no_room_for_is_questioned(tmp_path: Path) -> None:
         most = int(re.search(r"expected at most (\d+) of them", told)[1])
         assert "10 MiB" in told
         assert not (tmp_path / "s.zarr").exists()
-        from mauvecl.store.form import Store
+        from mauvecl.store.layout import Store
 
         study = Study().with_settings(
             ["star=[{library='G2V',magnitude=7}]", "flare.amplitudes=[0.1]", "observation.exposure_s=5"]

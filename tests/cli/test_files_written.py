@@ -13,9 +13,9 @@ from answers import small
 from refusals import refused
 
 from mauvecl.cli.app import app
-from mauvecl.host.files.whole import write_whole
+from mauvecl.host.files.atomic import write_whole
 from mauvecl.runs.checkpoint import Checkpoint
-from mauvecl.runs.durable import locked
+from mauvecl.runs.locks import locked
 from mauvecl.schema.errors import InputError
 from mauvecl.store.export import Selection, export
 
@@ -43,7 +43,7 @@ def full_from(step: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
             raise OSError(28, "No space left on device")
         real(handle)
 
-    monkeypatch.setattr("mauvecl.host.files.whole.os.fsync", fsync)
+    monkeypatch.setattr("mauvecl.host.files.atomic.os.fsync", fsync)
     return tried
 
 

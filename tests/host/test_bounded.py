@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from refusals import refused
 
-from mauvecl.host.files.bounded import read_bytes, unpacked
+from mauvecl.host.files.size_limits import read_bytes, unpacked
 from mauvecl.schema.text import shortened
 
 PACKERS = pytest.mark.parametrize("pack", [gzip.compress, bz2.compress, lzma.compress])

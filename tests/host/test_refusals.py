@@ -17,7 +17,7 @@ from mauvecl.host.expectation import expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.instrument.pixel_map import PixelMap
 from mauvecl.host.orbit.conditions import Particles, Thermal
-from mauvecl.host.orbit.limits import Limits
+from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.host.orbit.orbit import Orbit
 from mauvecl.host.orbit.targets import Target
 from mauvecl.host.orbit.time_grid import TimeGrid

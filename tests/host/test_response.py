@@ -12,7 +12,7 @@ from scipy.special import erf
 
 from mauvecl.host import response
 from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.host.instrument.line import Line
+from mauvecl.host.instrument.line_spread import Line
 from mauvecl.host.response import Order, electrons_per_second, response_matrix
 
 Float = NDArray[np.float64]

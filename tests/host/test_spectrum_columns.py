@@ -21,7 +21,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from refusals import refused
 
-from mauvecl.host.spectra.roles import role_of
+from mauvecl.host.spectra.column_roles import role_of
 from mauvecl.host.stars.source import Source
 from mauvecl.schema.errors import InputError
 

@@ -14,7 +14,7 @@ from refusals import refused
 from mauvecl.host.orbit import constraints
 from mauvecl.host.orbit.conditions import Particles, Thermal
 from mauvecl.host.orbit.earth import direction, unit
-from mauvecl.host.orbit.limits import Limits
+from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.host.orbit.orbit import Orbit, circular
 from mauvecl.host.orbit.radiation import proton_map
 from mauvecl.host.orbit.season import elongation_deg, zodiacal_light

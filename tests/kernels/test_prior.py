@@ -11,7 +11,7 @@ from refusals import refused
 
 from mauvecl.device.probes import Probes
 from mauvecl.noise import reference
-from mauvecl.noise.factors import Factors
+from mauvecl.noise.factor_tables import Factors
 from mauvecl.noise.prior_tables import nodes
 from mauvecl.noise.priors import Normal, Prior, Uniform
 from mauvecl.noise.processes import Processes

@@ -12,7 +12,7 @@ from mauvecl.lightcurve.flares.shapes import SHAPES
 from mauvecl.lightcurve.search.bank import Bank, Level
 from mauvecl.lightcurve.search.survey import Survey
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates, frame_nuisances
-from mauvecl.lightcurve.stares.components import Components
+from mauvecl.lightcurve.stares.frame_components import Components
 
 DAVENPORT = SHAPES["davenport2014"]
 ONE = np.ones((1, 1))

@@ -5,12 +5,12 @@ import pytest
 from refusals import refused
 
 from mauvecl.host.orbit.conditions import Thermal
-from mauvecl.host.orbit.limits import Limits
+from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.host.orbit.orbit import Orbit
 from mauvecl.host.orbit.targets import Target
 from mauvecl.host.orbit.time_grid import TimeGrid
 from mauvecl.host.orbit.visibility import Visibility
-from mauvecl.lightcurve.stares.along import OrbitStare, stare_along
+from mauvecl.lightcurve.stares.orbit_stare import OrbitStare, stare_along
 from mauvecl.lightcurve.stares.stare import Stare
 
 START, HOURS = "2026-09-20T03:00:00", 8.0

@@ -10,8 +10,8 @@ from scenes import instrument, star
 from scipy import special
 
 from mauvecl.device.engine import Engine
-from mauvecl.device.stares import Stares
-from mauvecl.lightcurve.stares.components import Components
+from mauvecl.device.stare_engine import Stares
+from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.stare import Stare
 
 METHODS = ["pixels", "cumulants"]

@@ -11,7 +11,7 @@ import pytest
 from scipy import special
 from searches import DAVENPORT, KNOWN, ONE, spectra, survey
 
-from mauvecl.device.stares import Stares
+from mauvecl.device.stare_engine import Stares
 from mauvecl.lightcurve.search import injection_sites
 from mauvecl.lightcurve.search.bank import Bank, Level
 from mauvecl.lightcurve.search.counted_rate import consecutive_alarm_rate, consecutive_alarms

@@ -15,7 +15,7 @@ from searches import DAVENPORT, KNOWN, ONE
 
 from mauvecl import Study
 from mauvecl.device.engine import Engine
-from mauvecl.device.stares import Stares
+from mauvecl.device.stare_engine import Stares
 from mauvecl.host.orbit.orbit import Orbit
 from mauvecl.host.stars.source import Source
 from mauvecl.lightcurve.defaults import per_day
@@ -27,9 +27,9 @@ from mauvecl.lightcurve.search.bank import Bank, Level
 from mauvecl.lightcurve.search.completeness import Completeness, DurationLaw, frame_signal, search_threshold
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.search.yields import fit_power_law
-from mauvecl.lightcurve.stares.along import stare_along
-from mauvecl.lightcurve.stares.components import Components
 from mauvecl.lightcurve.stares.curves import Sinusoid, Table
+from mauvecl.lightcurve.stares.frame_components import Components
+from mauvecl.lightcurve.stares.orbit_stare import stare_along
 from mauvecl.lightcurve.stares.stare import Stare, StareUnknown
 
 BANK = Bank((20.0,), ONE, DAVENPORT, 5.0, KNOWN)

@@ -8,13 +8,13 @@ from refusals import refused
 from scipy import special
 from searches import DAVENPORT, KNOWN, ONE, survey
 
-from mauvecl.device.stares import Stares
+from mauvecl.device.stare_engine import Stares
 from mauvecl.lightcurve.defaults import DAYS, per_day
 from mauvecl.lightcurve.search.bank import Bank, Level
 from mauvecl.lightcurve.search.counted_rate import CountedRate, consecutive_alarm_rate, consecutive_alarms
 from mauvecl.lightcurve.search.importance_sampling import LADDER, sample_rate
-from mauvecl.lightcurve.search.scatter import Scatter
 from mauvecl.lightcurve.search.search import Search
+from mauvecl.lightcurve.search.unknown_shifts import Scatter
 from mauvecl.lightcurve.stares.curves import Sinusoid
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.study.searches import SearchChoice

@@ -12,13 +12,13 @@ from refusals import refused
 from scenes import instrument, star
 
 from mauvecl.device.engine import Engine
-from mauvecl.device.stares import Stares
-from mauvecl.lightcurve.stares import reference
-from mauvecl.lightcurve.stares.components import Components
-from mauvecl.lightcurve.stares.requests import StaresRequest
-from mauvecl.lightcurve.stares.scene import Flares, StareScene
+from mauvecl.device.stare_engine import Stares
+from mauvecl.lightcurve.stares import stare_reference
+from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.lightcurve.stares.sums import SumTable
+from mauvecl.lightcurve.stares.stare_requests import StaresRequest
+from mauvecl.lightcurve.stares.stare_scene import Flares, StareScene
+from mauvecl.lightcurve.stares.sum_cumulants import SumTable
 from mauvecl.noise.processes import CosmicRays, Processes
 from mauvecl.results.requests.requests import Shard
 
@@ -80,7 +80,9 @@ def test_stares_are_the_twins(stares: Stares, name: str, method: Any) -> None:
     flares = Flares.of(components, stare, flare, amplitudes, COUNT)
     numbers = np.arange(FIRST, FIRST + COUNT, dtype=np.uint64)
     frames = range(0, stare.n_frames, 1 if method == "cumulants" else 6)
-    ours = {"pixels": reference.pixels, "cumulants": reference.sums}[method](scene, flares, numbers, frames, SEED)
+    ours = {"pixels": stare_reference.pixels, "cumulants": stare_reference.sums}[method](
+        scene, flares, numbers, frames, SEED
+    )
     np.testing.assert_array_equal(found[..., list(frames), :], ours if amplitudes is not None else ours[0])
     assert found.std() > 0
     assert SumTable.of(components).fourths == ("fourth" in name)
@@ -136,7 +138,7 @@ def test_what_flares_need_is_the_twins(stares: Stares, name: str, method: Any) -
     found = stares.reduced(asked)
     numbers, frames = np.arange(FIRST, FIRST + COUNT, dtype=np.uint64), range(stare.n_frames)
     np.testing.assert_array_equal(
-        found["glow"], reference.glow(StareScene.of(components, stare), numbers, frames, SEED)
+        found["glow"], stare_reference.glow(StareScene.of(components, stare), numbers, frames, SEED)
     )
     whole = stares.frames(components, stare, first=FIRST, count=COUNT, seed=SEED, method=method)
     np.testing.assert_array_equal(found["values"], whole)

@@ -82,11 +82,11 @@ from mauvecl.noise import unknowns
 unknowns.ADDITIVE["bursts"] = Bursts
 from mauvecl import Engine, Study
 from mauvecl.device.selftest import toy
-from mauvecl.device.stares import Stares
-from mauvecl.lightcurve.stares.components import Components
-from mauvecl.lightcurve.stares.scene import Flares, StareScene
+from mauvecl.device.stare_engine import Stares
+from mauvecl.lightcurve.stares.frame_components import Components
+from mauvecl.lightcurve.stares.stare_scene import Flares, StareScene
 from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.lightcurve.stares import reference as twin
+from mauvecl.lightcurve.stares import stare_reference as twin
 from mauvecl.noise import reference
 from mauvecl.noise.components import components
 from mauvecl.noise.processes import NONE, CosmicRays, Processes

@@ -17,7 +17,7 @@ from mauvecl.answers.measurements.measure import measure
 from mauvecl.answers.signal.snr import snr
 from mauvecl.answers.stares.inject import inject
 from mauvecl.device.engine import Engine
-from mauvecl.device.stares import Stares
+from mauvecl.device.stare_engine import Stares
 from mauvecl.pictures import answers, injections, measurements
 from mauvecl.pictures.registry import pictures_of
 from mauvecl.study.parts import First, note_of, part_note

@@ -15,7 +15,7 @@ from mauvecl.device.engine import Engine
 from mauvecl.pictures import answers as pictures
 from mauvecl.results.detection.detection import Detection
 from mauvecl.results.requests.requests import DetectRequest, Shard
-from mauvecl.results.sums import DetectionSums, pack_detection
+from mauvecl.results.shard_sums import DetectionSums, pack_detection
 
 PAYLOAD = instrument(part=True, output_min_nm=300.0, output_max_nm=340.0)
 KIND = {"realisations": 20_000, "seed": 4, "statistics": ("chi2", "chi2_element", "matched", "paper")}

@@ -17,7 +17,7 @@ from refusals import refused
 from mauvecl import Engine, Expectation, Instrument, Nuisances, Source, expect
 from mauvecl.host.stars.flare_spectra import LINES_NM, BalmerFlare, ObservedFlare
 from mauvecl.results.measurements.fit import fit, fit_sums, forecast
-from mauvecl.results.measurements.model import FlareModel
+from mauvecl.results.measurements.flare_model import FlareModel
 from mauvecl.results.measurements.reduction import Reduction, drawn_sums
 
 MAUVE = Instrument.load("mauve")

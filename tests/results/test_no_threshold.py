@@ -14,7 +14,7 @@ from mauvecl.answers.detection.maps import detection_map
 from mauvecl.answers.limits.search import LimitSearch
 from mauvecl.device.engine import Engine
 from mauvecl.host.expectation import Expectation
-from mauvecl.results.requests.fap import NoThresholdError
+from mauvecl.results.requests.fap_checks import NoThresholdError
 from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 

@@ -29,7 +29,7 @@ from typer.testing import CliRunner
 from mauvecl import Study, measure
 from mauvecl.cli.app import app
 from mauvecl.device.engine import DeviceError, Engine
-from mauvecl.device.stares import Stares
+from mauvecl.device.stare_engine import Stares
 from mauvecl.host.expectation import Expectation
 from mauvecl.results.requests.requests import RealiseRequest, Shard
 from mauvecl.runs.cluster import DaskWorkers

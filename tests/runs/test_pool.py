@@ -30,7 +30,7 @@ from mauvecl.noise.drawing import Drawing
 from mauvecl.noise.processes import Processes, Uniform
 from mauvecl.results.detection.detection import Detection
 from mauvecl.results.requests.requests import DetectRequest, Shard, SnrRequest
-from mauvecl.results.sums import Arrays
+from mauvecl.results.shard_sums import Arrays
 from mauvecl.runs import shards
 from mauvecl.runs.checkpoint import Checkpoint, _digest_of
 from mauvecl.runs.pool import LocalWorkers, Pool, Stopped, map_in_order

@@ -15,8 +15,8 @@ from scenes import N_STARES as N
 from scenes import flaring_stares as request
 
 from mauvecl.device.engine import Engine
-from mauvecl.device.stares import Stares
-from mauvecl.lightcurve.stares.components import Components
+from mauvecl.device.stare_engine import Stares
+from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.runs import shards
 from mauvecl.runs.checkpoint import Checkpoint

@@ -18,7 +18,7 @@ from mauvecl import Engine, Study, measure
 from mauvecl.answers.campaigns import planned_injections
 from mauvecl.answers.campaigns.plan import plan
 from mauvecl.answers.stares import stare as stares_module
-from mauvecl.device.stares import Stares
+from mauvecl.device.stare_engine import Stares
 from mauvecl.runs.checkpoint import Checkpoint, kept
 from mauvecl.runs.pool import LocalWorkers, Pool
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mauvecl.store import form as store
+from mauvecl.store import layout as store
 
 
 @pytest.fixture(autouse=True)

@@ -23,12 +23,12 @@ from typer.testing import CliRunner
 
 from mauvecl.cli.app import app
 from mauvecl.device.engine import Engine
-from mauvecl.host.files import whole
-from mauvecl.runs.durable import locked
+from mauvecl.host.files import atomic
+from mauvecl.runs.locks import locked
 from mauvecl.store import bulk
-from mauvecl.store import form as store
+from mauvecl.store import layout as store
 from mauvecl.store.export import Selection, _study, export
-from mauvecl.store.form import Store
+from mauvecl.store.layout import Store
 from mauvecl.study.cases import cases
 from mauvecl.study.study import Study
 
@@ -264,7 +264,7 @@ def test_a_kill_at_every_step_of_writing(tmp_path: Path, monkeypatch: pytest.Mon
             return wrapped
 
         def run(path: Path = path, mortal: Any = mortal) -> None:
-            whole.os.fsync = mortal(os.fsync)  # type: ignore[attr-defined]
+            atomic.os.fsync = mortal(os.fsync)  # type: ignore[attr-defined]
             Path.replace = mortal(Path.replace)  # type: ignore[method-assign]
             Store.note = mortal(Store.note)  # type: ignore[method-assign]
             bulk.realise(study(200), path, Painter())  # type: ignore[arg-type]

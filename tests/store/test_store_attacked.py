@@ -18,11 +18,11 @@ from stores import CHUNK, Painter, flip, forked, killed, study, tree
 from typer.testing import CliRunner
 
 from mauvecl.cli.app import app
-from mauvecl.runs.durable import locked
+from mauvecl.runs.locks import locked
 from mauvecl.store import bulk
 from mauvecl.store.description import signed
 from mauvecl.store.export import Selection
-from mauvecl.store.form import Store
+from mauvecl.store.layout import Store
 
 
 class Seeded(Painter):

@@ -9,8 +9,8 @@ from refusals import refused
 
 from mauvecl.answers.campaigns.plan import plan
 from mauvecl.device.engine import Engine
-from mauvecl.device.stares import Stares
-from mauvecl.lightcurve.stares.components import Components
+from mauvecl.device.stare_engine import Stares
+from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.noise.unknowns import ADDITIVE, PROCESSES
 from mauvecl.study.cases import cases
 from mauvecl.study.study import Study

@@ -37,7 +37,7 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
-    from mauvecl.device.stares import Stares
+    from mauvecl.device.stare_engine import Stares
     from mauvecl.host.expectation import Expectation
     from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use
@@ -369,7 +369,7 @@ def _completeness(question: PlanQuestion, engine: Stares | Pool | None) -> Compl
     from mauvecl.answers.campaigns.planned_injections import inject_target
 
     if engine is None:
-        from mauvecl.device.stares import Stares as Default
+        from mauvecl.device.stare_engine import Stares as Default
 
         engine = Default()
     return partial(inject_target, engine=engine)

@@ -18,8 +18,8 @@ from mauvecl.study.searches import InjectionQuestion
 from mauvecl.study.stare_section import CurveText
 
 if TYPE_CHECKING:
-    from mauvecl.device.stares import Stares
-    from mauvecl.results.sums import Arrays
+    from mauvecl.device.stare_engine import Stares
+    from mauvecl.results.shard_sums import Arrays
 
 Float = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.campaigns.calendars import Entry, calendar_bytes
-from mauvecl.host.orbit.bodies import Bodies
 from mauvecl.host.orbit.season import elongation_deg, zodiacal_light
+from mauvecl.host.orbit.sun_and_moon import Bodies
 from mauvecl.host.orbit.targets import Target
 from mauvecl.host.orbit.time_grid import TimeGrid
 from mauvecl.host.orbit.visibility import Visibility, Windows

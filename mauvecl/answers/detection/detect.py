@@ -17,10 +17,10 @@ from mauvecl.results.detection import departures
 from mauvecl.results.detection.campaign import campaign, per_test
 from mauvecl.results.detection.departures import departure_table
 from mauvecl.results.detection.detection import COLUMNS, Detection
-from mauvecl.results.detection.paper import PAPER_G2V, WHY, reconstruct
+from mauvecl.results.detection.paper_chi2 import PAPER_G2V, WHY, reconstruct
 from mauvecl.results.detection.roc import AREA_COLUMNS, ROC_ROWS
 from mauvecl.results.detection.roc import COLUMNS as ROC_COLUMNS
-from mauvecl.results.requests.fap import check_fap, countable
+from mauvecl.results.requests.fap_checks import check_fap, countable
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
-from mauvecl.results.requests.fap import check_fap
+from mauvecl.results.requests.fap_checks import check_fap
 from mauvecl.schema.calls import validated
 from mauvecl.schema.tables import Column, View, table_of
 from mauvecl.statistics.intervals import Interval

@@ -12,7 +12,7 @@ from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import Cost, cost_lines, marginal_lines, unknown_cost
 from mauvecl.answers.limits.assumptions import assumption_columns
 from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle, single_flares
-from mauvecl.results.requests.fap import check_fap
+from mauvecl.results.requests.fap_checks import check_fap
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import INTERVAL, Column, View, interval, records, table_of

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import InCell
 from mauvecl.answers.measurements.expected import models_of
-from mauvecl.lightcurve.stares.measured import MeasuredBins, fit_bins, measure_along
-from mauvecl.lightcurve.stares.requests import Arrays, StaresRequest
+from mauvecl.lightcurve.stares.measured_bins import MeasuredBins, fit_bins, measure_along
+from mauvecl.lightcurve.stares.stare_requests import Arrays, StaresRequest
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool
 from mauvecl.schema.errors import InputError
@@ -19,7 +19,7 @@ from mauvecl.schema.errors import InputError
 if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
     from mauvecl.lightcurve.flares.events import Event
-    from mauvecl.lightcurve.stares.components import Components
+    from mauvecl.lightcurve.stares.frame_components import Components
     from mauvecl.lightcurve.stares.light_curves import StareExpectation
     from mauvecl.study.cases import Case
 
@@ -51,7 +51,7 @@ def measured_stare(case: Case, engine: Engine | Pool, snr_per_bin: float) -> Mea
                                 processes=processes)  # fmt: skip
         if isinstance(engine, Pool):
             return np.asarray(engine.stares(request)["values"][0], np.float64)
-        from mauvecl.device.stares import Stares
+        from mauvecl.device.stare_engine import Stares
 
         return np.asarray(Stares(engine.open_device).reduced(request)["values"][0], np.float64)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mauvecl.answers.answer import InCell
 from mauvecl.answers.measurements.truth import Truth
 from mauvecl.results.measurements.fit import LEVELS, Forecast, Measurement, fit, forecast
-from mauvecl.results.measurements.model import FlareModel
+from mauvecl.results.measurements.flare_model import FlareModel
 from mauvecl.results.measurements.reduction import Reduction, variance_of
 from mauvecl.study.measurements import fitted_models
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.measurements.along import MeasuredStare, measured_stare
 from mauvecl.answers.measurements.expected import ExpectedMeasurement, expected_measurements, matched_filter
-from mauvecl.lightcurve.stares.measured import MeasuredBins
+from mauvecl.lightcurve.stares.measured_bins import MeasuredBins
 from mauvecl.results.measurements.fit import LEVELS, Measurement, fit
 from mauvecl.results.measurements.reduction import variance_of
 from mauvecl.runs.checkpoint import kept
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
-    from mauvecl.results.sums import Arrays
+    from mauvecl.results.shard_sums import Arrays
     from mauvecl.study.assumptions import Use
 
 Float = NDArray[np.float64]

@@ -16,7 +16,7 @@ from mauvecl.lightcurve.search.counted_rate import CountedRate, consecutive_alar
 from mauvecl.lightcurve.search.fit_accuracy import FitAccuracy, Refit
 from mauvecl.lightcurve.search.injected_completeness import InjectedCompleteness
 from mauvecl.lightcurve.search.injections import Injections
-from mauvecl.lightcurve.stares.requests import Arrays
+from mauvecl.lightcurve.stares.stare_requests import Arrays
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -33,9 +33,9 @@ from mauvecl.study.surveys import Sizes, StarSurvey, injected_sizes
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
-    from mauvecl.device.stares import Stares
+    from mauvecl.device.stare_engine import Stares
     from mauvecl.host.expectation import Expectation
-    from mauvecl.lightcurve.stares.requests import StaresRequest
+    from mauvecl.lightcurve.stares.stare_requests import StaresRequest
     from mauvecl.study.assumptions import Use
 
 Float = NDArray[np.float64]
@@ -270,7 +270,7 @@ def inject(
             f"the sweep has the quantity {idle!r}, which injections have none of", "another", key="sweep", value=idle
         )
     if engine is None:
-        from mauvecl.device.stares import Stares as Default
+        from mauvecl.device.stare_engine import Stares as Default
 
         engine = Default()
     prepared = cases(study)

@@ -32,11 +32,11 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
-    from mauvecl.device.stares import Stares
+    from mauvecl.device.stare_engine import Stares
     from mauvecl.host.expectation import Expectation
     from mauvecl.lightcurve.search.blends import Factor
     from mauvecl.lightcurve.search.flare_fit import FittedFlares
-    from mauvecl.results.sums import Arrays
+    from mauvecl.results.shard_sums import Arrays
     from mauvecl.runs.checkpoint import Checkpoint
     from mauvecl.study.assumptions import Use
 
@@ -372,7 +372,7 @@ def stare(
     # Bad input is refused before anything is drawn.
     quiet = [case.stare_expectation.quiet for case in prepared]
     if engine is None:
-        from mauvecl.device.stares import Stares as Default
+        from mauvecl.device.stare_engine import Stares as Default
 
         engine = Default()
     drawn: list[StarStare] = []

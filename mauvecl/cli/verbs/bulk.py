@@ -16,7 +16,7 @@ from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
     from mauvecl.cli.session import Session
-    from mauvecl.store.form import Store
+    from mauvecl.store.layout import Store
     from mauvecl.study.study import Study
 
 StoreArgument = Annotated[Path, typer.Argument(help="Store that `mauvecl realise` wrote.")]
@@ -50,7 +50,7 @@ def realise(study: Study, session: Session) -> None:
     from mauvecl.schema.errors import InputError
     from mauvecl.store import bulk
     from mauvecl.store.export import ENDINGS
-    from mauvecl.store.form import Store
+    from mauvecl.store.layout import Store
 
     place = session.output or Path("mauvecl-frames.zarr")
     one_file = place.suffix in ENDINGS
@@ -204,7 +204,7 @@ def export(
     from mauvecl.cli.console import show
     from mauvecl.store.export import Selection
     from mauvecl.store.export import export as write
-    from mauvecl.store.form import Store
+    from mauvecl.store.layout import Store
 
     write(Selection.of(Store.open(store), array, _rows_of(rows)), file, replace=replace)
     if not quiet:

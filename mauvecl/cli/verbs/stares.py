@@ -21,7 +21,7 @@ def stare(
 ) -> None:
     """Draw stares on one device, which keeps their frames for a resume."""
     from mauvecl.answers.stares.stare import stare as compute
-    from mauvecl.device.stares import Stares
+    from mauvecl.device.stare_engine import Stares
     from mauvecl.schema.errors import InputError
 
     if given["energy"] and (given["amplitude"] or given["flares"]):

@@ -29,8 +29,8 @@ from mauvecl.schema.physical import DAY_S
 from mauvecl.statistics.intervals import CONFIDENCE, Interval
 
 if TYPE_CHECKING:
-    from mauvecl.lightcurve.search.scatter import Scatter
     from mauvecl.lightcurve.search.search import Search
+    from mauvecl.lightcurve.search.unknown_shifts import Scatter
 
 Float = NDArray[np.float64]
 

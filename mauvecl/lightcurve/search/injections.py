@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from mauvecl.lightcurve.search.fit_accuracy import FIT_QUANTITIES, Refit
 from mauvecl.lightcurve.search.injection_sites import InjectionSite, sites_of
 from mauvecl.lightcurve.search.survey import select_frames, subtract_known
-from mauvecl.lightcurve.stares.components import STEADY, Components
-from mauvecl.lightcurve.stares.requests import Method, StaresRequest
-from mauvecl.lightcurve.stares.sums import method_for
+from mauvecl.lightcurve.stares.frame_components import STEADY, Components
+from mauvecl.lightcurve.stares.stare_requests import Method, StaresRequest
+from mauvecl.lightcurve.stares.sum_cumulants import method_for
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.schema.errors import InputError
 

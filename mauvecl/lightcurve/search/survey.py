@@ -10,17 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.lightcurve.search.importance_sampling import SampledRate, sample_rate
-from mauvecl.lightcurve.search.scatter import Scatter
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.search.trend import Trend
-from mauvecl.lightcurve.stares.requests import StaresRequest
-from mauvecl.lightcurve.stares.sums import method_for
+from mauvecl.lightcurve.search.unknown_shifts import Scatter
+from mauvecl.lightcurve.stares.stare_requests import StaresRequest
+from mauvecl.lightcurve.stares.sum_cumulants import method_for
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.schema.physical import DAY_S
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.search.bank import Bank
-    from mauvecl.lightcurve.stares.components import Components
+    from mauvecl.lightcurve.stares.frame_components import Components
     from mauvecl.lightcurve.stares.stare import Stare
     from mauvecl.noise.unknowns import Changing
 

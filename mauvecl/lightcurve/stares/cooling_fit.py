@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.lightcurve.flares.events import Cooling
 from mauvecl.lightcurve.flares.shapes import Shape, shape_of
-from mauvecl.lightcurve.stares.components import Components
-from mauvecl.lightcurve.stares.measured import checked_frames, known_strengths
+from mauvecl.lightcurve.stares.frame_components import Components
+from mauvecl.lightcurve.stares.measured_bins import checked_frames, known_strengths
 from mauvecl.results.measurements.fit import LEVELS, Measurement
 from mauvecl.results.measurements.profile import Profile
 from mauvecl.results.measurements.reduction import Reduction
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from mauvecl.host.expectation import Expectation
     from mauvecl.lightcurve.stares.stare import Stare
-    from mauvecl.results.measurements.model import FlareModel
+    from mauvecl.results.measurements.flare_model import FlareModel
     from mauvecl.statistics.nuisances import Nuisances
 
 Float = NDArray[np.float64]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.stares.components import MOST_STATISTICS, Components
+from mauvecl.lightcurve.stares.frame_components import MOST_STATISTICS, Components
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:

@@ -216,7 +216,7 @@ class Stare:
     @classmethod
     def along(cls, orbit: Orbit, target: Target | str, start: str, duration_s: Duration, **how: Any) -> Stare:
         """Return the stare along an orbit; see `along.stare_along`, which also returns the particle rate."""
-        from mauvecl.lightcurve.stares.along import stare_along
+        from mauvecl.lightcurve.stares.orbit_stare import stare_along
 
         return stare_along(orbit, target, start, duration_s, **how).stare
 

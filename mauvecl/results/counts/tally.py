@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.noise import layout
-from mauvecl.results.counts.far import UNIT_BITS, FarCounts, FarTally, SparseCounts, is_above
+from mauvecl.results.counts.sparse_counts import UNIT_BITS, FarCounts, FarTally, SparseCounts, is_above
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.intervals import Interval, central_counts
 

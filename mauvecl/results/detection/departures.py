@@ -12,7 +12,7 @@ from scipy import special
 
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.noise.unknowns import ADDITIVE
-from mauvecl.results.requests.fap import countable
+from mauvecl.results.requests.fap_checks import countable
 from mauvecl.schema.calls import validated
 from mauvecl.schema.tables import INTERVAL, Column, interval, percent, table_of
 from mauvecl.statistics.distributions import Form

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.drawable import Drawable
-from mauvecl.host.content import ContentEquality
+from mauvecl.host.content_equality import ContentEquality
 from mauvecl.results.counts.tally import Distribution, TailSamples, Tally
 from mauvecl.results.detection.roc import Roc
 from mauvecl.results.requests.channels import ChannelPlan, Key
-from mauvecl.results.requests.fap import NoThresholdError, Tails, check_atom, check_fap, countable
+from mauvecl.results.requests.fap_checks import NoThresholdError, Tails, check_atom, check_fap, countable
 from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.schema.calls import validated
 from mauvecl.schema.fields import Range

@@ -19,7 +19,7 @@ from scipy import special
 from mauvecl.noise import layout
 from mauvecl.noise.factor_distributions import quantile_at_score
 from mauvecl.noise.unknowns import ADDITIVE
-from mauvecl.results.requests.fap import check_atom
+from mauvecl.results.requests.fap_checks import check_atom
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.distributions import Form, Mixture, QuadraticForm
 from mauvecl.statistics.intervals import CONFIDENCE, Interval

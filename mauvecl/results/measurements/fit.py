@@ -10,8 +10,8 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.results.measurements.bounded import BoundedProfile, bounded_intervals, with_bounds
-from mauvecl.results.measurements.model import FlareModel, derived_values
+from mauvecl.results.measurements.flare_model import FlareModel, derived_values
+from mauvecl.results.measurements.nonnegative import BoundedProfile, bounded_intervals, with_bounds
 from mauvecl.results.measurements.profile import Profile, covariance, covariance_of, intervals
 from mauvecl.results.measurements.reduction import Reduction, check_distinct, usable_variance
 from mauvecl.schema.calls import validated
@@ -185,7 +185,7 @@ def fit(
     Examples
     --------
     >>> from mauvecl import Instrument, Source, expect
-    >>> from mauvecl.results.measurements.model import FlareModel
+    >>> from mauvecl.results.measurements.flare_model import FlareModel
     >>> from mauvecl.results.measurements.fit import fit
     >>> star, mauve = Source.from_library("M3V").at_magnitude(9), Instrument.load("mauve")
     >>> quiet, flare = (expect(s, mauve, exposure=50.0) for s in (star, star.flaring(0.5, 9000)))

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.results.measurements.model import derived_values
+from mauvecl.results.measurements.flare_model import derived_values
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-    from mauvecl.results.measurements.model import FlareModel
+    from mauvecl.results.measurements.flare_model import FlareModel
     from mauvecl.results.measurements.reduction import Reduction
 
 Float = NDArray[np.float64]

@@ -21,7 +21,7 @@ from mauvecl.statistics.nuisances import Nuisances, join_names
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
-    from mauvecl.results.measurements.model import FlareModel
+    from mauvecl.results.measurements.flare_model import FlareModel
 
 Float = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 """Fits of flares with two free temperatures.
 
 At each second temperature, taken from the model's, the flare is one blackbody with a further component of fixed shape,
-so that everything else is a fit of `results.measurements.bounded`. The second temperature is the higher one.
+so that everything else is a fit of `results.measurements.nonnegative`. The second temperature is the higher one.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.results.measurements.bounded import BoundedProfile, bounded_intervals
 from mauvecl.results.measurements.fit import LEVELS, Measurement, checked_excess, fit, variance_groups
-from mauvecl.results.measurements.model import Derived, FlareModel, derived_values
+from mauvecl.results.measurements.flare_model import Derived, FlareModel, derived_values
+from mauvecl.results.measurements.nonnegative import BoundedProfile, bounded_intervals
 from mauvecl.results.measurements.profile import Best
 from mauvecl.results.measurements.reduction import Reduction
 from mauvecl.schema.calls import validated

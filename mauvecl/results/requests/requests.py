@@ -16,7 +16,7 @@ from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingOptions
 from mauvecl.noise.scene import BATCH, Scene, prepare
 from mauvecl.results.requests.channels import ChannelPlan, plan_channels
-from mauvecl.results.requests.fap import Tails
+from mauvecl.results.requests.fap_checks import Tails
 from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.results.counts.far import FarCounts
+from mauvecl.results.counts.sparse_counts import FarCounts
 from mauvecl.results.counts.tally import TailSamples, Tally
 from mauvecl.results.detection.detection import Detection
 from mauvecl.results.requests.requests import DetectRequest, SnrRequest

@@ -1,4 +1,4 @@
-"""The rule of the rooms is held: imports that it forbids are found, wherever and however they are written."""
+"""The import contracts find every forbidden import, at module level, inside functions and for type checkers."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).parent.parent
-#: Who must not import whom: up, up for types alone, up inside a room, and OpenCL outside the device's room.
+#: Forbidden imports: upwards, upwards for types only, upwards inside a package, and pyopencl outside `device`.
 FORBIDDEN = {
     "noise/layout.py": ("import mauvecl.study.study", "mauvecl.noise.layout -> mauvecl.study.study"),
     "results/detection/roc.py": (
         "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from mauvecl.cli.app import main",
         "mauvecl.results.detection.roc -> mauvecl.cli.app",
     ),
-    "host/files/bounded.py": (
+    "host/files/size_limits.py": (
         "from mauvecl.host.stars.source import Source",
-        "mauvecl.host.files.bounded -> mauvecl.host.stars.source",
+        "mauvecl.host.files.size_limits -> mauvecl.host.stars.source",
     ),
     "results/counts/tally.py": (
         "from mauvecl.results.detection import roc",
@@ -35,8 +35,8 @@ FORBIDDEN = {
 }
 
 
-def test_forbidden_imports_are_found(tmp_path: Path) -> None:
-    """In a copy of the package with one more import in each of six files."""
+def test_forbidden_imports_fail_the_contracts(tmp_path: Path) -> None:
+    """Add one forbidden import to each of six files in a copy of the package."""
     pytest.importorskip("importlinter")
     sources = [path for path in (ROOT / "mauvecl").glob("*") if path.name != "__pycache__"]
     (tmp_path / "mauvecl").mkdir()
@@ -52,36 +52,36 @@ def test_forbidden_imports_are_found(tmp_path: Path) -> None:
     code = "from importlinter.cli import lint_imports; import sys; sys.exit(lint_imports(no_cache=True))"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 1, done.stdout + done.stderr
-    told = " ".join(done.stdout.split())
+    report = " ".join(done.stdout.split())
     for _, arrow in FORBIDDEN.values():
-        assert arrow in told
+        assert arrow in report
 
 
-def test_the_drawing_by_imports() -> None:
-    """Room by room no circle, at any depth, lazy imports and those for types among them; few rooms on few floors."""
+def test_packages_form_layers_without_cycles() -> None:
+    """Check every level of packages, including lazy imports and imports for types."""
     grimp = pytest.importorskip("grimp")
     graph = grimp.build_graph("mauvecl", cache_dir=None)
-    drawn = {room: floors(graph, room) for room in graph.modules if rooms_in(graph, room)}
-    assert len(drawn["mauvecl"]) <= 20
-    assert max(drawn["mauvecl"].values()) <= 11
+    layers = {package: layers_of(graph, package) for package in graph.modules if packages_in(graph, package)}
+    assert len(layers["mauvecl"]) <= 20
+    assert max(layers["mauvecl"].values()) <= 11
 
 
-def rooms_in(graph: Any, room: str) -> set[str]:
-    return {inner for inner in graph.find_children(room) if graph.find_children(inner)}
+def packages_in(graph: Any, package: str) -> set[str]:
+    return {inner for inner in graph.find_children(package) if graph.find_children(inner)}
 
 
-def floors(graph: Any, room: str) -> dict[str, int]:
-    """Of each room in this one; a circle raises CycleError."""
-    inside = {inner: {inner, *graph.find_descendants(inner)} for inner in rooms_in(graph, room)}
+def layers_of(graph: Any, package: str) -> dict[str, int]:
+    """Return the layer of each package inside this one; a cycle raises CycleError."""
+    inside = {inner: {inner, *graph.find_descendants(inner)} for inner in packages_in(graph, package)}
     below = {
         inner: {other for other in inside if other != inner and inside[other] & imported}
         for inner, files in inside.items()
         for imported in [set().union(*map(graph.find_modules_directly_imported_by, files))]
     }
-    floor: dict[str, int] = {}
+    layer: dict[str, int] = {}
     for inner in TopologicalSorter(below).static_order():
-        floor[inner] = 1 + max((floor[other] for other in below[inner]), default=0)
-    return floor
+        layer[inner] = 1 + max((layer[other] for other in below[inner]), default=0)
+    return layer
 
 
 def only_python(folder: str, names: list[str]) -> list[str]:

@@ -20,7 +20,7 @@ from mauvecl.results.measurements.profile import Best, Profile, extreme, tempera
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-    from mauvecl.results.measurements.model import FlareModel
+    from mauvecl.results.measurements.flare_model import FlareModel
     from mauvecl.results.measurements.reduction import Reduction
 
 Float = NDArray[np.float64]

@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.stares.components import STEADY, Components
-from mauvecl.lightcurve.stares.scene import Flares, StareScene, unique
+from mauvecl.lightcurve.stares.frame_components import STEADY, Components
+from mauvecl.lightcurve.stares.stare_scene import Flares, StareScene, unique
 from mauvecl.noise.cumulants import expansion_error
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.noise.unknowns import ADDITIVE
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
-    from mauvecl.lightcurve.stares.requests import Method
     from mauvecl.lightcurve.stares.stare import Stare
+    from mauvecl.lightcurve.stares.stare_requests import Method
 
 Float = NDArray[np.float64]
 Floats = NDArray[np.float32]

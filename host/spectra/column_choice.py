@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
-from .roles import Role
+from .column_roles import Role
 
 #: Most names that a message lists.
 MAX_LISTED = 12

@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.files.bounded import read_bytes
-from mauvecl.host.files.parsed import toml
-from mauvecl.host.files.whole import UNFINISHED, write_whole
-from mauvecl.runs.durable import differing_keys
+from mauvecl.host.files.atomic import UNFINISHED, write_whole
+from mauvecl.host.files.parsing import toml
+from mauvecl.host.files.size_limits import read_bytes
+from mauvecl.runs.locks import differing_keys
 from mauvecl.schema.errors import InputError
 from mauvecl.store.description import describe, study_in
 from mauvecl.study.cases import cases

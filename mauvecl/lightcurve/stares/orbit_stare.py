@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mauvecl.host.orbit.conditions import Particles, Thermal
 from mauvecl.host.orbit.constraints import sunlight
-from mauvecl.host.orbit.limits import Limits
+from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.host.orbit.orbit import Orbit, Track
 from mauvecl.host.orbit.targets import Target
 from mauvecl.host.orbit.time_grid import TimeGrid

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from mauvecl.device.device import Device
 from mauvecl.device.stare_launches import StareLaunches
 from mauvecl.device.tiles import Progress, Tile, Tiles
-from mauvecl.lightcurve.stares.components import Components
-from mauvecl.lightcurve.stares.requests import Arrays, KeepStatistics, Method, StareNumber, StaresRequest, joined
-from mauvecl.lightcurve.stares.scene import Flares, StareScene, padded_frames
+from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.lightcurve.stares.sums import check_sums
+from mauvecl.lightcurve.stares.stare_requests import Arrays, KeepStatistics, Method, StareNumber, StaresRequest, joined
+from mauvecl.lightcurve.stares.stare_scene import Flares, StareScene, padded_frames
+from mauvecl.lightcurve.stares.sum_cumulants import check_sums
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.results.requests.requests import Shard
 from mauvecl.schema.calls import validated
@@ -54,8 +54,8 @@ class Stares:
     --------
     >>> import numpy as np
     >>> from mauvecl import Instrument, Source, expect
-    >>> from mauvecl.device.stares import Stares
-    >>> from mauvecl.lightcurve.stares.components import Components
+    >>> from mauvecl.device.stare_engine import Stares
+    >>> from mauvecl.lightcurve.stares.frame_components import Components
     >>> from mauvecl.lightcurve.stares.stare import Stare
     >>> star, mauve = Source.from_library("G2V").at_magnitude(7.4), Instrument.load("mauve")
     >>> quiet, flare = (expect(s, mauve, exposure=5.0) for s in (star, star.flaring(1.0)))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mauvecl.noise import layout
 from mauvecl.noise.cumulants import Cumulants
-from mauvecl.noise.factors import Factors
+from mauvecl.noise.factor_tables import Factors
 from mauvecl.noise.poisson import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, table_set
 from mauvecl.schema.errors import InputError
 

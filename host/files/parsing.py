@@ -14,7 +14,7 @@ from typing import Any
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import printable, shortened
 
-from .bounded import read_bytes
+from .size_limits import read_bytes
 
 #: Sizes that a number of a user may have, apart from 0: products of several stay within double precision.
 SMALLEST, LARGEST = 1e-30, 1e30

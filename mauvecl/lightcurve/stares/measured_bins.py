@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.host.expectation import Expectation
-    from mauvecl.results.measurements.model import FlareModel
+    from mauvecl.results.measurements.flare_model import FlareModel
     from mauvecl.statistics.nuisances import Nuisances
 
 Float = NDArray[np.float64]

@@ -8,9 +8,9 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.stares.components import STEADY
-from mauvecl.lightcurve.stares.scene import Flares, StareScene, unique
-from mauvecl.lightcurve.stares.sums import SumTable
+from mauvecl.lightcurve.stares.frame_components import STEADY
+from mauvecl.lightcurve.stares.stare_scene import Flares, StareScene, unique
+from mauvecl.lightcurve.stares.sum_cumulants import SumTable
 from mauvecl.noise import layout, reference
 from mauvecl.noise.reference import MAGIC, combine_factors, fma, four_normals
 

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.stares.components import MOST_STATISTICS, STEADY, Components
+from mauvecl.lightcurve.stares.frame_components import MOST_STATISTICS, STEADY, Components
 from mauvecl.noise import layout
 from mauvecl.noise.cumulants import Cumulants, joint_is_exact
-from mauvecl.noise.pixels import padded
+from mauvecl.noise.pixel_tables import padded
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.noise.scene import Scene, prepare
 from mauvecl.schema.errors import InputError

@@ -10,9 +10,9 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.stares.components import Components
-from mauvecl.lightcurve.stares.scene import Flares
+from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.lightcurve.stares.stare_scene import Flares
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.results.requests.requests import Countable
 from mauvecl.schema.calls import validated

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
 
-from .range import MIN_MEASURED, NEEDED_NM, SPAN_NM, is_gap, likely_unit, measured_part
-from .scatter import point_noise
-from .values import BRIGHTEST, FAINTEST, check_values
+from .number_check import BRIGHTEST, FAINTEST, check_values
+from .point_noise import point_noise
+from .wavelength_range import MIN_MEASURED, NEEDED_NM, SPAN_NM, is_gap, likely_unit, measured_part
 
 if TYPE_CHECKING:
-    from ..instrument.line import Line
+    from ..instrument.line_spread import Line
 
 Float = NDArray[np.float64]
 
@@ -173,7 +173,7 @@ def remarks(wavelength: Float, flux: Float) -> tuple[str, ...]:
 @cache
 def _nominal_line() -> Line:
     from ..instrument.instrument import Instrument
-    from ..instrument.line import Line
+    from ..instrument.line_spread import Line
 
     return Line.of(Instrument.load("mauve"))
 

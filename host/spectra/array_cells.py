@@ -11,7 +11,7 @@ import numpy as np
 
 from mauvecl.schema.errors import InputError
 
-from .choice import Choice, listed, plain
+from .column_choice import Choice, listed, plain
 from .file_table import FileTable
 
 #: Columns that divide one spectrum over several rows: detector segments and echelle orders.
