@@ -300,9 +300,7 @@ def test_recovered_flares(half_width, snr):
     sums = rng.standard_normal((n, stare.n_frames, response.size)) + course[:, :, None] * response + 3.0
     sums += 0.01 * stare.start_s[:, None]
     start = one.search.largest(sums)
-    found = Fit(one.bank, templates).recover(
-        sums, stare.start_s, peak_s=start.peak_s, half_width_s=start.half_width_s, temperature_k=12_000.0
-    )
+    found = Fit(one.bank, templates).recover(sums, stare.start_s, peak_s=start.peak_s, half_width_s=start.half_width_s)
     duration = amplitude * half_width * DAVENPORT.equivalent_duration
     pulls = {
         "peak": (found.peak_s - peaks) / found.peak_error_s,

@@ -159,7 +159,7 @@ def test_flares_are_what_they_are_without_a_drift(drifting, size):
         net = (plain if drift is None else one).net(sums)
         values.append(one.search.largest(net).maximum[0])
         found = fit.recover(
-            net, one.stare.start_s, peak_s=[peak], half_width_s=[width], temperature_k=[10_000.0],
+            net, one.stare.start_s, peak_s=[peak], half_width_s=[width],
             variance=one.search.variance,
         )  # fmt: skip
         energies.append(found.equivalent_duration_s[0])

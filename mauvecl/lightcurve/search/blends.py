@@ -16,8 +16,6 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.search.flare_fit import Fit
-
 if TYPE_CHECKING:
     from mauvecl.lightcurve.search.bank import Bank
     from mauvecl.lightcurve.search.search import Search
@@ -112,11 +110,6 @@ class StareSums:
     net: Float  # sums less their known means, shape (n_frame, n_sum)
 
     @cached_property
-    def response(self) -> tuple[Any, Any, float, float]:
-        """Sums of a flare of unit amplitude as a function of log temperature, their derivative, and its range."""
-        return Fit(self.survey.bank, self.templates).response
-
-    @cached_property
     def edges(self) -> Float:
         """Start and end of each frame, s, shape (n_frame, 2)."""
         start = self.survey.stare.start_s
@@ -135,11 +128,11 @@ class StareSums:
     @cached_property
     def bounds(self) -> tuple[Float, Float]:
         """Bounds of a flare's parameters, from the stare, the bank and the templates, shape (4,) each."""
-        widths, (_, _, coolest, hottest) = self.survey.bank.half_widths_s, self.response
+        widths, kelvin = self.survey.bank.half_widths_s, self.templates.mean_sums.log_k
         first, last = self.edges[0, 0], self.edges[-1, 1]
         narrow, wide = np.log(widths[0] / BEYOND_BANK), np.log(widths[-1] * BEYOND_BANK)
         low, high = LOG_AMPLITUDES
-        return np.array([low, first, narrow, coolest]), np.array([high, last, wide, hottest])
+        return np.array([low, first, narrow, kelvin[0]]), np.array([high, last, wide, kelvin[-1]])
 
     def frames(self, first_s: float, last_s: float) -> slice:
         """Return the frames that overlap a time interval."""
@@ -156,7 +149,7 @@ class StareSums:
         """Return the mean sums of flares in some frames, shape (n_frame, n_sum)."""
         total = np.zeros_like(self.net)[frames]
         for one, inside, mean in self._shining(theta, frames):
-            total[inside] += mean[:, None] * self.response[0](np.array([one[KELVIN]]))[0]
+            total[inside] += mean[:, None] * self.templates.mean_sums.spline(one[KELVIN])
         return total
 
     def noise(self, theta: Float, light: Float, frames: slice = slice(None)) -> Float:
@@ -251,7 +244,7 @@ class Block:
     def model(self, theta: Float) -> tuple[Float, Float]:
         """Return the whitened flux less its projection on the baseline, (n_row,), and derivatives, (n_row, n, 4)."""
         edges, light = self.sums.edges[self.used], self.sums.survey.stare.light[self.used]
-        shape, (value, slope, _, _) = self.sums.survey.bank.shape, self.sums.response
+        shape, spline = self.sums.survey.bank.shape, self.sums.templates.mean_sums.spline
         derivatives = np.zeros((self.data.size, len(theta), 4))
         for k, one in enumerate(theta):
             width, amplitude = np.exp(one[WIDTH]), np.exp(one[AMPLITUDE])
@@ -260,11 +253,10 @@ class Block:
             ends = shape.at(tau) * (width / (edges[:, 1] - edges[:, 0]))[:, None]
             later = (ends[:, 0] - ends[:, 1]) / width
             wider = mean - (tau[:, 1] * ends[:, 1] - tau[:, 0] * ends[:, 0])
-            kelvin = np.array([one[KELVIN]])
-            along = self.whiten @ value(kelvin)[0]
+            along = self.whiten @ spline(one[KELVIN])
             time = amplitude * light * np.array([mean, later, wider])
             rows = time[:, :, None] * along
-            hotter = time[0][:, None] * (self.whiten @ slope(kelvin)[0])
+            hotter = time[0][:, None] * (self.whiten @ spline(one[KELVIN], 1))
             derivatives[:, k] = np.stack([*rows, hotter]).reshape(4, -1).T
         flat = derivatives.reshape(self.data.size, -1)
         flat = flat - self.basis @ (self.basis.T @ flat)

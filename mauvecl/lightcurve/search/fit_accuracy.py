@@ -36,12 +36,6 @@ class Refit:
     temperature_k: float  # temperature of the injected flares
     count: int  # number of stares per peak time with fits, the first ones
 
-    @property
-    def kelvin(self) -> Float:
-        """Temperatures of the bank, shape (n_temperature,)."""
-        templates = self.fit.templates
-        return np.array(templates.temperatures_k)[list(templates.chosen)]
-
     def compared(self, recovered: FittedFlares, amplitude: Float, site: InjectionSite) -> dict[str, NDArray[Any]]:
         """Compare fits with the injected flares, by the names of `FIT_QUANTITIES`, shape (n_amplitude,) each."""
         duration = amplitude * site.half_width_s * self.fit.bank.shape.equivalent_duration

@@ -1,19 +1,21 @@
 """Fits of single flares: peak, amplitude, half-width, temperature and equivalent duration, with standard errors.
 
-Least squares from the template that detected the flare, with the baseline of the search (Levenberg 1944, doi
-10.1090/qam/10666; Marquardt 1963, doi 10.1137/0111030); errors from the inverse of the information. Amplitudes of
+For a given peak and half-width, the frames under the shape add up to one measurement of the flare's spectrum, of which
+`results.measurements` finds amplitude and temperature. Peak and half-width follow by least squares from the template
+that detected the flare, with the baseline of the search (Levenberg 1944, doi 10.1090/qam/10666; Marquardt 1963, doi
+10.1137/0111030; Golub & Pereyra 1973, doi 10.1137/0710036); errors from the inverse of the information. Amplitudes of
 flares near the threshold are biased high, because noise contributes to their detection; fits do not correct for that.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
+
+from mauvecl.results.measurements.profile import Profile
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.search.bank import Bank
@@ -65,17 +67,6 @@ class Fit:
     bank: Bank
     templates: Templates
 
-    @cached_property
-    def response(self) -> tuple[Any, Any, float, float]:
-        """Sums of a flare of unit amplitude as a function of log temperature, their derivative, and its range."""
-        logs = np.log(self.templates.temperatures_k)
-        if logs.size == 1:
-            row = self.templates.directions[0]
-            ends = float(logs[0]), float(logs[0])
-            return (lambda x: np.tile(row, (np.size(x), 1))), (lambda x: np.zeros((np.size(x), row.size))), *ends
-        spline = scipy.interpolate.CubicSpline(logs, self.templates.directions)
-        return spline, spline.derivative(), float(logs[0]), float(logs[-1])
-
     def recover(
         self,
         sums: NDArray[Any],
@@ -83,7 +74,6 @@ class Fit:
         *,
         peak_s: ArrayLike,
         half_width_s: ArrayLike,
-        temperature_k: ArrayLike,
         variance: Float | None = None,
         curves: Float | None = None,
     ) -> FittedFlares:
@@ -94,7 +84,7 @@ class Fit:
         sums : ndarray, shape (n, n_frame, n_sum)
             Sums less their known mean.
         start_s : ndarray, shape (n_frame,)
-        peak_s, half_width_s, temperature_k : array_like, shape (n,)
+        peak_s, half_width_s : array_like, shape (n,)
             Starting points, such as those of the template that detected each flare.
         variance : ndarray, shape (n_frame,), optional
             Variance of each frame's sums; 1 by default.
@@ -102,10 +92,7 @@ class Fit:
             Baseline curves; see `Search`.
         """
         n = len(sums)
-        peak, log_width, log_kelvin = (
-            np.array(np.broadcast_to(np.asarray(value, np.float64), n))
-            for value in (peak_s, np.log(half_width_s), np.log(temperature_k))
-        )
+        peak, log_width = (np.array(np.broadcast_to(value, n), np.float64) for value in (peak_s, np.log(half_width_s)))
         several = max(1, int(np.exp(log_width.min()) / self.bank.frame_s / FINE)) if n else 1
         sums, start_s, variance, curves = self._averaged(several, sums, start_s, variance, curves)
         weight, level = self._windows(start_s, peak, np.exp(log_width), variance, curves)
@@ -113,9 +100,6 @@ class Fit:
         weight, level, start_s = weight[:, used], level[:, used], start_s[used]
         edges = np.column_stack([start_s, start_s + several * self.bank.frame_s])
         y = _remove_baseline(np.asarray(sums[:, used], np.float64), weight, level)
-        response, slope, coolest, hottest = self.response
-        log_kelvin = np.clip(log_kelvin, coolest, hottest)
-        amplitude = np.full(n, np.nan)
 
         def inner_products(peak: Float, log_width: Float) -> tuple[Float, Float]:
             """Return products of shape and derivatives with each other, (n, 3, 3), and with the sums, (n, 3, K)."""
@@ -131,43 +115,48 @@ class Fit:
             weighted = three * weight[:, :, None]
             return np.einsum("nti,ntj->nij", weighted, three), np.einsum("nti,ntk->nik", weighted, y)
 
-        def fitted(products: tuple[Float, Float], log_kelvin: Float) -> tuple[Float, Float]:
-            """Return the best amplitude, and the fall of chi-squared."""
-            r = response(log_kelvin)
-            along = np.einsum("nk,nk->n", products[1][:, 0], r)
-            power = products[0][:, 0, 0] * np.einsum("nk,nk->n", r, r)
-            best = np.maximum(along / np.maximum(power, 1e-300), 1e-12)
-            return best, 2 * best * along - best**2 * power
-
         products = inner_products(peak, log_width)
-        amplitude, gain = fitted(products, log_kelvin)
+        log_kelvin, amplitude, gain = self._brightest(products)
         damping = np.full(n, DAMPING)
         going = np.ones(n, np.bool_)
         for _ in range(STEPS):
-            information, pull = self._normal(products, amplitude, response(log_kelvin), slope(log_kelvin))
+            information, pull = self._normal(products, amplitude, log_kelvin)
             diagonal = np.einsum("nii->ni", information)
             damped = information + (damping[:, None] * diagonal + 1e-12)[:, :, None] * np.eye(4)
             move = np.linalg.solve(damped, pull[:, :, None])[:, :, 0]
-            move[:, 1:3] = np.clip(move[:, 1:3], -LARGEST_STEP, LARGEST_STEP)
-            move[~going] = 0
+            move = np.where(going[:, None], np.clip(move, -LARGEST_STEP, LARGEST_STEP), 0.0)
             there = peak + move[:, 1] * np.exp(log_width), log_width + move[:, 2]
-            kelvin = np.clip(log_kelvin + move[:, 3], coolest, hottest)
             tried = inner_products(*there)
-            best, reached = fitted(tried, kelvin)
+            kelvin, best, reached = self._brightest(tried)
             better = going & (reached > gain)
             small = np.abs(reached - gain) < ENOUGH
-            peak, log_width = (np.where(better, a, b) for a, b in zip(there, (peak, log_width), strict=True))
-            log_kelvin, amplitude = np.where(better, kelvin, log_kelvin), np.where(better, best, amplitude)
+            peak, log_width, log_kelvin, amplitude, gain = (
+                np.where(better, a, b)
+                for a, b in zip(
+                    (*there, kelvin, best, reached), (peak, log_width, log_kelvin, amplitude, gain), strict=True
+                )
+            )
             products = tuple(  # type: ignore[assignment]
                 np.where(better[:, None, None], a, b) for a, b in zip(tried, products, strict=True)
             )
-            gain = np.where(better, reached, gain)
             damping = np.where(better, damping / EASIER, damping * HARDER)
             going &= ~(small & better) & (damping < 1e6)
             if not going.any():
                 break
-        information, _ = self._normal(products, amplitude, response(log_kelvin), slope(log_kelvin))
+        information, _ = self._normal(products, amplitude, log_kelvin)
         return self._with_errors(peak, log_width, log_kelvin, amplitude, gain, information)
+
+    def _brightest(self, products: tuple[Float, Float]) -> tuple[Float, Float, Float]:
+        """Return log temperature, amplitude and fall of chi-squared of the best fits of given shapes."""
+        shapes, data = products
+        length = np.sqrt(np.maximum(shapes[:, 0, 0], 1e-300))
+        sums = data[:, 0] / length[:, None]
+        profile = Profile(self.templates.mean_sums, sums)
+        given = np.log(self.templates.temperatures_k[self.templates.chosen[0]])
+        x = profile.best().log_k if self.templates.coloured else np.full(len(sums), given)
+        amplitude, variance, _ = profile.parts(x)
+        best = np.maximum(amplitude, 1e-12 * length)
+        return x, best / length, (2 * amplitude - best) * best / variance
 
     def _averaged(
         self, several: int, sums: NDArray[Any], start_s: Float, variance: Float | None, curves: Float | None
@@ -208,10 +197,11 @@ class Fit:
             terms = np.divide(basis, root, out=np.zeros_like(basis), where=root > 0)
         return weight, terms
 
-    @staticmethod
-    def _normal(products: tuple[Float, Float], amplitude: Float, r: Float, dr: Float) -> tuple[Float, Float]:
+    def _normal(self, products: tuple[Float, Float], amplitude: Float, log_kelvin: Float) -> tuple[Float, Float]:
         """Return information and gradient for log amplitude, peak in half-widths, log half-width, log temperature."""
         shapes, data = products
+        spline = self.templates.mean_sums.spline
+        r, dr = spline(log_kelvin), spline(log_kelvin, 1) * self.templates.coloured
         # Each derivative is a product of one in time and one in the sums.
         time, sums = np.array([0, 1, 2, 0]), np.stack([r, r, r, dr], axis=1)
         inner = np.einsum("nik,njk->nij", sums, sums)
@@ -228,8 +218,8 @@ class Fit:
         self, peak: Float, log_width: Float, log_kelvin: Float, amplitude: Float, gain: Float, information: Float
     ) -> FittedFlares:
         width, kelvin = np.exp(log_width), np.exp(log_kelvin)
-        several = len(self.templates.temperatures_k) > 1
-        if not several:
+        coloured = self.templates.coloured
+        if not coloured:
             information = information[:, :3, :3]
         covariance = np.linalg.pinv(information, hermitian=True)
         error = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0.0))
@@ -238,7 +228,7 @@ class Fit:
         none = np.full(peak.size, np.nan)
         return FittedFlares(
             peak, width * error[:, 1], amplitude, amplitude * error[:, 0], width, width * error[:, 2],
-            kelvin if several else none, kelvin * error[:, 3] if several else none,
+            kelvin if coloured else none, kelvin * error[:, 3] if coloured else none,
             duration, duration * both, np.sqrt(np.maximum(gain, 0.0)),
         )  # fmt: skip
 

@@ -258,7 +258,7 @@ class Injecting:
         for d, (site, row) in enumerate(zip(self.sites, refit.amplitudes, strict=True)):
             if not len(site.filters):
                 continue
-            value, temperature, template = (each[:, 0] for each in self.best(site, drawn, row))
+            value, _, template = (each[:, 0] for each in self.best(site, drawn, row))
             alarm = value >= self.threshold
             if not alarm.any():
                 continue
@@ -268,7 +268,6 @@ class Injecting:
                 self.start_s[here],
                 peak_s=site.peaks_s[which],
                 half_width_s=site.widths_s[which],
-                temperature_k=refit.kelvin[temperature[alarm]],
                 variance=self.variance[here],
                 curves=None if self.curves is None else self.curves[:, here],
             )

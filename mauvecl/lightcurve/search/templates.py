@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.lightcurve.defaults import RANK
+from mauvecl.results.measurements.reduction import MeanSums
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.nuisances import Nuisances, join_names
 
@@ -122,6 +123,20 @@ class Templates:
         n = max(1, int(np.ceil(along[-1] / ANGLE)))
         wanted = (np.arange(n) + 0.5) / n * along[-1]
         return tuple(dict.fromkeys(int(np.argmin(np.abs(along - w))) for w in wanted))
+
+    @property
+    def coloured(self) -> bool:
+        """True if the sums of a flare depend on its temperature by more than a factor."""
+        return len(self.temperatures_k) > 1 and self.directions.shape[1] > 1
+
+    @cached_property
+    def mean_sums(self) -> MeanSums:
+        """Mean sums of a flare of unit amplitude over log temperature."""
+        log_k, values = np.log(self.temperatures_k), self.directions
+        if log_k.size == 1:
+            # The same at any temperature.
+            log_k, values = log_k + np.array([-1.0, 1.0]), np.tile(values, (2, 1))
+        return MeanSums(values, np.zeros((0, values.shape[1])), log_k)
 
     @property
     def loss(self) -> Float:

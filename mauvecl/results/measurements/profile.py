@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
     from mauvecl.results.measurements.flare_model import FlareModel
-    from mauvecl.results.measurements.reduction import Reduction
+    from mauvecl.results.measurements.reduction import MeanSums
 
 Float = NDArray[np.float64]
 
@@ -63,7 +63,7 @@ class Best:
 class Profile:
     """The profile likelihood of some frames' sums over the temperature."""
 
-    def __init__(self, reduction: Reduction, sums: Float) -> None:
+    def __init__(self, reduction: MeanSums, sums: Float) -> None:
         self.reduction, self.sums = reduction, sums
         basis, self._triangle = reduction.basis
         self.along = sums @ basis.T
@@ -77,6 +77,7 @@ class Profile:
     def hot(self, log_k: Float) -> Float:
         """Return the mean sums of a blackbody of amplitude 1, shape (*log_k.shape, n_sum)."""
         step = self.nodes[1] - self.nodes[0]
+        # Next to a node of an uneven grid the neighbouring cubic is as good.
         interval = np.clip(((log_k - self.nodes[0]) / step).astype(np.int64), 0, self.nodes.size - 2)
         offset = (log_k - self.nodes[interval])[..., None]
         c = self._coefficients

@@ -36,7 +36,39 @@ LEAST_KEPT = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
-class Reduction:
+class MeanSums:
+    """What a model's flares do to weighted sums of covariance one.
+
+    Attributes
+    ----------
+    hot : ndarray, shape (n_node, n_sum)
+        Mean sums for a blackbody of amplitude 1, at each of the model's temperatures.
+    fixed : ndarray, shape (n_linear - 1, n_sum)
+        Those of the other components.
+    log_k : ndarray, shape (n_node,)
+        Evenly spaced, to a few percent of a step.
+    """
+
+    hot: Float
+    fixed: Float
+    log_k: Float
+
+    @cached_property
+    def basis(self) -> tuple[Float, Float]:
+        """Orthonormal directions of the fixed components, (n_linear - 1, n_sum), and their triangular factor."""
+        if not len(self.fixed):
+            return np.zeros((0, self.hot.shape[1])), np.zeros((0, 0))
+        q, r = np.linalg.qr(self.fixed.T)
+        return q.T, r
+
+    @cached_property
+    def spline(self) -> scipy.interpolate.CubicSpline:
+        """Sums of the blackbody over log temperature."""
+        return scipy.interpolate.CubicSpline(self.log_k, self.hot)
+
+
+@dataclass(frozen=True, eq=False)
+class Reduction(MeanSums):
     """Weights of sums, and what a model's flares do to these sums.
 
     Attributes
@@ -47,11 +79,6 @@ class Reduction:
         Per DN; sums have covariance one.
     rows : ndarray, shape (k, n_pixel)
         What marginalisation subtracts from chi-squared.
-    hot : ndarray, shape (n_node, n_sum)
-        Mean sums for a blackbody of amplitude 1, at each of the model's temperatures.
-    fixed : ndarray, shape (n_linear - 1, n_sum)
-        Those of the other components.
-    log_k : ndarray, shape (n_node,)
     n_free : int
         Unknowns that are projected out.
     """
@@ -59,9 +86,6 @@ class Reduction:
     variance: Float
     weights: Float
     rows: Float
-    hot: Float
-    fixed: Float
-    log_k: Float
     n_free: int
 
     @classmethod
@@ -104,7 +128,7 @@ class Reduction:
         kept = values > LEAST * values[-1]
         weights = (vectors[:, kept] / length[:, None] / np.sqrt(values[kept])).T @ optimal
         free = nuisances.free if nuisances else 0
-        return cls(variance, weights, rows, model.hot @ weights.T, model.fixed @ weights.T, model.log_k, free)
+        return cls(model.hot @ weights.T, model.fixed @ weights.T, model.log_k, variance, weights, rows, free)
 
     def sums(self, excess_dn: Float) -> tuple[Float, Float]:
         """Return the sums of frames less the quiescent mean, (n, n_sum), and chi-squared of what these leave, (n,)."""
@@ -124,19 +148,6 @@ class Reduction:
     def n_used(self) -> int:
         """Number of pixels that count."""
         return int((self.variance > 0.0).sum())
-
-    @cached_property
-    def basis(self) -> tuple[Float, Float]:
-        """Orthonormal directions of the fixed components, (n_linear - 1, n_sum), and their triangular factor."""
-        if not len(self.fixed):
-            return np.zeros((0, self.weights.shape[0])), np.zeros((0, 0))
-        q, r = np.linalg.qr(self.fixed.T)
-        return q.T, r
-
-    @cached_property
-    def spline(self) -> scipy.interpolate.CubicSpline:
-        """Sums of the blackbody over log temperature."""
-        return scipy.interpolate.CubicSpline(self.log_k, self.hot)
 
 
 def drawn_sums(values: NDArray[np.float32], reduction: Reduction) -> Float:
