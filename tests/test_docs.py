@@ -35,7 +35,7 @@ def blocks(page: Path, language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
 
 
-def test_no_page_is_left_out_of_the_contents() -> None:
+def test_every_page_is_in_the_contents() -> None:
     contents = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
     pages = [p for p in (ROOT / "docs").glob("*.md") if p.name != "index.md"]
     pages += list((ROOT / "docs" / "notebooks").glob("*.ipynb"))
@@ -43,7 +43,7 @@ def test_no_page_is_left_out_of_the_contents() -> None:
         assert str(page.relative_to(ROOT / "docs").with_suffix("")) in contents
 
 
-def test_what_the_documentation_names_is_there() -> None:
+def test_documented_names_exist() -> None:
     """Files, and where it says `file: name`, the name's definition in it."""
     named = [(page.name, *found) for page in all_pages() for found in NAMED.findall(page.read_text(encoding="utf-8"))]
     missing = [(page, file) for page, file, _ in named if not list(ROOT.glob(file))]
@@ -60,7 +60,7 @@ def test_what_the_documentation_names_is_there() -> None:
     assert len([name for *_, name in named if name]) > 40
 
 
-def test_what_pages_and_scripts_import_is_there() -> None:
+def test_imports_of_pages_and_scripts_exist() -> None:
     """Every import of mauvecl on a page, in a bench, a tool, or a program that a test starts."""
     files = [*all_pages(), *(path for folder in ("bench", "tools", "tests") for path in (ROOT / folder).rglob("*.py"))]
     seen = 0
@@ -90,7 +90,7 @@ def test_studies_and_instruments_shown_are_valid() -> None:
     assert seen > 10
 
 
-def test_commands_shown_have_those_verbs_and_flags() -> None:
+def test_documented_commands_have_existing_verbs_and_flags() -> None:
     verbs: Any = get_command(app)
     seen = 0
     for page in all_pages():
@@ -108,13 +108,13 @@ def test_commands_shown_have_those_verbs_and_flags() -> None:
     assert seen > 40
 
 
-def test_notebooks_are_kept_without_their_output() -> None:
+def test_notebooks_have_no_output() -> None:
     for page in (ROOT / "docs" / "notebooks").glob("*.ipynb"):
         cells = json.loads(page.read_text(encoding="utf-8"))["cells"]
         assert all(not cell.get("outputs") for cell in cells), page.name
 
 
-def test_links_have_words() -> None:
+def test_links_have_text() -> None:
     """A link without text is filled in when the documentation is built, and is nothing at all in the repository."""
     empty = re.compile(r"\[\]\([^)]*\)")
     assert not [str(page) for page in all_pages() if empty.search(page.read_text(encoding="utf-8"))]

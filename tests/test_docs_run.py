@@ -198,7 +198,7 @@ def test_snippets_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
             exec(compile(snippet, page.name, "exec"), names)
 
 
-def test_every_exception_is_needed() -> None:
+def test_skipped_snippets_exist_on_pages() -> None:
     """What is reduced, brought or left out is on a page; no exception stays behind its snippet."""
     every = [(page.name, kind, snippet) for page in PAGES for kind, snippet in snippets(page)]
     commands = [snippet.removeprefix("mauvecl ") for _, kind, snippet in every if kind == "command"]

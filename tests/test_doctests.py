@@ -20,12 +20,12 @@ def module(path: Path) -> str:
 
 
 @pytest.mark.parametrize("name", sorted({module(path) for path in FILES}))
-def test_examples(name: str) -> None:
+def test_examples_of_docstrings_run(name: str) -> None:
     failed, attempted = doctest.testmod(importlib.import_module(name))
     assert failed == 0 < attempted
 
 
-def test_there_are_examples() -> None:
+def test_main_names_have_examples() -> None:
     """Of what the package's front door shows."""
     finder = doctest.DocTestFinder(recurse=False)
     for name in ("Source", "Sky", "Instrument", "expect", "Engine", "Study"):
@@ -33,7 +33,7 @@ def test_there_are_examples() -> None:
         assert any(test.examples for test in finder.find(thing, name)), name
 
 
-def test_every_public_name_is_found() -> None:
+def test_every_public_name_is_imported() -> None:
     """Each from its home, and typed as such where it is imported."""
     import mauvecl
 

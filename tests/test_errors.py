@@ -13,7 +13,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.quantities import numbers
 
 
-def test_one_value_is_told_with_its_key_and_unit() -> None:
+def test_error_of_one_value_has_key_and_unit() -> None:
     error = InputError.of("flare amplitude", -1.0, "at least 0", unit="s", where="a.toml")
     assert str(error) == "a.toml: flare amplitude = -1.0 s, expected at least 0"
     assert (error.key, error.value, error.expected) == ("flare_amplitude", -1.0, "at least 0")
@@ -33,14 +33,14 @@ def test_values_are_shown_on_one_short_line(value: object, shown: str) -> None:
     assert str(InputError.of("key", value, "another")) == f"key = {shown}, expected another"
 
 
-def test_a_place_is_put_before_the_sentence_and_processes_pass_errors_on() -> None:
+def test_errors_have_a_place_and_are_pickled() -> None:
     error = InputError("no light", "some", key="flux", value=3).within("star.txt")
     for one in (error, pickle.loads(pickle.dumps(error))):
         assert str(one) == "star.txt: no light, expected some"
         assert (one.key, one.value, one.expected) == ("flux", 3, "some")
 
 
-def test_sentences_of_each_kind() -> None:
+def test_each_kind_of_error_has_its_sentence() -> None:
     for call, sentence in (
         (lambda: Source.from_library("G2V").at_magnitude(99.0), "magnitude = 99.0, expected -30 to 40 mag"),
         (

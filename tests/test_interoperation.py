@@ -21,7 +21,7 @@ from mauvecl.host.stars.flare import blackbody
 from mauvecl.host.stars.flare_table import flares_of, read_flares
 
 
-def test_a_synphot_spectrum_in_and_out() -> None:
+def test_synphot_spectrum_round_trips() -> None:
     source = Source.from_library("G2V").at_magnitude(7.4)
     back = Source.from_synphot(source.to_synphot(), name="G2V")
     np.testing.assert_allclose(
@@ -30,7 +30,7 @@ def test_a_synphot_spectrum_in_and_out() -> None:
     assert back.magnitude("V") == pytest.approx(7.4, abs=1e-4)
 
 
-def test_a_synphot_blackbody_as_stsynphot_makes_its_stars() -> None:
+def test_synphot_blackbody_is_read() -> None:
     """stsynphot's grids hand out synphot SourceSpectrum objects, as this is one."""
     from synphot import SourceSpectrum
     from synphot.models import BlackBodyNorm1D
@@ -39,7 +39,7 @@ def test_a_synphot_blackbody_as_stsynphot_makes_its_stars() -> None:
     assert hot.magnitude("GALEX NUV") - hot.magnitude("V") < cool.magnitude("GALEX NUV") - cool.magnitude("V")
 
 
-def test_a_spectrum_of_stsynphot(recwarn: pytest.WarningsRecorder) -> None:
+def test_stsynphot_spectrum_is_read(recwarn: pytest.WarningsRecorder) -> None:
     """Its parser, on expressions that need none of its data files."""
     parser = pytest.importorskip("stsynphot.spparser")
     found = Source.from_synphot(parser.parse_spec("rn(bb(9000),box(5500,100),15,abmag)"))
@@ -48,7 +48,7 @@ def test_a_spectrum_of_stsynphot(recwarn: pytest.WarningsRecorder) -> None:
     np.testing.assert_allclose(found.at_magnitude(8.0).flux_flam, body.at_magnitude(8.0).flux_flam, rtol=1e-3)
 
 
-def test_a_specutils_spectrum_in_and_out() -> None:
+def test_specutils_spectrum_round_trips() -> None:
     pytest.importorskip("specutils")
     source = Source.from_library("K3V").at_magnitude(6.0)
     out = source.to_specutils()
@@ -58,7 +58,7 @@ def test_a_specutils_spectrum_in_and_out() -> None:
     np.testing.assert_array_equal(back.wavelength_nm, source.wavelength_nm)
 
 
-def test_an_expectation_as_a_specutils_spectrum() -> None:
+def test_expectation_converts_to_a_specutils_spectrum() -> None:
     pytest.importorskip("specutils")
     (quiet,) = star()
     out = quiet.to_specutils()
@@ -74,7 +74,7 @@ ALTAIPONY = """istart,istop,cstart,cstop,tstart,tstop,ed_rec,ed_rec_err,ampl_rec
 """
 
 
-def test_flares_cut_out_of_a_lightkurve_light_curve() -> None:
+def test_lightkurve_flares_are_read() -> None:
     lightkurve = pytest.importorskip("lightkurve")
     flux = np.ones(200)
     flux[[50, 120]] = 1.1, 1.02
@@ -84,7 +84,7 @@ def test_flares_cut_out_of_a_lightkurve_light_curve() -> None:
     np.testing.assert_allclose(flares_of(peaks)["amplitude"], [0.1, 0.02])
 
 
-def test_a_table_of_altaipony(tmp_path: Path) -> None:
+def test_altaipony_table_is_read(tmp_path: Path) -> None:
     """The columns that its FlareLightCurve.flares writes to CSV."""
     file = tmp_path / "flares.csv"
     file.write_text(ALTAIPONY)
@@ -101,7 +101,7 @@ def test_a_table_of_altaipony(tmp_path: Path) -> None:
     assert sorted(set(found["amplitude"])) == [0.081, 0.24], "each amplitude once"
 
 
-def test_a_data_frame_and_a_fits_table(tmp_path: Path) -> None:
+def test_data_frame_and_fits_table_are_read(tmp_path: Path) -> None:
     pandas = pytest.importorskip("pandas")
     frame = pandas.DataFrame({"Amplitude": [0.1, 0.2], "Start": [1.0, 2.0]})
     np.testing.assert_array_equal(flares_of(frame)["amplitude"], [0.1, 0.2])
@@ -110,7 +110,7 @@ def test_a_data_frame_and_a_fits_table(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["time,flux\n1,2\n", "ampl_rec\n0.1\n-0.2\n", "ampl_rec\n"])
-def test_bad_tables_of_flares_are_refused(tmp_path: Path, text: str) -> None:
+def test_invalid_tables_of_flares_raise(tmp_path: Path, text: str) -> None:
     (tmp_path / "f.csv").write_text(text)
     with refused("amplitude"):
         read_flares(tmp_path / "f.csv")
@@ -118,7 +118,7 @@ def test_bad_tables_of_flares_are_refused(tmp_path: Path, text: str) -> None:
         read_flares("nowhere.csv")
 
 
-def test_fits_tables_read_by_astropy_and_clean(tmp_path: Path) -> None:
+def test_fits_tables_are_valid(tmp_path: Path) -> None:
     done = CliRunner().invoke(
         app, ["simulate", "--star", "G2V", "-m", "7.4", "--no-pictures", "--quiet", "-o", str(tmp_path)]
     )
@@ -133,7 +133,7 @@ def test_fits_tables_read_by_astropy_and_clean(tmp_path: Path) -> None:
         assert "0 warning(s) and 0 error(s)" in told, told
 
 
-def test_rich_displays() -> None:
+def test_html_representations_contain_values() -> None:
     (quiet,) = star()
     assert "best S/N" in quiet._repr_html_()
     source = Source.from_arrays(np.linspace(170, 800, 50), np.ones(50), name="<script>")

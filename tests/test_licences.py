@@ -22,12 +22,12 @@ NOTICES = {
 
 
 @pytest.mark.parametrize("package", NOTICES)
-def test_each_package_that_data_are_from_has_its_licence_here(package: str) -> None:
+def test_every_source_of_data_has_its_licence(package: str) -> None:
     text = (LIBRARY / "licenses" / f"{package}.txt").read_text()
     assert all(notice in text for notice in NOTICES[package])
 
 
-def test_no_data_without_a_licence() -> None:
+def test_all_data_have_a_licence() -> None:
     for file in LIBRARY.glob("*/*.ecsv"):
         meta = Table.read(file, format="ascii.ecsv").meta
         assert meta["licence"]
@@ -36,7 +36,7 @@ def test_no_data_without_a_licence() -> None:
         assert all((LIBRARY / "licenses" / f"{name}.txt").exists() for name in packages)
 
 
-def test_wheels_and_sdists_take_them_along() -> None:
+def test_wheels_and_sdists_contain_the_licences() -> None:
     """By the same patterns as setuptools: beside the data, and among the package's own licences."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     texts = set((LIBRARY / "licenses").iterdir())

@@ -170,7 +170,7 @@ def answer_to(call: Callable[[], Any]) -> str:
 
 @pytest.mark.long
 @pytest.mark.parametrize("path", sorted({path for path, _ in parameters()}))
-def test_a_wrong_argument_is_one_sentence(path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_arguments_raise_one_sentence(path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     function = dict(functions())[path]
     known = inspect.signature(function).parameters

@@ -75,7 +75,7 @@ def pair() -> tuple[Expectation, Expectation]:
 
 
 @pytest.mark.parametrize("name", ANSWERS)
-def test_answers_are_their_content_and_travel(engine: Engine, name: str) -> None:
+def test_answers_compare_by_content_and_are_pickled(engine: Engine, name: str) -> None:
     found = ANSWERS[name](engine, {})
     there = pickle.loads(pickle.dumps(found))
     assert there == found == ANSWERS[name](engine, {})
@@ -101,7 +101,7 @@ def things() -> dict[str, Callable[[float], Any]]:
 
 
 @pytest.mark.parametrize("name", things())
-def test_things_are_equal_by_content_and_short(name: str) -> None:
+def test_objects_compare_by_content_and_have_short_repr(name: str) -> None:
     make = things()[name]
     one, same, other = make(7.0), make(7.0), make(9.0)
     assert one == same
@@ -113,7 +113,7 @@ def test_things_are_equal_by_content_and_short(name: str) -> None:
     assert "\n" not in repr(one)
 
 
-def test_counts_as_people_write_them(engine: Engine) -> None:
+def test_whole_numbers_can_be_floats_and_tuples_single_values(engine: Engine) -> None:
     quiet, flare = pair()
     kind: dict[str, Any] = {"seed": 1, "statistics": "matched"}
     found = engine.detect(quiet, flare, realisations=1e4, **kind)
@@ -140,19 +140,19 @@ def test_counts_as_people_write_them(engine: Engine) -> None:
         (lambda e, q, f: expect("G2V", "mauve", exposure=5, sky="dark"), "sky = 'dark', expected a Sky or 5 to 35 mag"),
     ],
 )
-def test_what_cannot_be_is_one_sentence(engine: Engine, ask: Callable[..., Any], sentence: str) -> None:
+def test_impossible_calls_raise(engine: Engine, ask: Callable[..., Any], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence) as refused:
         ask(engine, *pair())
     assert "\n" not in str(refused.value)
 
 
-def test_names_where_a_star_and_an_instrument_are_expected() -> None:
+def test_names_are_accepted_for_stars_and_instruments() -> None:
     usual = expect(Source.from_library("Vega"), Instrument.load("mauve"), exposure=5, sky=Sky.of_brightness(22.1))
     assert expect("Vega", "mauve", exposure=5) == usual
     assert expect("Vega", "mauve", exposure=5 * u.s, sky=22.1) == usual
 
 
-def test_quantities_come_out_with_their_wavelengths() -> None:
+def test_tables_have_units() -> None:
     quiet, _ = pair()
     for table, snr_of in ((quiet.table, quiet.snr()), (quiet.element_table, quiet.snr_per_element())):
         assert (table["wavelength"].unit, table["signal"].unit, table["noise"].unit) == (u.nm, u.DN, u.DN)
@@ -166,7 +166,7 @@ def test_quantities_come_out_with_their_wavelengths() -> None:
 
 
 @pytest.mark.parametrize("name", ["Source", "Expectation", *ANSWERS])
-def test_pictures_go_into_axes_of_ones_own(engine: Engine, name: str) -> None:
+def test_pictures_are_drawn_into_given_axes(engine: Engine, name: str) -> None:
     """Into the second of three axes, whose figure stays the caller's: nothing outside them changes."""
     import matplotlib.pyplot as plt
 
@@ -195,5 +195,5 @@ def test_pictures_go_into_axes_of_ones_own(engine: Engine, name: str) -> None:
         plt.close(figure)
 
 
-def test_public_names_are_there() -> None:
+def test_public_names_exist() -> None:
     assert all(getattr(mauvecl, name) is not None for name in mauvecl.__all__)

@@ -73,11 +73,11 @@ MUTATIONS = {
                 'words_at(numbers, 0, "stare_',
             ),
         ),
-        "tests/lightcurve/test_draws.py::test_moments_are_those_of_a_recipe[cumulants]",
+        "tests/lightcurve/test_draws.py::test_moments_equal_those_of_the_recipe[cumulants]",
     ),
     "jitter and sums of stares from one stream": Mutation(
         (("mauvecl/noise/layout.py", '"stare_sums": 18', '"stare_sums": 17'),),
-        "tests/lightcurve/test_draws.py::test_moments_are_those_of_a_recipe[cumulants]",
+        "tests/lightcurve/test_draws.py::test_moments_equal_those_of_the_recipe[cumulants]",
     ),
     "a flare without photon noise": Mutation(
         (
@@ -102,7 +102,7 @@ MUTATIONS = {
                 "_padded(np.arange(stare.n_frames), np.uint32)",
             ),
         ),
-        "tests/lightcurve/test_stare_reference.py::test_a_split_changes_no_bit[cumulants]",
+        "tests/lightcurve/test_stare_reference.py::test_splitting_changes_no_bit[cumulants]",
     ),
     "a shard's flares from the first": Mutation(
         (
@@ -112,15 +112,15 @@ MUTATIONS = {
                 "request.flares.part(done,",
             ),
         ),
-        "tests/runs/test_stares.py::test_shards_join_to_the_same_bits[None-cumulants]",
+        "tests/runs/test_stares.py::test_shards_of_stares_join_to_the_same_bits[None-cumulants]",
     ),
     "a shard under another's name": Mutation(
         (("mauvecl/runs/checkpoint.py", 'name.encode() + b"\\0" + body', "body"),),
-        "tests/runs/test_pool.py::test_a_shard_in_anothers_place",
+        "tests/runs/test_pool.py::test_misplaced_shard_is_found",
     ),
     "foreign chunks unseen": Mutation(
         (("mauvecl/store/bulk.py", 'return "good" if digest(data) == known else "foreign"', 'return "good"'),),
-        "tests/store/test_bulk.py::test_faults_are_found_and_repaired_to_the_bit",
+        "tests/store/test_bulk.py::test_damage_is_found_and_repaired_to_the_bit",
     ),
     "half a failed shard kept": Mutation(
         (
@@ -130,15 +130,15 @@ MUTATIONS = {
                 "        tally, samples = vars(request).setdefault('_kept', (Tally(plan.grids), plan.tails()))\n",
             ),
         ),
-        "tests/runs/test_pool.py::test_a_failed_launch_is_counted_again",
+        "tests/runs/test_pool.py::test_failed_launch_is_repeated",
     ),
     "far values lost": Mutation(
         (("mauvecl/device/launches.py", "        self._add_far(tile, tally)\n", ""),),
-        "tests/results/test_ends.py::test_every_number_is_that_of_sorting[0]",
+        "tests/results/test_ends.py::test_numbers_equal_those_of_sorting[0]",
     ),
     "far S/N lost": Mutation(
         (("mauvecl/device/launches.py", "            self._add_far_snr(tile, counts, np.flatnonzero(outside))\n", ""),),
-        "tests/results/test_ends.py::test_signal_to_noise_is_that_of_sorting[16-0]",
+        "tests/results/test_ends.py::test_snr_equals_that_of_sorting[16-0]",
     ),
     "7 rounds": Mutation(
         ((PHILOX, "range(3, 10)", "range(3, 7)"), (TWIN, "for r in range(10):", "for r in range(7):")),
@@ -268,11 +268,11 @@ MUTATIONS = {
     ),
     "noise of what is subtracted forgotten": Mutation(
         (("mauvecl/noise/scene.py", "return 1.0 + comparison.added_variance", "return 1.0"),),
-        "tests/results/test_tails.py::test_brute_force_agrees_whatever_is_compared",
+        "tests/results/test_tails.py::test_sampled_tail_agrees_for_every_comparison",
     ),
     "quiescent exposures with the observed draws": Mutation(
         (("mauvecl/noise/layout.py", "REFERENCE = 64", "REFERENCE = 0"),),
-        "tests/results/test_detection.py::test_the_null_is_its_closed_form",
+        "tests/results/test_detection.py::test_null_follows_its_closed_form",
     ),
     "closed forms that follow a temperature by their means alone": Mutation(
         (("mauvecl/statistics/statistic.py", "seen.variance + more, scatter", "seen.variance, scatter"),),
@@ -280,7 +280,7 @@ MUTATIONS = {
     ),
     "moved scores that count like others": Mutation(
         (("mauvecl/results/detection/tails.py", "np.log(2.0) - np.logaddexp(0.0, ratio)", "np.zeros(BLOCK)"),),
-        "tests/results/test_tails.py::test_brute_force_agrees_with_what_is_unknown[half a degree]",
+        "tests/results/test_tails.py::test_sampled_tail_with_unknowns_agrees_with_brute_force[half a degree]",
     ),
     "shifts forgotten in the closed form's phase": Mutation(
         (
@@ -301,7 +301,7 @@ MUTATIONS = {
                 "for centre, row in enumerate([]):",
             ),
         ),
-        "tests/results/test_detection.py::test_the_null_is_its_closed_form",
+        "tests/results/test_detection.py::test_null_follows_its_closed_form",
     ),
 }
 

@@ -66,7 +66,7 @@ QUESTIONS += [
 
 
 @pytest.mark.parametrize(("verb", "settings", "key"), QUESTIONS)
-def test_bad_questions_are_named(engine: Engine, verb: str, settings: list[str], key: str) -> None:
+def test_bad_input_raises(engine: Engine, verb: str, settings: list[str], key: str) -> None:
     drawing: Any = Stares(engine.open_device) if verb in ("stare", "inject") else engine
     study = Study().with_settings(FEW + settings)
     with refused(key):

@@ -77,7 +77,7 @@ def test_files_json_terminal_and_page_agree(
         assert all(repr([record[one] for one in names]) in in_file for record in records(view.table))
 
 
-def test_no_answer_makes_a_table_by_hand() -> None:
+def test_all_tables_come_from_columns() -> None:
     """Tables of answers are made of columns: nothing fills or extends an astropy table itself."""
     package = Path(mauvecl.__file__).parent
     found = []
@@ -94,7 +94,7 @@ def test_no_answer_makes_a_table_by_hand() -> None:
     assert not found
 
 
-def test_a_tab_needs_no_more_than_its_verb() -> None:
+def test_tab_shows_the_answer_of_its_verb() -> None:
     class Exposure(Tab):
         """Tab of exposures."""
 
@@ -123,7 +123,7 @@ COLUMNS = (
 )
 
 
-def test_a_row_may_hold_arrays_and_lack_values() -> None:
+def test_rows_hold_arrays_and_missing_values() -> None:
     table = table_of(COLUMNS, [Row("a", [1.0, 2.0], 3), Row("b", [], 1), Row("c", [5.0], None)], seed=7)
     assert table["name"].tolist() == ["a", "a", "c"]
     assert table["value"].unit == "s"
@@ -134,12 +134,12 @@ def test_a_row_may_hold_arrays_and_lack_values() -> None:
     assert (headings, cells) == (["value (s)"], [["1.0"], ["2.0"], ["5.0"]])
 
 
-def test_a_table_without_rows_keeps_its_types() -> None:
+def test_empty_table_keeps_its_types() -> None:
     table = table_of(COLUMNS, [])
     assert [table[name].dtype.kind for name in table.colnames] == ["U", "f", "i"]
 
 
-def test_stacked_tables_mask_what_one_lacks_and_refuse_two_units() -> None:
+def test_stacked_tables_mask_missing_columns_and_refuse_two_units() -> None:
     parts: list[tuple[Any, Any]] = [
         ({"star": "x"}, table_of([Column("a", unit="s")], [{"a": 1.0}], seed=1, n=1)),
         ({"star": "y"}, table_of([Column("a", unit="s"), Column("b")], [{"a": 2.0, "b": 3}], seed=1, n=2)),

@@ -31,7 +31,7 @@ TABLES = {
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_a_table_is_what_astropy_writes(name: str) -> None:
+def test_ecsv_text_equals_that_of_astropy(name: str) -> None:
     table, exact = TABLES[name], io.StringIO()
     table.write(exact, format="ascii.ecsv")
     assert ecsv_text(table) == exact.getvalue()

@@ -24,7 +24,7 @@ def study(magnitude: float = 7.4, **observation: float) -> Study:
 @pytest.mark.parametrize("per", ["pixel", "element"])
 @pytest.mark.parametrize("frames", [1, 2, 7, 120])
 @pytest.mark.parametrize("wavelength", [280.0, 450.0])
-def test_there_and_back(per: str, frames: int, wavelength: float) -> None:
+def test_exposure_inverts_snr(per: str, frames: int, wavelength: float) -> None:
     """The S/N of an exposure asks for that exposure, and a little more for a frame more."""
     asked = study(exposure_s=5.0 * frames)
     x = Case(asked).quiet
@@ -46,7 +46,7 @@ def test_the_engine_finds_the_wanted_snr(engine: Engine) -> None:
     assert row["mean"] == pytest.approx(found.snr, abs=5 * row["std"] / np.sqrt(20_000) + 0.01 * found.snr)
 
 
-def test_fainter_is_longer_and_saturation_is_told() -> None:
+def test_fainter_stars_need_longer_exposures_and_saturation_is_reported() -> None:
     bright, faint = (exposure_for(study(m), 10.0, 400.0).exposures[0] for m in (6.0, 8.0))
     assert faint.frames > bright.frames
     blinding = exposure_for(study(-2.0), 10.0, 450.0)
@@ -55,14 +55,14 @@ def test_fainter_is_longer_and_saturation_is_told() -> None:
     assert not bright.saturated
 
 
-def test_one_stars_failure_does_not_lose_the_others() -> None:
+def test_failure_of_one_star_keeps_the_others() -> None:
     stars = [{"library": "G2V", "magnitude": m} for m in (7.4, 28.0)]
     found = exposure_for(Study.build({"star": stars}, "test"), 10.0, 300.0)
     assert [one.star for one in found.exposures] == ["G2V V = 7.4"]
     assert found.messages[0].startswith("NO ANSWER: G2V V = 28 has an S/N of ")
 
 
-def test_more_than_a_day_is_an_answer() -> None:
+def test_exposure_above_one_day_is_answered() -> None:
     """An exposure of a day at most is a rule of `expect`; several of them add up."""
     found = exposure_for(study(14.5), 10.0, 550.0)
     (answer,) = found.exposures
@@ -71,7 +71,7 @@ def test_more_than_a_day_is_an_answer() -> None:
     assert any("more than a day" in message for message in found.messages)
 
 
-def test_the_answer_is_written_and_drawn(tmp_path: Path) -> None:
+def test_answer_is_written_and_drawn(tmp_path: Path) -> None:
     found = exposure_for(study(), 10.0, 300.0)
     assert [path.name for path in found.write(tmp_path)] == ["exposure.ecsv", "study.toml"]
     again = exposure_for(Study.read(tmp_path / "exposure.ecsv"))
@@ -82,7 +82,7 @@ def test_the_answer_is_written_and_drawn(tmp_path: Path) -> None:
     assert (tmp_path / "exposure.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_a_column_is_defined_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_column_is_defined_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """One more column stands in the file, in JSON and on the terminal, with its unit, description and format."""
     less = Column("frame_less", "snr_one_frame_less", "DN", "for this test", "one less", lambda value: f"<{value:.1f}>")
     monkeypatch.setattr(exposures, "COLUMNS", (*exposures.COLUMNS, less))

@@ -42,7 +42,7 @@ def found(stares):
     return inject(study(), stares)
 
 
-def test_tables(found):
+def test_tables_are_consistent(found):
     (star,) = found.stars
     cells = found.completeness
     assert len(cells) == 15
@@ -70,7 +70,7 @@ def test_tables(found):
     assert Study.build(__import__("tomllib").loads(found.study.toml()), "text") == found.study
 
 
-def test_files_and_pictures(found, tmp_path):
+def test_files_and_pictures_are_written(found, tmp_path):
     names = {path.name for path in found.write(tmp_path)}
     assert names == {"limits.ecsv", "completeness.ecsv", "search.ecsv", "study.toml"}
     assert Study.read(tmp_path / "limits.ecsv") == found.study
@@ -82,7 +82,7 @@ class Stop(Exception):  # noqa: N818
 
 
 @pytest.mark.long
-def test_resume_gives_the_same(found, tmp_path):
+def test_resumed_run_gives_the_same_answer(found, tmp_path):
     """Some peaks kept, the others drawn later by two devices of different form: the same to the last bit."""
 
     def stop(done, total):
@@ -103,7 +103,7 @@ def test_resume_gives_the_same(found, tmp_path):
 
 
 @pytest.mark.long
-def test_sweep_over_magnitude_and_temperature(stares):
+def test_sweep_over_magnitude_and_temperature_is_answered(stares):
     """Fainter stars hide larger flares; every cell on common draws, so that each limit moves."""
     axes = [
         {"quantity": "magnitude", "values": [6.0, 8.0]},
@@ -119,7 +119,7 @@ def test_sweep_over_magnitude_and_temperature(stares):
 
 
 @pytest.mark.long
-def test_search_that_leaves_out_a_cycle_is_told(stares):
+def test_search_without_the_cycle_reports_its_false_alarms(stares):
     """A thermal cycle that the search does not know raises the threshold, or is refused where none is high enough."""
     quick = {"count": 10, "positions": 2, "fitted": 0, "widths": 2, "sizes": 2}
     changes = {"stare": {"cycles": {"temperature": 0.5}}, "injections": quick}
@@ -134,7 +134,7 @@ def test_search_that_leaves_out_a_cycle_is_told(stares):
 
 
 @pytest.mark.long
-def test_a_drift_of_the_temperature_hides_nothing(stares):
+def test_temperature_drift_hides_no_flare(stares):
     """Limits and recovered energies with an unknown drift of 0.3 deg C per hour are those without it."""
     quick = {"count": 80, "positions": 8, "fitted": 40, "widths": 2, "sizes": 3, "low": 1e33, "high": 3e34}
     plain, drifting = (
@@ -151,7 +151,7 @@ def test_a_drift_of_the_temperature_hides_nothing(stares):
     assert drifting.threshold.value == pytest.approx(plain.threshold.value, abs=0.05)
 
 
-def test_rays_and_saturation(stares):
+def test_cosmic_rays_and_saturation_are_reported(stares):
     """Cosmic rays are drawn where the study has them, and hide flares; flares that saturate are told."""
     quick = {"count": 10, "positions": 2, "fitted": 0, "widths": 1, "sizes": 2, "low": 1e33, "high": 1e39}
     plain, struck = (
@@ -163,7 +163,7 @@ def test_rays_and_saturation(stares):
     assert any(m.startswith("SATURATED: flares of G2V") for m in plain.messages)
 
 
-def test_intervals_widen_where_positions_differ():
+def test_intervals_widen_if_positions_differ():
     """Binomial where all positions are alike, of the positions alone where each finds all or nothing."""
     rng = np.random.default_rng(2)
     alike = InjectedCompleteness((1.0,), np.array([0.5]), np.ones((1, 1)), rng.random((1, 20, 100)))
@@ -182,7 +182,7 @@ def test_intervals_widen_where_positions_differ():
 
 
 @pytest.mark.long
-def test_command(tmp_path):
+def test_inject_command_writes_its_files(tmp_path):
     """The verb with flags: its JSON, its files, its record."""
     words = (
         "inject --star G2V --magnitude 7.4 --duration 4000 --injections 20 --alarms-per day --false-alarms 0.5 --json"
@@ -197,13 +197,13 @@ def test_command(tmp_path):
     }
 
 
-def test_sizes_may_be_energies():
+def test_sizes_can_be_energies():
     """In erg, which are beyond what other numbers may be."""
     asked = Study().with_settings(["injections.low=1e33", "injections.high=1e35"])
     assert (asked.injections.low, asked.injections.high) == (1e33, 1e35)
 
 
-def test_a_size_that_a_star_has_not_is_told_before_any_is_searched(monkeypatch, stares):
+def test_impossible_size_raises_before_any_search(monkeypatch, stares):
     near = SMALL["star"][0]
     asked = study(star=[near, {**near, "distance_pc": None}], injections={"of": "energy"})
     monkeypatch.setattr("mauvecl.study.surveys.survey_star", lambda *_: pytest.fail("searched"))

@@ -38,7 +38,7 @@ FEW = {"statistics": ("matched",), "realisations": 20_000}
 
 @pytest.mark.long
 @pytest.mark.parametrize("power", [0.5, 0.9])
-def test_the_limiting_magnitude_has_the_power_asked_for(engine: Engine, power: float) -> None:
+def test_limiting_magnitude_has_the_requested_power(engine: Engine, power: float) -> None:
     """By a fresh simulation, within three half-widths of its 95 % interval: four statistics, 1e-4 by chance."""
     asked = study(limit={"power": power})
     result = limiting_magnitude(asked, engine)
@@ -60,7 +60,7 @@ def test_the_limiting_magnitude_has_the_power_asked_for(engine: Engine, power: f
     assert found["chi2"] < found["chi2_element"]
 
 
-def test_there_and_back(engine: Engine) -> None:
+def test_limit_inverts_detect(engine: Engine) -> None:
     """At the limiting magnitude of an amplitude the smallest amplitude is that one, and the exposure the shortest."""
     only = {"statistics": ("matched",)}
     (limit,) = limiting_magnitude(study(run=only), engine).limits
@@ -82,12 +82,12 @@ def test_there_and_back(engine: Engine) -> None:
         {"sky": {"surface_brightness": 14.0}},
     ],
 )
-def test_harder_is_never_fainter(engine: Engine, harder: dict[str, Any]) -> None:
+def test_limits_are_monotone(engine: Engine, harder: dict[str, Any]) -> None:
     (plain,), (worse,) = (limiting_magnitude(study(run=FEW, **c), engine).limits for c in ({}, harder))
     assert worse.value.value < plain.value.value
 
 
-def test_a_cooler_detector_gains_what_theory_says(engine: Engine) -> None:
+def test_cooler_detector_gains_as_predicted(engine: Engine) -> None:
     """13 C has 0.58 of the dark of 21 C: the limit moves as the closed form's."""
     few = {"statistics": ("matched",)}
     (warm,), (cool,) = (
@@ -99,7 +99,7 @@ def test_a_cooler_detector_gains_what_theory_says(engine: Engine) -> None:
     assert 0.15 < gain < 1.25 * 0.0684 * 8 / np.log(10)
 
 
-def test_the_table_and_the_files(engine: Engine, tmp_path: Path) -> None:
+def test_table_and_files_are_written(engine: Engine, tmp_path: Path) -> None:
     result = limiting_magnitude(study(run=FEW), engine)
     files = result.write(tmp_path)
     table = QTable.read(tmp_path / "limit.ecsv")
@@ -112,7 +112,7 @@ def test_the_table_and_the_files(engine: Engine, tmp_path: Path) -> None:
     assert (tmp_path / "limit.png").stat().st_size > 10_000
 
 
-def test_one_stars_failure_does_not_lose_the_others(engine: Engine) -> None:
+def test_failure_of_one_star_keeps_the_others(engine: Engine) -> None:
     stars = [{"library": "G2V", "magnitude": m} for m in (25.0, 7.0)]
     found = shortest_exposure(study(run=FEW, star=stars), engine)
     assert [one.star for one in found.limits] == ["G2V V = 7"]
@@ -121,7 +121,7 @@ def test_one_stars_failure_does_not_lose_the_others(engine: Engine) -> None:
 
 
 @pytest.mark.long
-def test_a_limit_of_more_than_a_day(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limit_above_one_day_is_found(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of some 1e5 frames, which are halved and not walked through."""
     asks, simulated = [], LimitSearch.simulated
 
@@ -137,26 +137,26 @@ def test_a_limit_of_more_than_a_day(engine: Engine, monkeypatch: pytest.MonkeyPa
     assert len(asks) < 100
 
 
-def test_a_flare_without_a_shape_is_a_sentence(engine: Engine) -> None:
+def test_flare_without_a_shape_raises(engine: Engine) -> None:
     with pytest.raises(InputError) as error:
         limiting_magnitude(study(run=FEW, flare={"amplitudes": [0.0]}), engine)
     assert "an amplitude above 0" in str(error.value.expected)
 
 
-def test_a_limit_tells_of_saturation(engine: Engine) -> None:
+def test_limit_reports_saturation(engine: Engine) -> None:
     bright = study(run=FEW, star=[{"library": "G2V", "magnitude": -1.0}])
     found = smallest_amplitude(bright, engine)
     assert found.messages[0].startswith("SATURATED")
 
 
-def test_one_frame_is_the_shortest(engine: Engine) -> None:
+def test_shortest_exposure_is_one_frame(engine: Engine) -> None:
     (limit,) = shortest_exposure(study(run=FEW, star=[{"library": "G2V", "magnitude": 5.0}]), engine).limits
     assert limit.value.value == 5.0
     assert limit.verdict == "exceeds it"
     assert not limit.agrees
 
 
-def test_what_is_assumed_moves_the_limit_as_physics_says() -> None:
+def test_assumptions_move_the_limit_as_predicted() -> None:
     """More light or less noise is fainter; each end is the limit of an instrument changed so."""
     asked = study(run=FEW)
     table = what_matters(asked)

@@ -47,7 +47,7 @@ def alone(asked: Study, engine: Engine, x: float | str, y: float | str) -> list[
         ({"quantity": "star", "values": ["G2V", "K5V"]}, {"quantity": "sky", "values": [18.0, 22.0]}),
     ],
 )
-def test_each_cell_is_its_own_detection(engine: Engine, x: dict, y: dict) -> None:
+def test_each_cell_equals_its_own_detection(engine: Engine, x: dict, y: dict) -> None:
     """To the bit, because all cells share their draws."""
     asked = study(x, y)
     found = detection_map(asked, engine)
@@ -58,7 +58,7 @@ def test_each_cell_is_its_own_detection(engine: Engine, x: dict, y: dict) -> Non
     assert (found.probability <= found.high).all()
 
 
-def test_harder_is_never_easier(engine: Engine) -> None:
+def test_probability_decreases_with_magnitude(engine: Engine) -> None:
     """A brighter star or a larger flare is seen as often or more, on common draws to the threshold's own error."""
     found = detection_map(study(MAGNITUDE, AMPLITUDE), engine)
     slack = 5e-3
@@ -70,7 +70,7 @@ def test_harder_is_never_easier(engine: Engine) -> None:
     assert (np.abs(found.probability - found.closed_form) < 5 * (error + 0.4 * 0.03) + 1e-3).all()
 
 
-def test_table_files_and_picture(engine: Engine, tmp_path: Path) -> None:
+def test_map_writes_table_and_picture(engine: Engine, tmp_path: Path) -> None:
     found = detection_map(study(MAGNITUDE, AMPLITUDE), engine)
     assert {path.name for path in found.write(tmp_path)} == {"map.ecsv", "map.fits", "study.toml"}
     table = QTable.read(tmp_path / "map.ecsv")
@@ -84,7 +84,7 @@ def test_table_files_and_picture(engine: Engine, tmp_path: Path) -> None:
     assert (tmp_path / "map.png").stat().st_size > 10_000
 
 
-def test_saturation_is_told(engine: Engine) -> None:
+def test_map_reports_saturation(engine: Engine) -> None:
     asked = study({"quantity": "magnitude", "values": [-2.0, 6.0]}, {"quantity": "sky", "values": [22.0]})
     found = detection_map(asked, engine)
     assert np.isfinite(found.probability[:, 0, 1]).all()

@@ -31,7 +31,7 @@ def jump(engine: Engine) -> MeasureAnswer:
     return measure(study_of(spectrum={"balmer_jump": 2.5}), engine)
 
 
-def test_the_right_model_covers_and_the_simple_one_is_rejected(jump: MeasureAnswer) -> None:
+def test_correct_model_covers_and_simple_model_is_rejected(jump: MeasureAnswer) -> None:
     """400 fits of drawn pixels. False failures: 11 quantities whose coverage is 93 to 97 %, 2e-6 each."""
     simple, right = jump.flares
     assert (simple.model, right.model) == ("blackbody", "balmer")
@@ -50,7 +50,7 @@ def test_the_right_model_covers_and_the_simple_one_is_rejected(jump: MeasureAnsw
     assert quality["balmer"]["snr"] == pytest.approx(134.56, rel=0.01)
 
 
-def test_truths_are_those_of_the_light_that_is_added(jump: MeasureAnswer) -> None:
+def test_true_values_equal_those_of_the_added_light(jump: MeasureAnswer) -> None:
     study = jump.study
     source = study.star[0].source()
     lit = Case(study).flaring(0.5)
@@ -122,7 +122,7 @@ def test_flares_are_measured_along_a_stare(engine: Engine, tmp_path: Path) -> No
     assert any("snr_per_bin = 1000000.0" in text for text in faint.messages)
 
 
-def test_lines_and_absolute_fluxes(engine: Engine) -> None:
+def test_lines_and_absolute_fluxes_are_measured(engine: Engine) -> None:
     spectrum = {"balmer_jump": 2.0, "lines": {"H alpha": 0.05}, "line_fluxes": {"Mg II": 2e-11}}
     answer = measure(study_of("measure.fits=50", "nuisances={}", spectrum=spectrum), engine)
     assert [one.model for one in answer.flares] == ["blackbody", "balmer", "lines"]
@@ -132,7 +132,7 @@ def test_lines_and_absolute_fluxes(engine: Engine) -> None:
     assert rows["line H alpha"]["perfect"] == pytest.approx(rows["line H alpha"]["truth"], rel=0.02)
 
 
-def test_a_flare_of_a_file_has_fluxes_and_no_temperature(engine: Engine) -> None:
+def test_flare_from_a_file_has_fluxes_and_no_temperature(engine: Engine) -> None:
     data = Path(__file__).parent.parent / "data"
     spectrum = {
         "file": str(data / "spectra" / "ADLeo_912s.dat"), "quiescent": str(data / "flares" / "adleo_quiescent2.dat"),
@@ -144,7 +144,7 @@ def test_a_flare_of_a_file_has_fluxes_and_no_temperature(engine: Engine) -> None
     assert truth["flux 200-320 nm"] > 0
 
 
-def test_sweeps_seeds_and_files(engine: Engine, tmp_path: Path) -> None:
+def test_sweep_and_seed_change_the_tables(engine: Engine, tmp_path: Path) -> None:
     study = study_of("measure.fits=30").with_settings(['sweep.axes=[{quantity="exposure", values=[50, 300]}]'])
     answer = measure(study, engine)
     assert len(answer.flares) == 2
@@ -158,7 +158,7 @@ def test_sweeps_seeds_and_files(engine: Engine, tmp_path: Path) -> None:
     assert (tmp_path / "fit.png").stat().st_size > 10_000
 
 
-def test_the_command(tmp_path: Path) -> None:
+def test_measure_command_writes_its_files(tmp_path: Path) -> None:
     words = ("--star", "M3V", "--magnitude", "9", "--amplitude", "0.5", "--balmer-jump", "2", "--fits", "40")
     done = run("measure", *words, "--nuisance", "dark=free", "-o", "out", folder=tmp_path)
     assert "jump" in done.stdout

@@ -12,7 +12,7 @@ from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study
 
 
-def test_closed_forms_that_rounding_spoils_are_told() -> None:
+def test_rounding_that_invalidates_closed_forms_is_reported() -> None:
     quiet = {"observation.changes={read_noise_dn=0.1}", "observation.temperature_c=-40"}
     asked = Study().with_changes({}, [{"library": "G2V", "magnitude": 12.0}])
     for settings, is_told in ((quiet, True), ((), False)):
@@ -20,7 +20,7 @@ def test_closed_forms_that_rounding_spoils_are_told() -> None:
         assert any("rounding to whole DN" in text for text in collect_messages([x])) == is_told
 
 
-def test_json_has_no_number_that_is_none() -> None:
+def test_json_has_no_nan_and_no_infinity() -> None:
     assert json.loads(json_text({"a": [float("nan"), 1.5], "b": {"c": (float("inf"), "NaN")}})) == {
         "a": [None, 1.5],
         "b": {"c": [None, "NaN"]},
@@ -28,7 +28,7 @@ def test_json_has_no_number_that_is_none() -> None:
 
 
 @pytest.mark.parametrize(("magnitude", "dark"), [(7.4, False), (20.0, False), (24.0, True), (25.0, True)])
-def test_a_star_without_light_is_named(magnitude: float, dark: bool) -> None:
+def test_star_without_light_is_reported(magnitude: float, dark: bool) -> None:
     """Less than one electron in all pixels of an exposure is said; S/N of 0 does not stand without a word."""
     study = Study().with_settings([f"star=[{{library = 'G2V', magnitude = {magnitude}}}]"])
     messages = simulate(study).messages

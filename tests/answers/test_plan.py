@@ -49,7 +49,7 @@ def answer(study: Study) -> PlanAnswer:
     return plan(study)
 
 
-def test_numbers_follow_from_each_other(answer: PlanAnswer) -> None:
+def test_plan_numbers_are_consistent(answer: PlanAnswer) -> None:
     """From the tables alone: hours, rates and shares give the flares, their interval and the false alarms."""
     table, stars, energies = answer.table, answer.stars, answer.by_energy
     for k, name in enumerate(table["target"][:2]):
@@ -67,13 +67,13 @@ def test_numbers_follow_from_each_other(answer: PlanAnswer) -> None:
     assert answer.seen.table["hours"].value == pytest.approx(table["seen"].value)
 
 
-def test_a_closed_form_says_that_it_takes_the_stare_for_known(study: Study, answer: PlanAnswer) -> None:
+def test_closed_form_reports_that_it_ignores_unknowns(study: Study, answer: PlanAnswer) -> None:
     assert not any(line.startswith("FALSE ALARMS") for line in answer.messages)
     drifting = plan(study.with_changes({"stare": {"drifts": {"temperature": 0.3}}}, None))
     assert any(line.startswith("FALSE ALARMS") for line in drifting.messages)
 
 
-def test_the_rates_are_those_asked_for(answer: PlanAnswer) -> None:
+def test_plan_uses_the_requested_rates(answer: PlanAnswer) -> None:
     star = next(one.observation.star for one in answer.planned if one.name == "eps Eri")
     source, distance = star.source(), star.distance_pc
     assert distance is not None
@@ -107,7 +107,7 @@ def held(table: Table, column: str, target: str) -> list[float]:
     return values
 
 
-def test_each_number_of_the_report_is_in_the_table_it_names(answer: PlanAnswer, tmp_path: Path) -> None:
+def test_report_numbers_are_in_the_named_tables(answer: PlanAnswer, tmp_path: Path) -> None:
     """As written beside it, in the column that is named, for the target: pages, summary and messages."""
     tables = {name: QTable.read(write_table(table, tmp_path / f"{name}.ecsv")) for name, table in answer.tables.items()}
     count = 0
@@ -142,7 +142,7 @@ def test_each_number_of_the_report_is_in_the_table_it_names(answer: PlanAnswer, 
     assert count > 100
 
 
-def test_what_is_missing_is_said(answer: PlanAnswer) -> None:
+def test_missing_values_are_reported(answer: PlanAnswer) -> None:
     told = " ".join(answer.messages)
     assert "Flare rates of Denebola, of the type 'A3V', are unknown except for an exponent of 1.3" in told
     assert "EK Dra is never seen" in told
@@ -155,7 +155,7 @@ def test_what_is_missing_is_said(answer: PlanAnswer) -> None:
 
 
 @pytest.mark.long
-def test_report(answer: PlanAnswer, study: Study) -> None:
+def test_report_is_written(answer: PlanAnswer, study: Study) -> None:
     """A page for each target beside the summary and the assumptions; every assumption."""
     content = answer.documents["plan.pdf"]()
     assert len(re.findall(rb"/Type /Page\b", content)) >= len(answer.planned) + 2
@@ -172,7 +172,7 @@ def test_report(answer: PlanAnswer, study: Study) -> None:
 
 
 @pytest.mark.long
-def test_markup_in_names_is_text(study: Study) -> None:
+def test_report_escapes_markup_in_names(study: Study) -> None:
     target = {
         "name": "<script>$x^2$",
         "coordinates": "10.5 -3",
@@ -189,7 +189,7 @@ def test_markup_in_names_is_text(study: Study) -> None:
     assert answer.plot() is not None
 
 
-def test_completeness_as_an_argument(study: Study) -> None:
+def test_plan_takes_completeness_as_argument(study: Study) -> None:
     def none_below(observed: TargetObservation) -> Completeness:
         assert observed.window_s > 600
         edge = np.array([1e30, 1e33 * (1 - 1e-12), 1e33, 1e40])
@@ -203,7 +203,7 @@ def test_completeness_as_an_argument(study: Study) -> None:
     assert [answer.table["low"][0], answer.table["high"][0]] == stats.poisson.ppf([0.025, 0.975], mean).tolist()
 
 
-def test_conditions_are_those_of_stares_along_the_orbit() -> None:
+def test_conditions_equal_those_of_stares_along_the_orbit() -> None:
     """Temperature and hits while a target is seen, beside the frames of the same orbit; both change the noise."""
     base = [
         "plan.targets=[{name='GJ 205'}]",
@@ -244,7 +244,7 @@ def test_more_light_finds_smaller_flares(study: Study) -> None:
     assert near > 5 * far
 
 
-def test_types() -> None:
+def test_table_columns_have_types() -> None:
     assert subtype("M3.5Ve") == 63.5
     assert subtype("K") == 55
     assert nearest_spectrum("G2V") == "G2V"
@@ -253,7 +253,7 @@ def test_types() -> None:
         subtype("L5")
 
 
-def test_rates_of_a_file_beside_the_table(tmp_path: Path) -> None:
+def test_file_of_rates_is_found_next_to_the_table(tmp_path: Path) -> None:
     (tmp_path / "ffd.csv").write_text("energy,rate\n1e31,2.0\n1e34,0.001\n")
     (tmp_path / "targets.csv").write_text("name,rates_file,rates_band\neps Eri,ffd.csv,TESS\n")
     changes = {"plan": QUICK | {"targets": read_targets(tmp_path / "targets.csv")}, "orbit": {"days": 2.0}}

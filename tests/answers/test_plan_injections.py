@@ -13,7 +13,7 @@ from mauvecl.lightcurve.search.completeness import Completeness, DurationLaw
 from mauvecl.lightcurve.search.yields import fit_power_law, recovered_per_day
 
 
-def test_shares_by_hand() -> None:
+def test_shares_equal_those_computed_by_hand() -> None:
     """Two half-widths; every flare of an energy has one half-width, in the middle of their logarithms."""
     critical = np.array([[1.0, 2.0, 3.0, 4.0], [10.0, 20.0, 0.0, 30.0]])
     widths = np.array([10.0, 1000.0])
@@ -25,7 +25,7 @@ def test_shares_by_hand() -> None:
     assert short == pytest.approx([0.5])
 
 
-def test_stretches_are_the_targets() -> None:
+def test_stretches_are_those_of_the_target() -> None:
     study = Study().with_settings(["plan.targets=[{name='GJ 205'}]", "orbit.days=20", "search.false_alarms=2"])
     seen: list[TargetObservation] = []
 
@@ -44,7 +44,7 @@ def test_stretches_are_the_targets() -> None:
 
 
 @pytest.mark.long
-def test_campaigns_close_through_the_search() -> None:
+def test_simulated_campaigns_agree_with_the_plan() -> None:
     """Flares put into drawn stares and searched for: the closed form is near, and 350 campaigns give back their rates.
 
     Half of the injections make the completeness, the other half decide on the campaigns' flares. 68 +- 5 % within one

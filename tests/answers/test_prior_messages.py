@@ -46,20 +46,20 @@ def said(verb: str, engine: Engine, **sections: Any) -> list[str]:
     return [text for text in ask(study, engine).messages if text.startswith("OUTSIDE THE PRIOR")]
 
 
-def test_every_prior_is_looked_at() -> None:
+def test_every_prior_is_tested() -> None:
     assert PRIORS.keys() == PROCESSES.keys()
 
 
 # Far from the expectation no limit settles, which is refused: one prior near it.
 @pytest.mark.parametrize(("verb", "name"), [(v, n) for v in VERBS for n in PRIORS if v != "limit" or n == "light_loss"])
-def test_a_prior_away_from_the_expectation_is_named(engine: Engine, verb: str, name: str) -> None:
+def test_prior_that_excludes_the_expectation_is_reported(engine: Engine, verb: str, name: str) -> None:
     holds, misses = ({"processes": {name: {"uniform": ends}}} for ends in PRIORS[name])
     assert said(verb, engine, **holds) == []
     (sentence,) = said(verb, engine, **misses)
     assert name in sentence
 
 
-def test_a_swept_value_counts(engine: Engine) -> None:
+def test_prior_that_excludes_a_swept_value_is_reported(engine: Engine) -> None:
     """The prior contains the study's temperature, and one of the two that are swept over."""
     sweep = {"axes": [{"quantity": "detector_temperature", "values": [20.0, 10.0]}]}
     prior = {"detector_temperature": {"uniform": [18.0, 22.0]}}
@@ -68,7 +68,7 @@ def test_a_swept_value_counts(engine: Engine) -> None:
 
 
 @pytest.mark.parametrize("of", ["amplitude", "magnitude", "exposure"])
-def test_a_limit_that_does_not_settle_names_the_prior(engine: Engine, of: str) -> None:
+def test_unconverged_limit_names_the_prior(engine: Engine, of: str) -> None:
     study = small(
         star=[{"library": "G2V", "magnitude": 7.4}],
         flare={"amplitudes": [0.24]},
@@ -82,7 +82,7 @@ def test_a_limit_that_does_not_settle_names_the_prior(engine: Engine, of: str) -
         assert fact in str(error.value)
 
 
-def test_the_command_line_prints_the_message_of_a_store(tmp_path: Path) -> None:
+def test_realise_prints_the_message(tmp_path: Path) -> None:
     for ends, there in zip(PRIORS["light_loss"], (False, True), strict=True):
         prior = f"processes.light_loss={{uniform = {ends}}}"
         given = ["--star", "G2V", "-m", "7.4", "-n", "10", "--set", prior, "--output", str(tmp_path / f"{there}.zarr")]

@@ -103,7 +103,7 @@ def test_a_flare_that_saturates_alone_is_reported(engine: Engine, tmp_path: Path
     assert any(text.startswith("SATURATED") and "flare" in text for text in said), said
 
 
-def test_many_messages_become_few(engine: Engine) -> None:
+def test_many_messages_are_summarised(engine: Engine) -> None:
     """A map of 64 cells, each with a flare that saturates: one on all cells, a dozen sentences, one on the others."""
     axes = {"x": {"quantity": "amplitude", "values": [12.0 + 0.1 * n for n in range(32)]},
             "y": {"quantity": "exposure", "values": [5.0, 10.0]}}  # fmt: skip
@@ -113,7 +113,7 @@ def test_many_messages_become_few(engine: Engine) -> None:
     assert said[-1].startswith("SATURATED: pixels of ")
 
 
-def test_a_plan_reports_it() -> None:
+def test_plan_reports_saturation() -> None:
     study = Study().with_settings(
         ["plan.targets=[{name = 'Vega'}]", "orbit.days=31", "plan.hours=100", "plan.completeness='closed form'"]
     )

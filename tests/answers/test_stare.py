@@ -45,7 +45,7 @@ def found(stares) -> StareAnswer:
     return stare(SHORT, stares)
 
 
-def test_spectra_summed_over_frames_are_the_engines_exposures(stares):
+def test_spectra_summed_over_frames_equal_exposures_of_the_engine(stares):
     # Frames of a stare have the addresses of an exposure's: the same draws, to the last DN.
     study = SHORT.with_settings(["stare.gaps=[]", "stare.duration_s=50", "flare.amplitudes=[0]"])
     study = study.model_copy(update={"stare": study.stare.model_copy(update={"thermal": None, "number": 3})})
@@ -71,7 +71,7 @@ def test_light_scatters_about_its_mean_by_its_standard_deviation(found):
     assert abs(spectrum.mean()) < 4.9 / np.sqrt(spectrum.size)
 
 
-def test_the_mean_is_the_star_and_its_flare(found):
+def test_mean_equals_star_plus_flare(found):
     one = found.stares[0]
     event = one.flares[0].event
     assert (event.peak_s, event.amplitude, event.half_width_s) == (150.0, 0.5, 20.0)
@@ -84,7 +84,7 @@ def test_the_mean_is_the_star_and_its_flare(found):
         np.testing.assert_allclose(mean / quiet - 1, rise * (mean.max() / quiet - 1) / rise.max(), atol=1e-9)
 
 
-def test_bands_may_overlap_and_be_many(stares, found):
+def test_bands_can_overlap(stares, found):
     bands = [[200, 300], [200, 300], [250, 450], *([300 + 10 * k, 400 + 10 * k] for k in range(9))]
     light = stare(SHORT.with_settings([f"stare.bands_nm={bands}"]), stares).stares[0].light
     assert light.flux.shape == (50, 13)
@@ -92,7 +92,7 @@ def test_bands_may_overlap_and_be_many(stares, found):
     np.testing.assert_allclose(light.flux[:, [1, 4]], found.stares[0].light.flux[:, [1, 2]], atol=0.01)
 
 
-def test_a_flares_snr_is_that_of_its_frames_and_pixels(found):
+def test_snr_of_a_flare_combines_its_frames_and_pixels(found):
     one = found.stares[0]
     quiet, flare = one.staring.quiet, one.staring.flare[:, 0]
     spectrum = quiet.gain_dn_per_electron * one.staring.flare_electrons[0]
@@ -100,7 +100,7 @@ def test_a_flares_snr_is_that_of_its_frames_and_pixels(found):
     assert one.flares[0].snr == pytest.approx(exact, rel=1e-12)
 
 
-def test_the_same_stare_again_and_another(stares, found):
+def test_seed_determines_the_stare(stares, found):
     again = stare(SHORT, stares)
     np.testing.assert_array_equal(again.stares[0].light.spectrum, found.stares[0].light.spectrum)
     other = stare(SHORT.with_settings(["stare.number=1"]), stares)
@@ -108,7 +108,7 @@ def test_the_same_stare_again_and_another(stares, found):
     np.testing.assert_array_equal(other.stares[0].light.mean, found.stares[0].light.mean)
 
 
-def test_a_fits_file_as_lightkurve_reads_it(found):
+def test_fits_file_has_the_columns_of_lightkurve(found):
     with fits.open(io.BytesIO(found.documents["light-curve-1.fits"]())) as hdus:
         hdus.verify("exception")
         table, gti = hdus[1], hdus["GTI"]
@@ -129,7 +129,7 @@ def test_a_fits_file_as_lightkurve_reads_it(found):
         assert hdus[0].header["OBJECT"] == "G2V V = 7.4"
 
 
-def test_lightkurve_reads_it(found, tmp_path):
+def test_lightkurve_reads_the_fits_file(found, tmp_path):
     lightkurve = pytest.importorskip("lightkurve")
     found.write(tmp_path)
     curve = lightkurve.read(str(tmp_path / "light-curve-1.fits"))
@@ -138,7 +138,7 @@ def test_lightkurve_reads_it(found, tmp_path):
 
 
 @pytest.mark.long
-def test_the_search_finds_what_was_put_in_and_nothing_else(stares):
+def test_search_finds_only_the_injected_flares(stares):
     """False alarms: one in a star-month; three flares of S/N 8, 32 and 96, and one of 3 that may be missed."""
     study = Study().with_settings(
         ['star=[{library="G2V", magnitude=7.4, distance_pc=37}]', "stare.gaps=[[2500, 3000]]"]
@@ -159,13 +159,13 @@ def test_the_search_finds_what_was_put_in_and_nothing_else(stares):
     assert answer.table["found"][0] == len(found)
 
 
-def test_a_stare_too_short_for_a_search_is_told(stares):
+def test_stare_too_short_for_a_search_is_reported(stares):
     short = stare(SHORT.with_settings(["stare.search=true", "stare.duration_s=10", "stare.gaps=[]"]), stares)
     assert any("is not searched" in message for message in short.messages)
     assert short.table["found"][0] == -1
 
 
-def test_the_verb_and_its_files(tmp_path):
+def test_stare_command_writes_its_files(tmp_path):
     words = [
         "stare",
         "--star",
@@ -198,7 +198,7 @@ def test_the_verb_and_its_files(tmp_path):
     np.testing.assert_array_equal(ours["flux"], theirs["flux"])
 
 
-def test_sweeps_over_magnitude_and_temperature(stares):
+def test_sweep_over_magnitude_and_temperature_is_answered(stares):
     study = SHORT.with_settings(['sweep.axes=[{quantity="magnitude", values=[7, 9]}]'])
     swept = stare(study, stares)
     assert swept.table["magnitude"].value.tolist() == [7.0, 9.0]
@@ -208,7 +208,7 @@ def test_sweeps_over_magnitude_and_temperature(stares):
     assert [one.flares[0].event.hottest_k for one in hot.stares] == [8000.0, 20_000.0]
 
 
-def test_a_saturated_flare_is_told(stares):
+def test_saturated_flare_is_reported(stares):
     study = SHORT.with_settings(['star=[{library="G2V", magnitude=2.2}]', "flare.amplitudes=[3]"])
     cut = stare(study, stares)
     assert cut.messages[0].startswith("SATURATED: ")
@@ -216,7 +216,7 @@ def test_a_saturated_flare_is_told(stares):
     assert cut.stares[0].staring.quality.sum() == cut.table["saturated_frames"][0]
 
 
-def test_what_a_stare_does_not_use_is_said(stares):
+def test_unused_settings_are_reported(stares):
     told = stare(SHORT.with_settings(["observation.exposure_s=20", "events=[{peak_s=310}, {peak_s=200}]"]), stares)
     assert "A stare is made of frames of 5 s: observation.exposure_s = 20 s is not used." in told.messages
     (line,) = (message for message in told.messages if "outside of the frames" in message)
@@ -253,7 +253,7 @@ shape_file = "own.txt"
 
 
 @pytest.mark.long
-def test_a_study_file_with_curves_shapes_and_events(tmp_path, stares):
+def test_study_file_with_curves_shapes_and_events_is_read(tmp_path, stares):
     (tmp_path / "slow.txt").write_text("# s, relative\n0 0.0\n300 0.03\n")
     (tmp_path / "own.txt").write_text("-10 0\n0 4\n30 0\n")
     (tmp_path / "study.toml").write_text(STUDY)
@@ -269,7 +269,7 @@ def test_a_study_file_with_curves_shapes_and_events(tmp_path, stares):
     assert Case(study).stare.unknowns[0].name == "light drift"
 
 
-def test_the_two_flares_of_the_documentation(stares):
+def test_two_flares_of_the_documentation_have_their_values(stares):
     page = Path(__file__).parents[2] / "docs" / "flares-in-time.md"
     (text,) = (
         block for block in re.findall(r"```toml\n(.*?)```", page.read_text("utf-8"), re.DOTALL) if "peak = " in block
@@ -280,7 +280,7 @@ def test_the_two_flares_of_the_documentation(stares):
     assert second.bolometric_erg == pytest.approx(1e31, rel=1e-9)
 
 
-def test_unknowns_of_a_stare_are_drawn_where_asked_for():
+def test_unknowns_of_a_stare_are_drawn_if_requested():
     plain, usual = (
         Case(SHORT).stare,
         Case(SHORT.with_settings(["nuisances.usual=true", "stare.offsets.sky=0.05"])).stare,
@@ -291,7 +291,7 @@ def test_unknowns_of_a_stare_are_drawn_where_asked_for():
     assert spread == {"sky offset": 0.05, "star drift": 0.01, "temperature sine": 0.5, "temperature cosine": 0.5}
 
 
-def test_pictures_of_long_stares_and_gaps(stares):
+def test_long_stares_with_gaps_are_drawn(stares):
     study = SHORT.with_settings(["stare.duration_s=12000", "stare.gaps=[]", "stare.orbit_gap_s=2000"])
     long = stare(study, stares)
     for name in long.pictures:

@@ -54,7 +54,7 @@ def study(**nuisances: Any) -> Study:
         ({"dark": "free", "light": "free"}, 8.36, 0, 3.05),
     ],
 )
-def test_the_cost_is_that_of_the_methods(
+def test_cost_equals_that_of_the_methods(
     nuisances: dict[str, Any], known: float, plain: float, marginal: float
 ) -> None:
     asked = study(**nuisances)
@@ -72,7 +72,7 @@ def test_the_cost_is_that_of_the_methods(
     assert not marginal_lines(none)
 
 
-def test_every_answer_says_what_unknowns_cost(engine: Engine) -> None:
+def test_every_answer_reports_the_cost_of_unknowns(engine: Engine) -> None:
     small = study().with_settings(
         ["run.fap=0.01", "run.realisations=20000", "map.x={quantity='magnitude', values=[6, 8]}",
          "map.y={quantity='amplitude', values=[0.02, 0.2]}"]
@@ -89,7 +89,7 @@ def test_every_answer_says_what_unknowns_cost(engine: Engine) -> None:
     assert limiting_magnitude(marginal, engine).limits[0].closed_form < limiting_magnitude(small).limits[0].closed_form
 
 
-def test_a_study_reads_back_with_its_files(tmp_path: Path, engine: Engine) -> None:
+def test_study_is_read_back_with_its_files(tmp_path: Path, engine: Engine) -> None:
     (tmp_path / "stray.txt").write_text(STRAY)
     text = "[nuisances]\ndark = 0.1\n[nuisances.own.stray]\nfile = 'stray.txt'\nsd = 2.0\n"
     (tmp_path / "study.toml").write_text(text)
@@ -118,7 +118,7 @@ def test_a_study_reads_back_with_its_files(tmp_path: Path, engine: Engine) -> No
     )
 
 
-def test_points_in_a_study_are_the_files() -> None:
+def test_points_in_a_study_equal_those_of_files() -> None:
     asked = study(own={"x": {"points": [[200, 1], [450, 3], [700, 1]], "sd": 2.0}})
     again = Study.build(tomllib.loads(asked.toml()), "text")
     assert again == asked
@@ -131,12 +131,12 @@ def test_points_in_a_study_are_the_files() -> None:
 
 
 @pytest.mark.parametrize("text", ["200 1, 450", "200", "a b", "200 1, 200 2", "200 1 2", ","])
-def test_the_page_refuses_what_is_no_spectrum(text: str) -> None:
+def test_page_refuses_invalid_spectra(text: str) -> None:
     with pytest.raises(InputError):
         points(text)
 
 
-def test_the_page_asks_for_the_same(tmp_path: Path) -> None:
+def test_page_asks_the_same_question(tmp_path: Path) -> None:
     state = State()
     state.enter({"unknown": "the usual", "own_unknown": "200 1, 450 3, 700 1"})
     asked = state.question().study(tmp_path)
@@ -146,7 +146,7 @@ def test_the_page_asks_for_the_same(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["dark=", "=0.1", "dark=much", "dust=1"])
-def test_bad_nuisances_are_refused(text: str) -> None:
+def test_invalid_nuisances_raise(text: str) -> None:
     """Without a value, a name, a number, or a file of that name."""
     with pytest.raises(InputError) as error:
         detect(Study().with_changes({"nuisances": nuisances_of(Study(), [text])}, None))
@@ -154,14 +154,14 @@ def test_bad_nuisances_are_refused(text: str) -> None:
 
 
 @pytest.mark.parametrize("flag", ["dark", "dark=-1", "missing.txt=free"])
-def test_bad_flags_of_nuisances_are_one_sentence(flag: str, tmp_path: Path) -> None:
+def test_invalid_nuisance_flags_name_the_flag(flag: str, tmp_path: Path) -> None:
     star = ("--star", "G2V", "-m", "7.4", "-n", "20000", "--fap", "0.01")
     code, _, told = ended("detect", *star, "--nuisance", flag, folder=tmp_path)
     assert (code, told.count("\n")) == (2, 1)
     assert "expected" in told
 
 
-def test_the_usual_unknowns_are_drawn_where_the_study_observes() -> None:
+def test_usual_unknowns_follow_the_observation() -> None:
     """Around the study's own temperature; what it draws itself stays; without a sky none is unknown."""
     asked = study(usual=True).with_settings(
         ["observation.temperature_c=13", "processes.jitter={uniform=[0.0, 0.01]}", "nuisances.dark=0.3"]
@@ -180,7 +180,7 @@ def test_the_usual_unknowns_are_drawn_where_the_study_observes() -> None:
     assert Case(study()).processes.detector_temperature is None
 
 
-def test_the_documentation_holds_the_usual_unknowns() -> None:
+def test_documentation_lists_the_usual_unknowns() -> None:
     page = re.sub(r"\s+", " ", (Path(__file__).parents[2] / "docs" / "unknowns.md").read_text(encoding="utf-8"))
     for row in DOCUMENTED_NUISANCES:
         process = PROCESSES[row.process]
@@ -188,7 +188,7 @@ def test_the_documentation_holds_the_usual_unknowns() -> None:
             assert text in page
 
 
-def test_priors_have_their_joint_draw_on_both_instruments() -> None:
+def test_priors_are_drawn_jointly_on_both_instruments() -> None:
     """Priors are refused where noise must be drawn apart: nobody meets that here, at any usual setting."""
     payloads, temperatures = ("mauve", "mauve-electrons"), (-20.0, 0.0, 13.0, 21.0, 25.0)
     for payload, temperature, exposure in itertools.product(payloads, temperatures, (5.0, 50.0, 600.0)):
@@ -206,7 +206,7 @@ SEEDS = itertools.count(2026)
 
 
 @pytest.mark.long
-def test_false_alarms_as_asked_for_with_unknowns_drawn(engine: Engine) -> None:
+def test_false_alarms_with_drawn_unknowns_are_as_requested(engine: Engine) -> None:
     """100 random scenes with the documented unknowns drawn, 2e4 draws each.
 
     Marginalised: the simulated threshold on fresh draws, for which its own error counts as much as theirs, for every
@@ -248,7 +248,7 @@ def test_false_alarms_as_asked_for_with_unknowns_drawn(engine: Engine) -> None:
     assert failed == SCENES
 
 
-def test_the_table_and_its_picture(tmp_path: Path) -> None:
+def test_table_has_a_picture(tmp_path: Path) -> None:
     """METHODS section 7's row again, and the smallest amplitude has the power asked for."""
     found = unknown_table(study())
     rows = {row["unknown"]: row for row in found.table}

@@ -126,7 +126,7 @@ def test_no_unknown_is_ignored_silently(verb: str, name: str) -> None:
         assert differ(found, base, messages=verb == "plan"), f"{name} changes nothing that {verb} answers"
 
 
-def test_answers_name_what_they_do_not_use() -> None:
+def test_answers_report_unused_unknowns() -> None:
     base = plain("exposure")
     assert "not used" not in base.assumed
     found = answer("exposure", UNKNOWNS["processes.jitter"] | UNKNOWNS["stare.drifts.star"])

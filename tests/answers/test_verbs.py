@@ -18,7 +18,7 @@ from mauvecl.device.engine import Engine
 
 
 @pytest.mark.parametrize("name", VERBS)
-def test_a_verb_has_one_name_and_one_signature(name: str) -> None:
+def test_each_verb_has_one_name_and_one_signature(name: str) -> None:
     verb = VERBS[name]
     assert getattr(mauvecl, name) is verb.ask
     assert verb.ask.__name__ == name
@@ -35,13 +35,13 @@ def test_a_verb_has_one_name_and_one_signature(name: str) -> None:
     assert issubclass(getattr(module, returned), Answer)
 
 
-def test_the_command_line_has_every_verb_in_order() -> None:
+def test_command_line_has_every_verb_in_order() -> None:
     group = typer.main.get_command(app)
     assert list(group.commands)[: len(VERBS)] == list(VERBS)  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("name", QUICK)
-def test_progress_ends_with_all_of_it(name: str, engine: Engine) -> None:
+def test_progress_ends_at_its_total(name: str, engine: Engine) -> None:
     """By the positions of the arguments, which are the same for all verbs."""
     seen: list[tuple[int, int]] = []
     drawing = None if name == "plan" else engine

@@ -58,7 +58,7 @@ def test_sky_of_a_day(found: VisibleAnswer) -> None:
     assert row["zodiacal_light"].value == pytest.approx(sky.surface_brightness, abs=0.01)
 
 
-def test_what_is_told(found: VisibleAnswer) -> None:
+def test_messages_name_unseen_targets_and_the_orbit(found: VisibleAnswer) -> None:
     told = " ".join(found.messages)
     assert "EK Dra is never seen: the limit of declination alone leaves nothing" in told
     assert "mean Sun-synchronous" in told
@@ -67,7 +67,7 @@ def test_what_is_told(found: VisibleAnswer) -> None:
     assert all("assumption" in source for source in found.assumptions["source"])
 
 
-def test_written_and_read_again(found: VisibleAnswer, tmp_path: Path) -> None:
+def test_written_study_is_read_back(found: VisibleAnswer, tmp_path: Path) -> None:
     names = {path.name for path in found.write(tmp_path)}
     assert {"visible.ecsv", "months.ecsv", "days.ecsv", "windows.ecsv", "assumptions.ecsv", "visible.ics"} <= names
     again = Study.read(tmp_path / "visible.ecsv")
@@ -75,7 +75,7 @@ def test_written_and_read_again(found: VisibleAnswer, tmp_path: Path) -> None:
     assert Table.read(tmp_path / "visible.ecsv")["hours"].tolist() == found.table["hours"].value.tolist()
 
 
-def test_calendar_of_a_far_plan_has_days(found: VisibleAnswer) -> None:
+def test_calendar_beyond_the_elements_has_days(found: VisibleAnswer) -> None:
     events = icalendar.Calendar.from_ical(found.documents["visible.ics"]()).walk("VEVENT")
     assert {str(event["SUMMARY"]) for event in events} == {"eps Eri", "AU Mic"}
     for k, name in enumerate(NAMES):
@@ -84,7 +84,7 @@ def test_calendar_of_a_far_plan_has_days(found: VisibleAnswer) -> None:
         assert days == seen
 
 
-def test_calendar_of_a_near_plan_has_windows() -> None:
+def test_calendar_near_the_epoch_has_windows() -> None:
     near = Study().with_settings(["orbit.targets=['eps Eri']", "orbit.start=2026-09-20", "orbit.days=2"])
     answer = visible(near)
     events = icalendar.Calendar.from_ical(answer.documents["visible.ics"]()).walk("VEVENT")
@@ -94,7 +94,7 @@ def test_calendar_of_a_near_plan_has_windows() -> None:
     assert answer.messages == answer.messages[-1:]  # nothing of the orbit: its elements are a week old
 
 
-def test_calendars_hold_any_text() -> None:
+def test_calendar_escapes_any_text() -> None:
     """Long names, commas, other alphabets."""
     entry = Entry("2027-01-01", "2027-01-02", "α Cen; " + "long, " * 30, "two\nlines \\ and more")
     content = calendar_bytes([entry], "a, b")
@@ -105,20 +105,20 @@ def test_calendars_hold_any_text() -> None:
     assert content == calendar_bytes([entry], "a, b")
 
 
-def test_pictures(found: VisibleAnswer, study: Study) -> None:
+def test_pictures_are_drawn(found: VisibleAnswer, study: Study) -> None:
     figure = found.plot()
     assert len(figure.axes) >= 4
     many = study.with_settings([f"orbit.targets=[{', '.join(repr(f'{10 * i} 0') for i in range(8))}]", "orbit.days=5"])
     assert len(visible(many).plot().axes) == 2
 
 
-def test_dates_as_toml_has_them() -> None:
+def test_toml_dates_are_read() -> None:
     starts = ("orbit.start=2027-01-01", "orbit.start=2027-01-01T06:00:00", "orbit.start=2027-01-01T06:00:00+02:00")
     found = [Study().with_settings([one]).orbit.times().iso(0.0) for one in starts]
     assert found == ["2027-01-01T00:00:00", "2027-01-01T06:00:00", "2027-01-01T04:00:00"]
 
 
-def test_the_study_says_it_all(study: Study) -> None:
+def test_study_contains_all_flags(study: Study) -> None:
     limits = ["orbit.limits.moon_deg=none", "orbit.limits.anomaly=[[-90, -50], [40, -50], [0, 0]]"]
     changed = study.with_settings([*limits, "orbit.limits.eclipse=only"])
     assert Study.build(tomllib.loads(changed.toml()), "text") == changed

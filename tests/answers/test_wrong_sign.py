@@ -22,7 +22,7 @@ NUISANCES: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("unknown", NUISANCES)
 @pytest.mark.parametrize("temperature_k", [3000.0, 4000.0, 6000.0, 10_000.0, 20_000.0])
-def test_a_lowered_sum_is_named_where_the_simulation_finds_it_lower(
+def test_lowered_statistic_is_reported_if_simulation_lowers_it(
     engine: Engine, unknown: str, temperature_k: float
 ) -> None:
     """By the simulated means, where they differ by more than five standard errors: by chance once in 1e6."""
@@ -44,7 +44,7 @@ def test_a_lowered_sum_is_named_where_the_simulation_finds_it_lower(
     assert named <= {"uv_excess"}
 
 
-def test_some_are_lowered_and_some_are_not(engine: Engine) -> None:
+def test_cases_include_lowered_and_raised_statistics(engine: Engine) -> None:
     """The test above meets both, and a lowered one has no detections where matched has all."""
     found = {}
     for temperature_k in (4000.0, 10_000.0):
@@ -63,7 +63,7 @@ def test_some_are_lowered_and_some_are_not(engine: Engine) -> None:
 
 
 @pytest.mark.parametrize("temperature_k", [4000.0, 10_000.0])
-def test_maps_and_limits_name_what_detect_names(engine: Engine, temperature_k: float) -> None:
+def test_maps_and_limits_report_the_same_as_detect(engine: Engine, temperature_k: float) -> None:
     """In every cell of a map the same as `detect`, and a limit that cannot be has it as the cause."""
     sections = {
         "star": [{"library": "G2V", "magnitude": 7.4}],

@@ -51,7 +51,7 @@ def verbs() -> list[str]:
 
 
 @pytest.mark.parametrize("verb", long_but(verbs(), "simulate", "exposure", "detect", "visible"))
-def test_every_verb_says_what_it_assumed(verb: str, tmp_path: Path) -> None:
+def test_every_verb_prints_its_assumptions(verb: str, tmp_path: Path) -> None:
     flags, expected = ASKED[verb]
     (tmp_path / "targets.csv").write_text("name\neps Eri\n")
     light = np.random.default_rng(1).normal(100, 1, 200)
@@ -94,12 +94,12 @@ ALL = get_args(Use)
         ("orbit.limits.sun_deg=50", "Sun 50 deg"),
     ],
 )
-def test_the_line_follows_the_study(setting: str, words: str) -> None:
+def test_assumptions_follow_the_study(setting: str, words: str) -> None:
     usual, changed = assumption_line(Study(), ALL), assumption_line(Study().with_settings([setting]), ALL)
     assert words in changed
     assert words not in usual
     assert "\n" not in changed
 
 
-def test_every_verb_is_asked() -> None:
+def test_every_verb_is_tested() -> None:
     assert sorted(verbs()) == sorted(ASKED)

@@ -32,7 +32,7 @@ def write_star(path: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_unforeseen_is_one_sentence_and_a_file(tmp_path: Path) -> None:
+def test_unexpected_error_writes_a_traceback_file(tmp_path: Path) -> None:
     def fail(*_: object, **__: object) -> None:
         raise KeyError("what nobody foresaw")
 
@@ -66,7 +66,7 @@ def test_help_and_documentation_name_every_exit_code() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("words", [("--help",), ("--version",), ("library",), ("library", "--json")])
-def test_standard_output_that_takes_nothing(words: tuple[str, ...]) -> None:
+def test_unwritable_standard_output_is_reported(words: tuple[str, ...]) -> None:
     command = [sys.executable, "-m", "mauvecl", *words]
     with open("/dev/full", "w") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
@@ -81,7 +81,7 @@ def test_standard_output_that_takes_nothing(words: tuple[str, ...]) -> None:
 
 
 @pytest.mark.long
-def test_names_beyond_the_terminals_characters(tmp_path: Path) -> None:
+def test_names_outside_of_the_encoding_are_escaped(tmp_path: Path) -> None:
     write_star(tmp_path / "stérn.txt")
     for encoding in ("ascii", "latin-1"):
         done = subprocess.run(
@@ -107,7 +107,7 @@ def test_names_beyond_the_terminals_characters(tmp_path: Path) -> None:
         assert b"st\\xe9rn" in done.stdout or "stérn".encode("latin-1") in done.stdout
 
 
-def test_names_are_no_markup(tmp_path: Path) -> None:
+def test_names_are_not_parsed_as_markup(tmp_path: Path) -> None:
     """Brackets and colons of names stay in tables as they are."""
     name = "[bold]a:star:[red].txt"
     write_star(tmp_path / name)
@@ -115,7 +115,7 @@ def test_names_are_no_markup(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", [None, ""])
-def test_an_empty_environment_finds_the_linker(path: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_linker_is_found_without_path(path: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
     """PoCL looks for it on PATH alone, and ends the process where it finds none."""
     from mauvecl.device.program import load_opencl
 
@@ -158,7 +158,7 @@ def refused(*words: str, folder: Path) -> str:
     ],
     ids=lambda words: words[-1],
 )
-def test_names_that_no_file_has(words: tuple[str, ...], name: str, tmp_path: Path) -> None:
+def test_invalid_file_names_exit_with_code_2(words: tuple[str, ...], name: str, tmp_path: Path) -> None:
     """Over-long names were OSError 36."""
     refused(*words, name, folder=tmp_path)
 
@@ -168,7 +168,7 @@ NUMBERS = ["1e-308", "5e-324", "1e-31", "1e31", "1e308", "9" * 5000, str(2**64),
 
 @pytest.mark.parametrize("value", NUMBERS, ids=lambda value: value[:8])
 @pytest.mark.parametrize("key", ["run.fap", "star.0.magnitude", "run.seed", "flare.temperature_k", "signal.snr"])
-def test_extreme_numbers_in_settings_are_refused(key: str, value: str) -> None:
+def test_extreme_numbers_in_settings_raise(key: str, value: str) -> None:
     """Values such as fap = 1e-308 and whole numbers of 5000 digits end in one short sentence."""
     with pytest.raises(InputError) as error:
         exposure(Study().with_settings(["signal={snr=5, wavelength_nm=300}", f"{key}={value}"]))
@@ -176,11 +176,11 @@ def test_extreme_numbers_in_settings_are_refused(key: str, value: str) -> None:
     assert len(str(error.value)) < 1100
 
 
-def test_a_long_number_on_the_command_line_is_one_sentence(tmp_path: Path) -> None:
+def test_long_number_is_shortened_in_the_message(tmp_path: Path) -> None:
     refused("exposure", "--snr", "5", "--at", "300", "--set", f"run.seed={'9' * 5000}", folder=tmp_path)
 
 
-def test_extreme_numbers_in_instruments_are_refused(tmp_path: Path) -> None:
+def test_extreme_numbers_in_instruments_raise(tmp_path: Path) -> None:
     for value in NUMBERS:
         (tmp_path / "mine.toml").write_text(f"extends = 'mauve'\nread_noise_dn = {value}\n")
         with pytest.raises(InputError) as error:
@@ -201,7 +201,7 @@ def test_extreme_numbers_in_instruments_are_refused(tmp_path: Path) -> None:
     ],
     ids=["arrays", "tables", "a dotted key", "a dotted table", "a few more than any study"],
 )
-def test_nesting_has_an_end(text: str, tmp_path: Path) -> None:
+def test_deep_nesting_is_refused(text: str, tmp_path: Path) -> None:
     """RecursionError, or 3.8 GB for a key of 50000 parts."""
     (tmp_path / "deep.toml").write_text(text)
     refused("simulate", "deep.toml", folder=tmp_path)
@@ -209,12 +209,12 @@ def test_nesting_has_an_end(text: str, tmp_path: Path) -> None:
     refused(*OBSERVE, "--set", text.replace("a = ", "run.fap="), folder=tmp_path)
 
 
-def test_an_exposure_has_frames_that_can_be_counted(tmp_path: Path) -> None:
+def test_too_many_frames_are_refused(tmp_path: Path) -> None:
     """Frames of a nanosecond overflowed the kernels' 32 bits."""
     assert "frames" in refused(*OBSERVE, "--set", "observation.changes.frame_s=1e-9", folder=tmp_path)
 
 
-def test_chains_of_instruments_have_an_end(tmp_path: Path) -> None:
+def test_long_chains_of_instruments_are_refused(tmp_path: Path) -> None:
     for i in range(100):
         (tmp_path / f"{i}.toml").write_text(f"extends = '{i + 1}.toml'\n")
     (tmp_path / "100.toml").write_text("extends = 'mauve'\n")
@@ -225,7 +225,7 @@ def test_chains_of_instruments_have_an_end(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "content", ["[" * 100_000, "null", "[]", '{"attributes": []}', '{"attributes": {"study": "a = 1e999"}}']
 )
-def test_manifests_that_are_none(content: str, tmp_path: Path) -> None:
+def test_invalid_manifests_are_refused(content: str, tmp_path: Path) -> None:
     """RecursionError of nested JSON. Alone it is someone else's file; beside shards it was ours and is damaged."""
     for folder, name in (("store", "zarr.json"), ("run/checkpoint", "manifest.json")):
         (tmp_path / folder).mkdir(parents=True)
@@ -244,7 +244,7 @@ def test_manifests_that_are_none(content: str, tmp_path: Path) -> None:
         assert "damaged" in checkpoint.messages[0]
 
 
-def test_what_is_read_is_a_regular_file(tmp_path: Path) -> None:
+def test_only_regular_files_are_read(tmp_path: Path) -> None:
     """/dev/zero took all memory, and a pipe was waited for without end."""
     os.mkfifo(tmp_path / "pipe")
     for kind in ("toml", "ecsv", "csv", "txt"):
@@ -286,7 +286,7 @@ def test_what_is_read_is_a_regular_file(tmp_path: Path) -> None:
         "200",
     ],
 )
-def test_unusable_weights_are_refused(weights: str, tmp_path: Path) -> None:
+def test_unusable_weights_raise(weights: str, tmp_path: Path) -> None:
     (tmp_path / "weights.txt").write_text(weights)
     with pytest.raises(InputError) as error:
         detect(Study().with_settings([f"run.weights.mine='{tmp_path / 'weights.txt'}'"]))
@@ -294,7 +294,7 @@ def test_unusable_weights_are_refused(weights: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_an_output_that_is_a_folder(tmp_path: Path) -> None:
+def test_output_that_is_a_folder_is_refused(tmp_path: Path) -> None:
     """IsADirectoryError."""
     for name in ("study.toml", "observation-1.fits", "observation-1.ecsv", "run.json"):
         (tmp_path / name / name).mkdir(parents=True)
@@ -309,7 +309,7 @@ def test_an_output_that_is_a_folder(tmp_path: Path) -> None:
     ["tcp://", "tcp://[::1", "://", "tcp://host", "tcp://host:99999", "foo://x:1", "tcp://x y:1", "tcp://\udcff:1",
      "local:", "local:0", "local:²", "local:" + "9" * 5000, "", "file"],
 )  # fmt: skip
-def test_clusters_that_are_no_address(address: str, tmp_path: Path) -> None:
+def test_invalid_cluster_addresses_are_refused(address: str, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("{}")
     refused(*DETECT, "--cluster", address, folder=tmp_path)
 
@@ -319,17 +319,17 @@ def test_clusters_that_are_no_address(address: str, tmp_path: Path) -> None:
     ["word", "http://", "http://[::1", "http://x y/", "file:///dev/zero", "http://h:99999/", "http://\udcff/",
      "data:,x", "http://" + "a" * 70 + ".com/"],
 )  # fmt: skip
-def test_collections_that_are_at_no_address(address: str, tmp_path: Path) -> None:
+def test_invalid_collection_addresses_are_refused(address: str, tmp_path: Path) -> None:
     refused("library", "fetch", "ngsl:HD 1", "--from", address, folder=tmp_path)
 
 
-def test_two_flags_for_one_key(tmp_path: Path) -> None:
+def test_two_flags_for_one_key_are_refused(tmp_path: Path) -> None:
     """--flares beside -a was dropped in silence."""
     (tmp_path / "flares.csv").write_text("amplitude\n0.1\n")
     assert "--flares and --amplitude" in refused(*DETECT, "--flares", "flares.csv", folder=tmp_path)
 
 
-def test_wrong_use_of_flags_has_the_same_style(tmp_path: Path) -> None:
+def test_wrong_use_of_flags_exits_with_code_2(tmp_path: Path) -> None:
     for words in (
         ("detetc",),
         ("detect", "--nope"),
@@ -354,14 +354,14 @@ def test_wrong_use_of_flags_has_the_same_style(tmp_path: Path) -> None:
     ],
     ids=lambda words: words[0],
 )
-def test_what_takes_more_than_a_year_is_questioned(words: tuple[str, ...], tmp_path: Path) -> None:
+def test_runs_above_one_year_need_insist(words: tuple[str, ...], tmp_path: Path) -> None:
     told = refused(*words, folder=tmp_path)
     assert "years" in told
     assert "--insist" in told
     assert not list(tmp_path.iterdir()), "nothing has begun"
 
 
-def test_how_long_a_year_is() -> None:
+def test_duration_is_estimated_for_local_runs_only() -> None:
     study = Study()
     drawn = len(study.star) * (1 + len(study.flare.amplitudes)) * study.observation.load_instrument().pixels
     year = int(foresight.YEAR_S * foresight.CORE_RATE * (os.cpu_count() or 1) / drawn)
@@ -380,7 +380,7 @@ def test_how_long_a_year_is() -> None:
         foresight.question_time(beyond, **here, insist=True)
 
 
-def test_what_the_disk_has_no_room_for_is_questioned(tmp_path: Path) -> None:
+def test_stores_larger_than_the_disk_need_insist(tmp_path: Path) -> None:
     """`realise -n 1e12` are petabytes; it began."""
     words = ("realise", "--star", "G2V", "-m", "7", "-a", "0.1", "-t", "5")
     usage = mock.Mock(free=10 << 20)
@@ -406,7 +406,7 @@ def test_what_the_disk_has_no_room_for_is_questioned(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_uploads_are_read_apart(tmp_path: Path) -> None:
+def test_uploads_are_read_in_a_limited_process(tmp_path: Path) -> None:
     from mauvecl.host.stars.source import Source
     from mauvecl.web import sandboxed_reader
 

@@ -34,7 +34,7 @@ def answered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 
 @pytest.mark.long
-def test_detect_answers_the_papers_question(answered: tuple[Path, str]) -> None:
+def test_detect_answers_the_question_of_the_paper(answered: tuple[Path, str]) -> None:
     folder, text = answered
     lines = text.splitlines()
     assert "not a flight calibration" in lines[0]
@@ -59,7 +59,7 @@ def test_detect_answers_the_papers_question(answered: tuple[Path, str]) -> None:
 
 
 @pytest.mark.long
-def test_the_papers_pair_is_compared(answered: tuple[Path, str]) -> None:
+def test_detect_compares_with_the_values_of_the_paper(answered: tuple[Path, str]) -> None:
     """Both of the paper's values are reconstructed within 30 %, and the text says why a calibrated answer differs."""
     _, text = answered
     for amplitude, reduced in (("8.1 %", 0.66), ("24 %", 3.75)):
@@ -71,7 +71,7 @@ def test_the_papers_pair_is_compared(answered: tuple[Path, str]) -> None:
 
 
 @pytest.mark.long
-def test_files_and_record(answered: tuple[Path, str]) -> None:
+def test_detect_writes_files_and_record(answered: tuple[Path, str]) -> None:
     folder, text = answered
     out = folder / "mauvecl-detect"
     tables = {"detection.ecsv", "departures.ecsv", "roc.ecsv", "tails.ecsv"}
@@ -89,7 +89,7 @@ def test_files_and_record(answered: tuple[Path, str]) -> None:
 
 
 @pytest.mark.long
-def test_everything_side_by_side(tmp_path: Path) -> None:
+def test_detect_takes_all_statistics(tmp_path: Path) -> None:
     """Six statistics against noisy exposures and by estimated variances, and the study that says so."""
     words = ("detect", "--star", "G2V", "-m", "7.4", "-a", "0.1", "-n", "20000", "--fap", "0.01", "--no-pictures")
     shown = run(*words, "--statistic", "all", "--reference", "stack:3", "--variances", "estimated", folder=tmp_path)
@@ -100,7 +100,7 @@ def test_everything_side_by_side(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_study_gives_the_same_bits_again(answered: tuple[Path, str], tmp_path: Path) -> None:
+def test_written_study_gives_the_same_bits(answered: tuple[Path, str], tmp_path: Path) -> None:
     folder, _ = answered
     first = folder / "mauvecl-detect"
     run("detect", first / "study.toml", "--no-pictures", "-o", "again", folder=tmp_path)
@@ -109,7 +109,7 @@ def test_the_study_gives_the_same_bits_again(answered: tuple[Path, str], tmp_pat
 
 
 @pytest.mark.long
-def test_a_table_is_read_back_into_its_study(answered: tuple[Path, str], tmp_path: Path) -> None:
+def test_study_is_read_from_a_table(answered: tuple[Path, str], tmp_path: Path) -> None:
     folder, _ = answered
     table = folder / "mauvecl-detect" / "detection.ecsv"
     assert Study.read(table) == Study.read(folder / "mauvecl-detect" / "study.toml")
@@ -117,7 +117,7 @@ def test_a_table_is_read_back_into_its_study(answered: tuple[Path, str], tmp_pat
     assert "table 'no.ecsv' cannot be read" in run("detect", "no.ecsv", folder=tmp_path, code=2).stderr
 
 
-def test_weights_of_ones_own_in_a_study(tmp_path: Path) -> None:
+def test_study_defines_weights(tmp_path: Path) -> None:
     """A band around 280 nm: its closed form and its simulation agree, and bad files are a sentence."""
     (tmp_path / "band.txt").write_text("# nm, per DN\n270 1\n290 1\n")
     words = ("detect", "study.toml", "-n", "20000", "--fap", "0.01", "--no-pictures")
@@ -137,7 +137,7 @@ def test_weights_of_ones_own_in_a_study(tmp_path: Path) -> None:
         assert error.value.expected
 
 
-def test_a_study_file_and_flags(tmp_path: Path) -> None:
+def test_flags_override_the_study_file(tmp_path: Path) -> None:
     """A user's own spectrum named in a study, with flags on top; JSON alone on standard output."""
     wavelength = np.arange(170.0, 1100.0, 2.0)
     np.savetxt(tmp_path / "mine.txt", np.column_stack([wavelength, 1e-11 * np.ones_like(wavelength)]))
@@ -159,7 +159,7 @@ def test_a_study_file_and_flags(tmp_path: Path) -> None:
     assert "seed = 7" in text
 
 
-def test_a_study_may_redden_its_star() -> None:
+def test_study_reddens_its_star() -> None:
     plain, behind = (Star(library="G2V", magnitude=7.4, ebv=e).source() for e in (None, 0.3))
     assert behind.magnitude("V") == pytest.approx(plain.magnitude("V"), abs=1e-9)
     assert behind.magnitude("GALEX NUV") > plain.magnitude("GALEX NUV") + 1
@@ -186,7 +186,7 @@ fap = 0.1
 
 
 @pytest.mark.long
-def test_a_study_may_ask_for_processes(tmp_path: Path, engine: Engine) -> None:
+def test_study_has_processes(tmp_path: Path, engine: Engine) -> None:
     """As the engine given them in Python, and written back as they were read."""
     (tmp_path / "study.toml").write_text(PROCESSES)
     study = Study.read(tmp_path / "study.toml")
@@ -207,7 +207,7 @@ def test_a_study_may_ask_for_processes(tmp_path: Path, engine: Engine) -> None:
     assert "cosmic_rays" in simulate(study).observations[0][2].colnames
 
 
-def test_simulate(tmp_path: Path) -> None:
+def test_simulate_writes_components(tmp_path: Path) -> None:
     run("simulate", "--star", "G2V", "-m", "7.4", "-a", "0.24", "-t", "10", "-o", "out", folder=tmp_path)
     table = QTable.read(tmp_path / "out" / "observation-2.ecsv")
     parts = ("source", "sky", "photon_noise", "dark", "bias", "read_noise", "digitisation")
@@ -221,7 +221,7 @@ def test_simulate(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "observation-2.png").exists()
 
 
-def test_a_simulation_is_the_engines_realisation() -> None:
+def test_simulation_equals_the_realisation_of_the_engine() -> None:
     from scenes import instrument, star
 
     from mauvecl.device.engine import Engine
@@ -234,7 +234,7 @@ def test_a_simulation_is_the_engines_realisation() -> None:
 
 
 @pytest.mark.long
-def test_the_parts_of_a_simulation_have_their_variances() -> None:
+def test_components_of_a_simulation_have_their_variances() -> None:
     """Photon and read noise apart: 197 pixels x 30 realisations, each sum of squares within 5 standard errors."""
     from scenes import instrument, star
 
@@ -250,7 +250,7 @@ def test_the_parts_of_a_simulation_have_their_variances() -> None:
     assert abs((photon * read).sum()) < 5 * np.sqrt(n)
 
 
-def test_snr(tmp_path: Path) -> None:
+def test_snr_writes_its_tables(tmp_path: Path) -> None:
     done = run("snr", "--star", "B2IV", "-m", "3.03", "-t", "5", "-n", "5000", "-o", "out", folder=tmp_path)
     assert "S/N per 10.5 nm element" in done.stdout
     table = QTable.read(tmp_path / "out" / "snr-element.ecsv")
@@ -261,7 +261,7 @@ def test_snr(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_snr_of_the_papers_budgets_and_a_sweep(tmp_path: Path) -> None:
+def test_snr_answers_the_budgets_of_the_paper_and_sweeps(tmp_path: Path) -> None:
     """Without arguments the paper's three stars at 50 s and 600 s; with a sweep every combination, or a list."""
     shown = run("snr", "-n", "500", folder=tmp_path).stdout
     for name in ("B2IV V = 3.03", "K3V V = 3.7", "G2V V = 7.4"):
@@ -278,7 +278,7 @@ def test_snr_of_the_papers_budgets_and_a_sweep(tmp_path: Path) -> None:
     assert "--sweep 'magnitude=a'" in run("snr", "--sweep", "magnitude=a", folder=tmp_path, code=2).stderr
 
 
-def test_gaussian(tmp_path: Path) -> None:
+def test_gaussian_writes_its_tables(tmp_path: Path) -> None:
     words = ("--star", "G2V", "-n", "10000", "--fap", "0.01", "--sweep", "magnitude=6,9", "--statistic", "matched")
     shown = run("gaussian", *words, folder=tmp_path).stdout
     assert "The root-of-N formula beside 10,000 realisations" in shown
@@ -286,7 +286,7 @@ def test_gaussian(tmp_path: Path) -> None:
     assert {p.name for p in (tmp_path / "mauvecl-gaussian").iterdir()} == names
 
 
-def test_a_wrong_template_costs(tmp_path: Path) -> None:
+def test_wrong_template_loses_snr(tmp_path: Path) -> None:
     """Looked for as 5000 K a flare of 10000 K is seen less often, and the text says how much S/N is kept."""
     words = ("--star", "G2V", "-m", "7.4", "-a", "0.01", "-n", "50000", "--fap", "0.01", "--statistic", "matched")
     shown = run("detect", *words, "--no-pictures", "--template", "5000", "--template", "10000", folder=tmp_path).stdout
@@ -298,7 +298,7 @@ def test_a_wrong_template_costs(tmp_path: Path) -> None:
     assert p["matched 5000 K"] < p["matched"] == p["matched 10000 K"]
 
 
-def test_limit(tmp_path: Path) -> None:
+def test_limit_writes_its_table(tmp_path: Path) -> None:
     """The table, its files, and the study that gives the same bits again."""
     words = ("--star", "G2V", "-a", "0.24", "-n", "20000", "--fap", "0.01", "--statistic", "matched")
     shown = run("limit", *words, folder=tmp_path).stdout
@@ -316,7 +316,7 @@ def test_limit(tmp_path: Path) -> None:
     )
 
 
-def test_exposure(tmp_path: Path) -> None:
+def test_exposure_prints_its_row(tmp_path: Path) -> None:
     words = ("exposure", "--snr", "10", "--at", "300", "--star", "G2V", "-m", "7.4")
     assert "S/N of 10 per element at 300 nm" in run(*words, folder=tmp_path).stdout
     row = json.loads(run(*words, "--json", folder=tmp_path).stdout)["rows"][0]
@@ -324,7 +324,7 @@ def test_exposure(tmp_path: Path) -> None:
     assert "wavelength = 900.0 nm" in run(*words[:4], "900", folder=tmp_path, code=2).stderr
 
 
-def test_map(tmp_path: Path) -> None:
+def test_map_writes_its_table(tmp_path: Path) -> None:
     words = ("--star", "G2V", "--x", "magnitude:6:9:3", "--y", "amplitude=0.05,0.2", "-n", "20000", "--fap", "0.01")
     shown = run("map", *words, "--statistic", "matched", folder=tmp_path).stdout
     assert "detection probability in percent, matched" in shown
@@ -361,7 +361,7 @@ def test_the_schema_describes_every_key(tmp_path: Path) -> None:
     assert set(schema["properties"]) == set(Study.model_fields)
 
 
-def test_library_and_devices(tmp_path: Path) -> None:
+def test_library_and_devices_are_listed(tmp_path: Path) -> None:
     assert "HD 40307" in run("library", folder=tmp_path).stdout
     assert len(json.loads(run("library", "--json", folder=tmp_path).stdout)) >= 25
     assert "Portable Computing Language" in run("devices", folder=tmp_path).stdout
@@ -369,7 +369,7 @@ def test_library_and_devices(tmp_path: Path) -> None:
     assert "mauvecl 0" in run("--version", folder=tmp_path).stdout
 
 
-def test_saturation_comes_first(tmp_path: Path) -> None:
+def test_saturation_is_the_first_message(tmp_path: Path) -> None:
     done = run("simulate", "--star", "B2IV", "-m", "0.5", "-t", "5", "--no-pictures", folder=tmp_path)
     first = done.stdout.splitlines()[0]
     assert first.startswith("SATURATED: ")
@@ -405,14 +405,14 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_input_is_a_sentence_and_exit_code_2(name: str, tmp_path: Path) -> None:
+def test_bad_input_exits_with_code_2(name: str, tmp_path: Path) -> None:
     words, sentence = BAD[name]
     done = run(*words, folder=tmp_path, code=2)
     assert sentence in done.stderr
     assert done.stdout == ""
 
 
-def test_a_bad_study_file_is_a_sentence_and_exit_code_2(tmp_path: Path) -> None:
+def test_bad_study_file_exits_with_code_2(tmp_path: Path) -> None:
     (tmp_path / "study.toml").write_text("[run]\nsead = 3")
     done = run("detect", "study.toml", folder=tmp_path, code=2)
     assert done.stderr.count("\n") == 1
@@ -442,7 +442,7 @@ LONG = (
 
 
 @pytest.mark.long
-def test_stopped_and_resumed_as_if_never_stopped(tmp_path: Path) -> None:
+def test_interrupted_run_is_resumed_to_the_same_bits(tmp_path: Path) -> None:
     """Ctrl-C, the end of a batch job, kill -9: each next run goes on, and the last writes the tables of one alone."""
     command, shards, kept = [*SMALL_SHARDS, *LONG, "--resume", "--keep-after", "0"], tmp_path / "out" / "checkpoint", 0
 
@@ -473,7 +473,7 @@ def test_stopped_and_resumed_as_if_never_stopped(tmp_path: Path) -> None:
         assert (tmp_path / "out" / name).read_bytes() == (alone / "out" / name).read_bytes()
 
 
-def test_nothing_heavy_is_loaded_early() -> None:
+def test_import_loads_no_heavy_package() -> None:
     """Importing the package, or asking for help, loads neither OpenCL nor synphot nor astropy."""
     heavy = "('pyopencl', 'synphot', 'astropy', 'scipy')"
     code = f"import sys, mauvecl, mauvecl.cli.app; print([m for m in {heavy} if m in sys.modules])"

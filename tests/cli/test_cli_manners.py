@@ -35,13 +35,13 @@ for key, field in fields_of(Study):
 
 
 @pytest.mark.parametrize("name", VERBS)
-def test_help_teaches_by_an_example(name: str) -> None:
+def test_help_has_an_example(name: str) -> None:
     if not hasattr(VERBS[name], "commands"):
         assert f"mauvecl {name}" in VERBS[name].help.split("Example", 1)[1]
     assert all(p.help for p in VERBS[name].params if getattr(p, "opts", None) and p.param_type_name == "option")
 
 
-def test_the_list_of_verbs_is_whole() -> None:
+def test_list_of_verbs_is_not_truncated() -> None:
     """The first sentence of each fits into 80 columns: none ends in dots."""
     shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "80"}).output
     assert "Commands:" in shown
@@ -49,7 +49,7 @@ def test_the_list_of_verbs_is_whole() -> None:
 
 
 @pytest.mark.parametrize("name", VERBS)
-def test_defaults_that_help_tells_are_those_of_the_study(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_defaults_in_help_equal_those_of_the_study(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each verb without arguments, up to the study that it would answer."""
     asked: list[Study] = []
 
@@ -82,7 +82,7 @@ def _at(study: Study, path: tuple[str, ...]) -> Any:
     return value
 
 
-def test_the_same_word_means_the_same_everywhere() -> None:
+def test_each_flag_has_one_help_text() -> None:
     """A flag has one help text, whatever the verb; only its default differs."""
     said: dict[str, set[str]] = {}
     for verb in VERBS.values():
@@ -104,7 +104,7 @@ def test_bash_completes_verbs_and_flags(tmp_path: Path) -> None:
         assert wanted in done.stdout.split(), done
 
 
-def test_pipes_get_no_colour_and_errors_their_own_way(tmp_path: Path) -> None:
+def test_pipes_have_no_colour_and_errors_go_to_stderr(tmp_path: Path) -> None:
     plain = started("library", folder=tmp_path, TERM="xterm-256color")
     assert "\x1b" not in plain.stdout + plain.stderr
     assert "G2V" in plain.stdout
@@ -131,7 +131,7 @@ def test_json_is_alone_on_standard_output(words: tuple[str, ...], tmp_path: Path
 
 
 @pytest.mark.long
-def test_quiet_prints_no_progress_and_no_files(tmp_path: Path) -> None:
+def test_quiet_prints_neither_progress_nor_files(tmp_path: Path) -> None:
     words = ("detect", "--star", "G2V", "-m", "8", "-a", "0.1", "-n", "100000", "--no-pictures")
     loud, quiet = (started(*words, *more, folder=tmp_path) for more in ((), ("--quiet",)))
     assert "detection.ecsv" in loud.stdout + loud.stderr
@@ -176,7 +176,7 @@ for words in json.loads(sys.argv[1]):
 """
 
 
-def test_nothing_large_is_loaded_for_a_mistake(tmp_path: Path) -> None:
+def test_mistakes_load_no_heavy_package(tmp_path: Path) -> None:
     """What a user waits for after a typing error is imports, and nothing else: none of those that take long."""
     code = TRIED.replace("HEAVY", repr(HEAVY))
     asked = [["--version"], *MISTAKES]

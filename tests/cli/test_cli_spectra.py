@@ -22,7 +22,7 @@ def simulated(folder: Path, *flags: str) -> str:
     return " ".join(done.output.split())
 
 
-def test_what_is_assumed_of_a_star_stands_in_the_first_lines(tmp_path: Path) -> None:
+def test_assumptions_about_a_spectrum_come_first(tmp_path: Path) -> None:
     told = simulated(tmp_path, "--star", str(FILES / "10lac_stis_001.txt"), "--wavelength-unit", "Angstrom", "-m", "8")
     assert told.index("ASSUMED: flux in erg") < told.index("10lac_stis_001 V = 8")
     record = json.loads(next((tmp_path / "out").glob("*.json")).read_text())
@@ -32,7 +32,7 @@ def test_what_is_assumed_of_a_star_stands_in_the_first_lines(tmp_path: Path) -> 
     assert (again.star[0].wavelength_unit, again.star[0].magnitude) == ("Angstrom", 8.0)
 
 
-def test_a_star_is_extended_and_binned(tmp_path: Path) -> None:
+def test_star_is_extended_and_binned(tmp_path: Path) -> None:
     flags = ("--star", str(FILES / "vb8_stiswfcnic_004.fits"), "--extend", "M3V", "--bin-nm", "2", "-m", "9")
     told = simulated(tmp_path, *flags)
     assert "continued by M3V" in told
@@ -41,7 +41,7 @@ def test_a_star_is_extended_and_binned(tmp_path: Path) -> None:
     assert "ckp00_5750" in told
 
 
-def test_keys_of_files_belong_to_stars_of_files(tmp_path: Path) -> None:
+def test_keys_of_files_need_stars_from_files(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["simulate", "--star", "G2V", "--extend", "K5V", "-o", str(tmp_path)])
     assert isinstance(done.exception, InputError)
     assert "--extend without a spectrum file among the stars" in str(done.exception)

@@ -24,7 +24,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return Clock(monkeypatch)
 
 
-def test_no_time_is_left_after_one_of_1e12(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+def test_time_left_is_unknown_after_few_realisations(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
     """The first tile's rate says little: 1 of 1e12 in 11 s would be 348 thousand years."""
     with Meter() as meter:
         for done in (0, 1):
@@ -40,7 +40,7 @@ def test_no_time_is_left_after_one_of_1e12(clock: Clock, capsys: pytest.CaptureF
 @pytest.mark.parametrize(
     ("done", "left"), [(100, "99 s left"), (20, "9 min left"), (50, "3 min left"), (2, "time left unknown")]
 )
-def test_time_left(done: int, left: str, clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+def test_time_left_is_estimated(done: int, left: str, clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
     with Meter(unit="cells") as meter:
         meter(0, 1000)
         clock.now += 11.0
@@ -48,7 +48,7 @@ def test_time_left(done: int, left: str, clock: Clock, capsys: pytest.CaptureFix
     assert capsys.readouterr().err.rstrip().endswith(left)
 
 
-def test_threads_may_tell_late(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+def test_late_progress_is_ignored(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
     """A smaller number of the same work is old news: the rate goes on from the beginning."""
     with Meter() as meter:
         meter(0, 1000)
@@ -59,7 +59,7 @@ def test_threads_may_tell_late(clock: Clock, capsys: pytest.CaptureFixture[str])
     assert last == "500 of 1000 realisations, 16.7 a second, 30 s left"
 
 
-def test_the_next_stars_work_begins_anew(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+def test_meter_restarts_for_the_next_star(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
     with Meter() as meter:
         for total in (1000, 2000):
             meter(0, total)
@@ -71,7 +71,7 @@ def test_the_next_stars_work_begins_anew(clock: Clock, capsys: pytest.CaptureFix
     ]
 
 
-def test_no_empty_columns(capsys: pytest.CaptureFixture[str]) -> None:
+def test_empty_columns_are_omitted(capsys: pytest.CaptureFixture[str]) -> None:
     show_table("title", ("a", "empty", "b"), [("1", "", "x"), ("2", "", "")])
     told = capsys.readouterr().out
     assert "empty" not in told
@@ -80,7 +80,7 @@ def test_no_empty_columns(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize("width", [10, 40, 80, 132])
-def test_a_narrow_terminal_cuts_nothing(
+def test_narrow_terminal_truncates_nothing(
     width: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", str(width))

@@ -49,7 +49,7 @@ def full_from(step: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("verb", VERBS)
-def test_the_answer_is_told_though_the_disk_is_full(
+def test_answer_is_printed_if_the_disk_is_full(
     verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Nothing is written, nothing half written, and a table that was there is still there."""
@@ -65,7 +65,7 @@ def test_the_answer_is_told_though_the_disk_is_full(
 
 
 @pytest.mark.long
-def test_a_disk_that_fills_at_every_file(
+def test_each_file_is_whole_or_missing_if_the_disk_fills(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Those before it are as ever, those after it as they were."""
@@ -89,7 +89,7 @@ def test_a_disk_that_fills_at_every_file(
 
 
 @pytest.mark.long
-def test_a_disk_that_is_really_full(small_disk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_full_file_system_keeps_earlier_files(small_disk: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = small_disk / "out"
     words = [*VERBS["simulate"], "--no-pictures", "--output", str(out)]
     app(words, standalone_mode=False)
@@ -103,7 +103,7 @@ def test_a_disk_that_is_really_full(small_disk: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize("name", ["f.fits", "f.h5"])
-def test_an_export_onto_a_full_disk(name: str, small_disk: Path, tmp_path: Path) -> None:
+def test_export_to_a_full_disk_keeps_the_earlier_file(name: str, small_disk: Path, tmp_path: Path) -> None:
     from stores import Painter, study
 
     from mauvecl.store import bulk
@@ -116,7 +116,7 @@ def test_an_export_onto_a_full_disk(name: str, small_disk: Path, tmp_path: Path)
     assert [(p.name, p.read_text()) for p in small_disk.iterdir()] == [(name, "of an earlier run")]
 
 
-def test_one_process_writes_a_folder_from_beginning_to_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_output_folder_is_locked_while_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Tables too, and of verbs that draw nothing."""
     out = tmp_path / "out"
     out.mkdir()
@@ -144,7 +144,7 @@ SHARD = f"{hashlib.md5(b'').hexdigest()}-0-0-4096.npz"
 
 
 @pytest.mark.parametrize("how", [{"restart": True}, {"resume": True}, {}])
-def test_a_folder_called_checkpoint_is_not_ours_by_its_name(tmp_path: Path, how: dict[str, bool]) -> None:
+def test_only_files_of_a_checkpoint_are_removed(tmp_path: Path, how: dict[str, bool]) -> None:
     """Only files that a checkpoint writes are removed, at a restart and at the end."""
     theirs = tmp_path / "checkpoint"
     (theirs / "deep").mkdir(parents=True)
@@ -167,7 +167,7 @@ def test_a_folder_called_checkpoint_is_not_ours_by_its_name(tmp_path: Path, how:
 
 
 @pytest.mark.parametrize("how", [{"restart": True}, {"resume": True}, {}])
-def test_another_programs_manifest_is_kept(tmp_path: Path, how: dict[str, bool]) -> None:
+def test_foreign_manifest_is_kept(tmp_path: Path, how: dict[str, bool]) -> None:
     manifest = tmp_path / "checkpoint" / "manifest.json"
     manifest.parent.mkdir()
     manifest.write_text('{"model": "mine"}')
@@ -179,7 +179,7 @@ def test_another_programs_manifest_is_kept(tmp_path: Path, how: dict[str, bool])
     assert manifest.read_text() == '{"model": "mine"}'
 
 
-def test_a_restart_waits_for_no_one(tmp_path: Path) -> None:
+def test_restart_of_a_locked_folder_raises(tmp_path: Path) -> None:
     """What another process holds is not looked at, let alone removed."""
     with Checkpoint(tmp_path, "detect", small(), patience_s=0.0) as checkpoint:
         checkpoint.put(SHARD.removesuffix(".npz"), {})
@@ -192,7 +192,7 @@ def test_a_restart_waits_for_no_one(tmp_path: Path) -> None:
         assert checkpoint.kept == 1
 
 
-def test_what_cannot_be_put_in_place_leaves_nothing(tmp_path: Path) -> None:
+def test_failed_write_leaves_no_file(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     with refused("file"):
         write_whole(tmp_path / "a", b"content")
@@ -207,7 +207,7 @@ def names(folder: Path) -> set[str]:
 
 
 @pytest.mark.long
-def test_nothing_of_another_run_stays_beside_the_new(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_files_of_the_previous_run_are_removed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Pictures and tables of the run before are removed, what a user changed or put there is not."""
     out = tmp_path / "out"
     app(["simulate", "--star", "G2V", "--star", "K3V", "-m", "7", "-t", "5", "-o", str(out)], standalone_mode=False)
@@ -219,7 +219,7 @@ def test_nothing_of_another_run_stays_beside_the_new(tmp_path: Path, capsys: pyt
 
 
 @pytest.mark.parametrize("record", ["", "[]", '{"files": 3}', '{"files": {"../mine": "x"}}', '{"files": {"a": 1}}'])
-def test_a_record_of_another_program_removes_nothing(record: str, tmp_path: Path) -> None:
+def test_foreign_record_removes_nothing(record: str, tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
     (out / "run.json").write_text(record)
@@ -229,7 +229,7 @@ def test_a_record_of_another_program_removes_nothing(record: str, tmp_path: Path
     assert (out / "a").read_text() == (tmp_path / "mine").read_text() == "mine"
 
 
-def test_an_interruption_while_tables_are_written_is_a_sentence(
+def test_interruption_while_writing_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     real = write_whole

@@ -37,7 +37,7 @@ def all_flags() -> dict[str, dict[str, Any]]:
     return commands
 
 
-def test_flags_are_those_of_the_file() -> None:
+def test_flags_equal_those_of_the_file() -> None:
     """To accept a change: python tests/cli/test_flags.py."""
     assert all_flags() == json.loads(FILE.read_text(encoding="utf-8"))
 

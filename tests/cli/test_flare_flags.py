@@ -36,13 +36,13 @@ def test_flags_set_the_spectrum(tmp_path: Path) -> None:
         (("--flare-file", "missing.txt"), "missing.txt"),
     ],
 )
-def test_a_wrong_one_is_named(words: tuple[str, ...], text: str, tmp_path: Path) -> None:
+def test_wrong_flag_is_named(words: tuple[str, ...], text: str, tmp_path: Path) -> None:
     code, _, told = ended("detect", *STAR, *words, folder=tmp_path)
     assert code == 2
     assert text in told
 
 
-def test_every_verb_with_a_flare_temperature_takes_them() -> None:
+def test_every_verb_with_flares_takes_the_flags() -> None:
     group = get_command(app)
     context = typer.Context(group)
     seen = 0

@@ -168,13 +168,13 @@ KEYS = st.one_of(
 
 @many(70)
 @given(key=KEYS, value=st.one_of(VALUES, TEXTS))
-def test_settings(folder: Path, key: str, value: str) -> None:
+def test_settings_never_crash(folder: Path, key: str, value: str) -> None:
     check(folder, *ASK, "--set", f"{key}={value}")
 
 
 @many(50)
 @given(key=st.sampled_from(keys()), value=VALUES, junk=st.one_of(st.just(b""), st.binary(max_size=20)))
-def test_studies(folder: Path, key: str, value: str, junk: bytes) -> None:
+def test_studies_never_crash(folder: Path, key: str, value: str, junk: bytes) -> None:
     study = folder / "study.toml"
     study.write_bytes(f"{key.replace('star.0', 'star')} = {value}\n".encode() + junk)
     check(folder, "exposure", "study.toml", "--snr", "10", "--at", "300", "--no-pictures", "--quiet")
@@ -188,7 +188,7 @@ INSTRUMENT_KEYS = (
 
 @many(40)
 @given(key=st.sampled_from(INSTRUMENT_KEYS), value=VALUES)
-def test_instruments(folder: Path, key: str, value: str) -> None:
+def test_instruments_never_crash(folder: Path, key: str, value: str) -> None:
     (folder / "mine.toml").write_text(f"extends = 'mauve'\n{key} = {value}\n")
     check(folder, *ASK, "--instrument", "mine.toml")
 
@@ -201,7 +201,7 @@ FLAGS = st.sampled_from(
 
 @many(60)
 @given(flag=FLAGS, value=st.one_of(NUMBERS, TEXTS))
-def test_flags(folder: Path, flag: str, value: str) -> None:
+def test_flags_never_crash(folder: Path, flag: str, value: str) -> None:
     if flag == "--output":
         # Not outside the folder: what is written there would stay.
         value = value.replace("/", "?").replace("..", "?")
@@ -213,7 +213,7 @@ def test_flags(folder: Path, flag: str, value: str) -> None:
 
 @many(25)
 @given(verb=st.sampled_from(["verify", "export", "realise", "library", "serve", "map", "limit", "detect"]), value=TEXTS)
-def test_verbs(folder: Path, verb: str, value: str) -> None:
+def test_verbs_never_crash(folder: Path, verb: str, value: str) -> None:
     words = {
         "verify": ("verify", value),
         "export": ("export", value, f"{value}.fits", "--rows", value),
@@ -300,7 +300,9 @@ SPOILS = {
 
 @many(50)
 @given(kind=st.integers(0, 2), ending=st.sampled_from([".txt", ".ecsv", ".fits", ".csv", ".gz", ""]), **SPOILS)
-def test_spectra(folder: Path, kind: int, ending: str, place: float, splice: bytes, cut: int, pack: bool) -> None:
+def test_spectra_never_crash(
+    folder: Path, kind: int, ending: str, place: float, splice: bytes, cut: int, pack: bool
+) -> None:
     file = folder / f"star{ending}"
     file.write_bytes(spoilt(_spectra()[kind], place, splice, cut, pack))
     check(folder, *ASK[:-4], "--magnitude", "7.4", "--star", str(file))
@@ -308,7 +310,9 @@ def test_spectra(folder: Path, kind: int, ending: str, place: float, splice: byt
 
 @many(40)
 @given(kind=st.integers(0, 2), ending=st.sampled_from([".csv", ".ecsv", ".fits", ".txt"]), **SPOILS)
-def test_flare_tables(folder: Path, kind: int, ending: str, place: float, splice: bytes, cut: int, pack: bool) -> None:
+def test_flare_tables_never_crash(
+    folder: Path, kind: int, ending: str, place: float, splice: bytes, cut: int, pack: bool
+) -> None:
     file = folder / f"flares{ending}"
     file.write_bytes(spoilt(_flares()[kind], place, splice, cut, pack))
     # Fewer realisations than the threshold needs: everything is read, and then refused.
@@ -317,7 +321,7 @@ def test_flare_tables(folder: Path, kind: int, ending: str, place: float, splice
 
 @many(25)
 @given(lines=st.lists(st.tuples(NUMBERS, NUMBERS).map(" ".join), max_size=4), junk=st.binary(max_size=8))
-def test_weights(folder: Path, lines: list[str], junk: bytes) -> None:
+def test_weights_never_crash(folder: Path, lines: list[str], junk: bytes) -> None:
     from mauvecl.schema.errors import InputError
     from mauvecl.study.weights import read_weights
 
@@ -337,11 +341,11 @@ def test_weights(folder: Path, lines: list[str], junk: bytes) -> None:
     ),
     value=TEXTS.filter(lambda text: "\0" not in text),
 )  # fmt: skip
-def test_environments(folder: Path, name: str, value: str) -> None:
+def test_environments_never_crash(folder: Path, name: str, value: str) -> None:
     check(folder, "library", **{name: value})
 
 
-def test_the_check_would_notice(folder: Path) -> None:
+def test_check_detects_an_unexpected_error(folder: Path) -> None:
     """A verb that fails in a way that nobody foresaw fails here."""
     with (
         mock.patch("mauvecl.host.stars.catalogue.library_table", side_effect=KeyError("x")),

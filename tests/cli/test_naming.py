@@ -123,7 +123,7 @@ def test_the_command_line_names_flags(words: tuple[str, ...], begins: str, tmp_p
     assert "`" not in told
 
 
-def test_a_value_of_a_study_file_keeps_its_key(tmp_path: Path) -> None:
+def test_value_of_a_study_file_keeps_its_key(tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text("[run]\nfap = 2\n")
     code, _, told = ended("detect", "s.toml", "--seed", "3", folder=tmp_path)
     assert (code, told) == (2, "mauvecl: s.toml: run.fap = 2, expected a number above 0 and below 1\n")

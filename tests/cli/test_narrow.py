@@ -23,9 +23,7 @@ def commands() -> list[tuple[str, ...]]:
 
 
 @pytest.mark.parametrize("words", commands(), ids=" ".join)
-def test_help_fits_and_its_examples_can_be_pasted(
-    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_help_fits_80_columns(words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import typer.rich_utils
 
     monkeypatch.setattr(typer.rich_utils, "MAX_WIDTH", 80, raising=False)
@@ -47,7 +45,7 @@ def test_help_fits_and_its_examples_can_be_pasted(
 
 
 @pytest.mark.parametrize("labels", [1, 2, 3])
-def test_parts_repeat_no_more_than_tells_rows_apart(
+def test_parts_of_a_table_repeat_only_the_labels(
     labels: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Months of a year in 80 columns: each month once, and in each part what its rows are."""

@@ -11,7 +11,7 @@ from mauvecl import Study
 from mauvecl.cli.question import holds_study
 
 
-def test_visible(tmp_path: Path) -> None:
+def test_visible_writes_its_files(tmp_path: Path) -> None:
     words = ("visible", "--look-at", "eps Eri", "--look-at", "AU Mic", "--start", "2026-09-20", "--days", "3")
     done = run(*words, "--sun", "60", "--moon", "none", folder=tmp_path)
     assert "eps Eri" in done.stdout
@@ -27,7 +27,7 @@ def test_visible(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_plan(tmp_path: Path) -> None:
+def test_plan_writes_its_files(tmp_path: Path) -> None:
     (tmp_path / "targets.csv").write_text("name,mass_msun,age_myr\neps Eri,0.82,500\nkappa1 Cet,,\n")
     words = ("--days", "20", "--hours", "50", "--completeness", "closed form", "--report", "html")
     done = run("plan", "targets.csv", *words, folder=tmp_path)
@@ -40,7 +40,7 @@ def test_plan(tmp_path: Path) -> None:
     assert rows[0]["expected"] > 0
 
 
-def test_a_table_of_targets_is_told_from_an_answers(tmp_path: Path) -> None:
+def test_table_of_targets_is_distinguished_from_an_answer(tmp_path: Path) -> None:
     """As `mauvecl plan targets.ecsv` takes it: only what an answer wrote holds a study."""
     for name, meta in (("targets", {}), ("plan", {"study": "[plan]"})):
         Table({"name": ["eps Eri"]}, meta=meta).write(tmp_path / f"{name}.ecsv")
@@ -62,7 +62,7 @@ def test_a_table_of_targets_is_told_from_an_answers(tmp_path: Path) -> None:
         (("plan", "missing.csv"), "table of targets 'missing.csv' does not exist"),
     ],
 )
-def test_faults_are_a_sentence(words: tuple[str, ...], told: str, tmp_path: Path) -> None:
+def test_bad_flags_exit_with_code_2(words: tuple[str, ...], told: str, tmp_path: Path) -> None:
     done = run(*words, folder=tmp_path, code=2)
     assert done.stderr.startswith("mauvecl: ")
     assert told in done.stderr

@@ -29,7 +29,7 @@ def spectrum(folder: Path, name: str) -> str:
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_a_star_may_stand_in_place_of_the_study(verb: str, tmp_path: Path) -> None:
+def test_star_is_accepted_in_place_of_the_study(verb: str, tmp_path: Path) -> None:
     """Every verb takes one as far as its magnitude, which is wrong here."""
     for star in ("G2V", "sun", "G2V,M3V", spectrum(tmp_path, "star.txt"), spectrum(tmp_path, "noname")):
         code, _, told = ended(verb, star, "-m", "99", folder=tmp_path)
@@ -38,7 +38,7 @@ def test_a_star_may_stand_in_place_of_the_study(verb: str, tmp_path: Path) -> No
     assert (code, told) == (2, "mauvecl: 'G2V' and --star are both stars, expected one of them\n")
 
 
-def test_it_is_the_star_of_the_study(tmp_path: Path) -> None:
+def test_given_star_becomes_the_star_of_the_study(tmp_path: Path) -> None:
     name = spectrum(tmp_path, "star.txt")
     for given in ("G2V", name):
         run("exposure", given, "-m", "8", "--snr", "10", "--at", "300", "--no-pictures", folder=tmp_path)
@@ -50,7 +50,7 @@ def test_it_is_the_star_of_the_study(tmp_path: Path) -> None:
     assert "star V = 8" in told
 
 
-def test_a_missing_study_is_still_a_missing_study(tmp_path: Path) -> None:
+def test_missing_study_is_reported(tmp_path: Path) -> None:
     for name in ("no.toml", "nothing", "G3V"):
         code, _, told = ended("detect", name, folder=tmp_path)
         assert (code, f"study file {name!r} does not exist" in told) == (2, True), told
@@ -67,7 +67,7 @@ def test_well_known_stars_name_a_spectrum_and_a_magnitude(name: str) -> None:
     assert Star(library=found[1], magnitude=float(found[2])).source().name
 
 
-def test_the_command_line_proposes_flags_for_a_well_known_star(tmp_path: Path) -> None:
+def test_flags_are_proposed_for_a_well_known_star(tmp_path: Path) -> None:
     for words in (("--star", "AD Leo"), ("ad leo",)):
         code, _, told = ended("simulate", *words, folder=tmp_path)
         assert code == 2
@@ -76,7 +76,7 @@ def test_the_command_line_proposes_flags_for_a_well_known_star(tmp_path: Path) -
     run("simulate", *shlex.split(f"{found[1]} {found[2]}"), "--no-pictures", folder=tmp_path)
 
 
-def test_every_listed_star_has_what_the_sentence_needs() -> None:
+def test_every_listed_star_is_proposed() -> None:
     for row in target_table():
         if str(row["name"]) in ("Vega", "HD 40307", "GJ 581"):
             continue  # the library has them
@@ -84,7 +84,7 @@ def test_every_listed_star_has_what_the_sentence_needs() -> None:
             Star(library=str(row["name"])).source()
 
 
-def test_the_sun_needs_another_magnitude(tmp_path: Path) -> None:
+def test_sun_needs_another_magnitude(tmp_path: Path) -> None:
     code, _, told = ended("detect", "--star", "Sun", folder=tmp_path)
     assert code == 2
     assert "V = -26.76" in told

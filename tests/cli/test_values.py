@@ -19,17 +19,17 @@ from mauvecl.schema.parsing import number as number_of
     ("text", "value"),
     [("1e6", 10**6), ("2.5e3", 2500), (" 7 ", 7), ("18446744073709551615", 2**64 - 1), ("-1", -1), ("1E2", 100)],
 )
-def test_counts(text: str, value: int) -> None:
+def test_counts_are_read(text: str, value: int) -> None:
     assert count(text, "--n") == value
 
 
 @pytest.mark.parametrize("text", ["1.5", "x", "", "1e400", "nan", "inf", "1e-3", "1,000", "0x10", "1e999999999"])
-def test_what_is_no_count(text: str) -> None:
+def test_invalid_counts_raise(text: str) -> None:
     with refused("n", value=text):
         count(text, "--n")
 
 
-def test_lists() -> None:
+def test_lists_are_read() -> None:
     assert several(["7,8", "9"], "--m", number_of) == [7.0, 8.0, 9.0]
     with refused("m", value=""):
         several(["7,,8"], "--m", number_of)
@@ -46,7 +46,7 @@ def numeric() -> list[tuple[str, str]]:
     return found
 
 
-def test_one_style_for_every_number(tmp_path: Path) -> None:
+def test_every_numeric_flag_refuses_text(tmp_path: Path) -> None:
     """One sentence with the flag, the value and what was expected, whatever flag has no number behind it."""
     flags = numeric()
     assert len(flags) > 60
@@ -78,6 +78,6 @@ def test_one_style_for_every_number(tmp_path: Path) -> None:
     ],
     ids=lambda given: " ".join(given) if isinstance(given, list) else "",
 )
-def test_flags_reach_the_study(words: list[str], sentence: str, tmp_path: Path) -> None:
+def test_bad_values_name_their_flag(words: list[str], sentence: str, tmp_path: Path) -> None:
     code, _, told = ended(*words, folder=tmp_path)
     assert (code, sentence in told) == (2, True), told

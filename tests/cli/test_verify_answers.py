@@ -57,7 +57,7 @@ def test_every_changed_or_missing_file_is_noticed(verb: str, tmp_path: Path, mon
     assert verify_answer(out) == []
 
 
-def test_a_study_of_ones_own_is_no_answer(tmp_path: Path) -> None:
+def test_study_of_the_user_is_not_an_answer(tmp_path: Path) -> None:
     """A study next to a user's own table was written by no run: nothing is missing there."""
     (tmp_path / "study.toml").write_text("[run]\nfap = 0.01\n", encoding="utf-8")
     header = "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: amplitude, datatype: float64}\n"
@@ -67,7 +67,7 @@ def test_a_study_of_ones_own_is_no_answer(tmp_path: Path) -> None:
         verify_answer(tmp_path)
 
 
-def test_every_value_of_the_record_counts(tmp_path: Path) -> None:
+def test_every_value_of_the_record_is_verified(tmp_path: Path) -> None:
     """Each entry of the record changed or removed, and digests of files changed along with the files."""
     out = ask("exposure", tmp_path)
     place = out / "run.json"
@@ -85,7 +85,7 @@ def test_every_value_of_the_record_counts(tmp_path: Path) -> None:
     assert verify_answer(out) == []
 
 
-def test_what_verify_takes(tmp_path: Path) -> None:
+def test_verify_refuses_foreign_folders(tmp_path: Path) -> None:
     """Flags of stores are refused for an answer, and a folder of neither kind is; files of a user do not matter."""
     out = ask("exposure", tmp_path)
     (out / "notes.txt").write_text("mine", encoding="utf-8")
@@ -96,7 +96,7 @@ def test_what_verify_takes(tmp_path: Path) -> None:
         verify_answer(tmp_path / "empty")
 
 
-def test_a_run_again_is_verified_again(tmp_path: Path) -> None:
+def test_repeated_run_is_verified(tmp_path: Path) -> None:
     """Another answer in the same folder takes the place of the first with its digests."""
     out = ask("exposure", tmp_path)
     first = json.loads((out / "run.json").read_text(encoding="utf-8"))

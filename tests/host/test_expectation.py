@@ -55,7 +55,7 @@ def test_zodiacal_light_is_a_fifth_of_a_count(quiet: Expectation) -> None:
     assert rate.max() == pytest.approx(0.2, abs=0.05)
 
 
-def test_signal_is_linear_in_the_light(sunlike: Source, mauve: Instrument) -> None:
+def test_signal_is_linear_in_light(sunlike: Source, mauve: Instrument) -> None:
     bright = expect(sunlike.at_magnitude(4.9), mauve, exposure=50, sky=Sky.none())
     faint = expect(sunlike, mauve, exposure=50, sky=Sky.none())
     np.testing.assert_allclose(bright.source_electrons, 10 * faint.source_electrons, rtol=1e-9)

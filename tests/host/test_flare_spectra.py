@@ -40,7 +40,7 @@ SPECTRA = {
 
 
 @pytest.mark.parametrize("spectrum", SPECTRA.values(), ids=SPECTRA)
-def test_the_total_is_the_integral(spectrum: FlareSpectrum) -> None:
+def test_total_equals_the_integral(spectrum: FlareSpectrum) -> None:
     grid = spectrum.grid(np.geomspace(10.0, 300_000.0, 40_001))
     total = 10.0 * np.trapezoid(spectrum.flux(grid), grid)
     assert spectrum.bolometric_flux() == pytest.approx(total, rel=2e-5)
@@ -53,7 +53,7 @@ def test_a_coarse_grid_with_the_nodes_of_the_spectrum_keeps_lines_and_edges(spec
     assert one == pytest.approx(other, rel=1e-5)
 
 
-def test_the_balmer_flare_is_that_of_its_formula() -> None:
+def test_balmer_flare_follows_its_formula() -> None:
     nm, flare = np.array([200.0, 300.0, 364.5, 364.7, 500.0]), BalmerFlare(9500.0, 2.5, 8000.0)
     edge = blackbody(np.array([364.6]), 9500.0)[0]
     # h, c and k of CODATA 2018, SI.
@@ -65,7 +65,7 @@ def test_the_balmer_flare_is_that_of_its_formula() -> None:
     assert BalmerFlare(9500.0, 1.0).flux(nm) == pytest.approx(blackbody(nm, 9500.0), rel=1e-15)
 
 
-def test_two_blackbodies_of_one_temperature_are_one() -> None:
+def test_two_blackbodies_of_one_temperature_equal_one() -> None:
     nm = np.linspace(200.0, 700.0, 11)
     np.testing.assert_allclose(TwoBlackbodies(9e3, 9e3, 0.25).flux(nm), 1.25 * blackbody(nm, 9e3), rtol=1e-14)
 
@@ -91,7 +91,7 @@ def test_balmer_lines_have_the_wavelengths_of_hydrogen() -> None:
     assert EmissionLine.named("Ca II").wavelengths_nm == (LINES_NM["Ca II K"], LINES_NM["Ca II H"])
 
 
-def test_ad_leos_great_flare() -> None:
+def test_great_flare_of_ad_leo_is_read() -> None:
     """The numbers of the published spectra at 912 and 1497 s: colours, the ultraviolet."""
     for seconds, ratio, ultraviolet in ((912, 1.41, 4.0e-9), (1497, 1.96, 9.2e-10)):
         flare = ad_leo(seconds)

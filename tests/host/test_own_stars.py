@@ -172,7 +172,7 @@ def archive() -> Iterator[str]:
     server.server_close()
 
 
-def test_a_calspec_star_by_its_newest_file(archive: str) -> None:
+def test_calspec_star_is_its_newest_file(archive: str) -> None:
     kept = hst_collections.fetch("calspec:18 Sco", base=f"{archive}/calspec/", show_progress=False)
     assert kept.name == "18 Sco"
     assert "18sco_stis_006.fits" in kept.origin
@@ -204,7 +204,7 @@ def test_short_spectrum_is_kept_with_its_extension(archive: str, tmp_path: Path)
         expect(Source.from_library("model"), Instrument.load("mauve"), exposure=5.0)
 
 
-def test_an_ngsl_star(archive: str) -> None:
+def test_ngsl_star_is_fetched(archive: str) -> None:
     kept = hst_collections.fetch("ngsl:HD 37202", base=f"{archive}/ngsl", show_progress=False)
     assert "DATAQUAL = good" in kept.notes
     assert not kept.dereddened

@@ -169,7 +169,7 @@ def test_flares_rise_by_their_amplitude(sun: Source, band: str, amplitude: float
         assert photons[1] / photons[0] - 1 == pytest.approx(expected, abs=1e-9)
 
 
-def test_an_added_flare_is_a_blackbody(sun: Source) -> None:
+def test_added_flare_is_a_blackbody(sun: Source) -> None:
     excess = sun.flaring(0.24).flux_flam - sun.flux_flam
     shape = blackbody(sun.wavelength_nm, 10_000.0)
     np.testing.assert_allclose(excess / shape, excess[100] / shape[100], rtol=1e-6)
@@ -177,7 +177,7 @@ def test_an_added_flare_is_a_blackbody(sun: Source) -> None:
     assert sun.wavelength_nm[shape.argmax()] == pytest.approx(289.8, abs=1.0)
 
 
-def test_a_replacing_flare_hides_photosphere(sun: Source) -> None:
+def test_replacing_flare_hides_photosphere(sun: Source) -> None:
     """For a star that is a blackbody, the flux is the area-weighted sum of two blackbodies, exactly."""
     cool, hot, filling = (blackbody(grid(), t) for t in (5000.0, 10_000.0, 5000.0))
     star = Source.from_arrays(grid(), cool)

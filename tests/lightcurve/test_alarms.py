@@ -34,7 +34,7 @@ def found(known: StarSurvey, events: list[Event], seed: int = 1) -> list:
     return alarms(known.survey, known.templates, drawn(known, events, seed), THRESHOLD)
 
 
-def test_a_bright_flare_is_found_once(known):
+def test_bright_flare_is_found_once(known):
     # S/N of 400: its fit leaves no second alarm in any template. A false alarm: once in 7e4 runs.
     for seed in range(3):
         (one,) = found(known, [Event(3000.0, 60.0, 1.0)], seed)
@@ -42,7 +42,7 @@ def test_a_bright_flare_is_found_once(known):
         assert one.rho > 300
 
 
-def test_a_shape_that_the_fit_does_not_have_leaves_at_most_what_is_allowed(known):
+def test_unfitted_shape_leaves_at_most_the_allowed_residual(known):
     # The other published shape: its fit is wrong, but its rests are no flares.
     several = found(known, [Event(3000.0, 60.0, 1.0, shape="tovarmendoza2022")])
     assert several[0].rho > 300
@@ -50,7 +50,7 @@ def test_a_shape_that_the_fit_does_not_have_leaves_at_most_what_is_allowed(known
     assert len(several) <= 2
 
 
-def test_flares_apart_are_each_found_by_falling_value(known):
+def test_separate_flares_are_found_in_order_of_value(known):
     events = [Event(1500.0, 40.0, 0.1), Event(3000.0, 60.0, 0.3), Event(4500.0, 100.0, 0.05)]
     several = found(known, events)
     assert [round(float(one.recovered.peak_s[0]), -2) for one in several] == [3000.0, 1500.0, 4500.0]

@@ -26,7 +26,7 @@ def night(orbit: Orbit) -> OrbitStare:
     return stare_along(orbit, "eps Eri", START, HOURS * 3600, drifts={"light": 0.01}, offsets={"sky": 0.1})
 
 
-def test_frames_are_the_windows(orbit: Orbit, night: OrbitStare) -> None:
+def test_frames_are_those_of_the_windows(orbit: Orbit, night: OrbitStare) -> None:
     track = orbit.track(TimeGrid(START, HOURS / 24, 5.0))
     windows = Visibility.of(track, Target.of("eps Eri").direction[None]).windows(0)
     assert night.stare.gtis == pytest.approx(np.column_stack([windows.start_s, windows.stop_s]))
@@ -37,7 +37,7 @@ def test_frames_are_the_windows(orbit: Orbit, night: OrbitStare) -> None:
     assert drift.curve == pytest.approx((night.stare.middle_s - HOURS * 1800) / 3600)
 
 
-def test_temperature(orbit: Orbit, night: OrbitStare) -> None:
+def test_temperature_follows_the_orbit(orbit: Orbit, night: OrbitStare) -> None:
     """Between both ends, falling in shadow, rising in sunlight, and no matter when the stare begins."""
     stare, dark = night.stare, night.in_shadow
     assert dark.any()
@@ -53,7 +53,7 @@ def test_temperature(orbit: Orbit, night: OrbitStare) -> None:
     assert later.stare.temperature_c == pytest.approx(same, abs=0.02)  # of 8 deg C, after 8 time constants
 
 
-def test_own_thermal_curve_and_hits(orbit: Orbit) -> None:
+def test_thermal_curve_and_hits_can_be_given(orbit: Orbit) -> None:
     still = stare_along(orbit, "eps Eri", START, 7200.0, thermal=Thermal(15.0, 15.0))
     assert still.stare.temperature_c == pytest.approx(15.0)
     everywhere = Limits(earth_limb_deg=None, sun_deg=None, moon_deg=None, declination_deg=None, proton_flux=None)
@@ -65,14 +65,14 @@ def test_own_thermal_curve_and_hits(orbit: Orbit) -> None:
     assert through.mean_hits_per_cm2_s > outside.mean_hits_per_cm2_s >= 1.0
 
 
-def test_the_constructor_of_stares(orbit: Orbit, night: OrbitStare) -> None:
+def test_stare_constructor_follows_the_orbit(orbit: Orbit, night: OrbitStare) -> None:
     found = Stare.along(orbit, Target.of("eps Eri"), START, HOURS * 3600)
     assert found.start_s == pytest.approx(night.stare.start_s)
     assert night.messages == ()
     assert "along its track" in stare_along(orbit, "eps Eri", "2026-10-20", 7200.0).messages[0]
 
 
-def test_a_studys_stare(orbit: Orbit, night: OrbitStare) -> None:
+def test_study_has_a_stare_along_the_orbit(orbit: Orbit, night: OrbitStare) -> None:
     from mauvecl import Study
     from mauvecl.study.cases import Case
     from mauvecl.study.stare_expectation import orbit_lines

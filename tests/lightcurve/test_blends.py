@@ -46,7 +46,7 @@ def check(alarm: Alarm, event: Event) -> None:
 
 
 @pytest.mark.parametrize("apart", [30.0, 60.0, 120.0, 300.0, 900.0])
-def test_two_equal_flares_come_back_as_two(known, apart):
+def test_two_equal_flares_are_separated(known, apart):
     # S/N 83 each. Fitted one after another, those 120 s apart came back as four, one of ten times the energy.
     events = [Event(2800.0, 60.0, 0.5), Event(2800.0 + apart, 60.0, 0.5)]
     several = sorted(found(known, events, 1), key=lambda one: one.recovered.peak_s[0])
@@ -58,7 +58,7 @@ def test_two_equal_flares_come_back_as_two(known, apart):
 
 @pytest.mark.long
 @pytest.mark.parametrize(("number", "seeds"), [(2, range(100, 110)), (3, range(200, 206))])
-def test_random_pairs_and_triples(known, number, seeds):
+def test_random_pairs_and_triples_are_separated(known, number, seeds):
     # S/N of 30 to 120, peaks one to five half-widths apart. Of 38 flares and three quantities one is beyond five
     # errors in 1e-4 of the runs; a false alarm in 16 orbits: once in 30 of 1e3 runs at most.
     for seed in seeds:
@@ -76,7 +76,7 @@ def test_random_pairs_and_triples(known, number, seeds):
             assert alarm.p_value > 1e-6
 
 
-def test_what_leaves_the_stare_or_the_bank_is_not_measured(known):
+def test_flares_outside_of_stare_or_bank_are_not_measured(known):
     narrow, wide = known.survey.bank.half_widths_s[0], known.survey.bank.half_widths_s[-1]
     last = known.survey.stare.duration_s
     events = [
@@ -117,7 +117,7 @@ def one_flare(known, seed: int, snr: float) -> tuple[Event, list[Alarm]]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", [108, 118, 228, 251])
-def test_intervals_reach_the_other_optimum(known, seed):
+def test_intervals_include_a_second_optimum(known, seed):
     # Chi-squared at the true half-width is within one of its least, beyond a rise that once ended the interval.
     event, near = one_flare(known, seed, 6.0)
     low, high = near[0].intervals["half_width_s"]
@@ -125,7 +125,7 @@ def test_intervals_reach_the_other_optimum(known, seed):
 
 
 @pytest.mark.long
-def test_intervals_hold_the_truth_near_the_threshold(known):
+def test_intervals_cover_near_the_threshold(known):
     # 68 % intervals at S/N 6. At a coverage of 65 % each quantity fails once in 1000 runs.
     names = ("peak_s", "half_width_s", "equivalent_duration_s")
     held, count = np.zeros(3, np.int64), 0
@@ -140,7 +140,7 @@ def test_intervals_hold_the_truth_near_the_threshold(known):
 
 
 @pytest.mark.long
-def test_intervals_hold_the_truth_above_the_threshold(known):
+def test_intervals_cover_above_the_threshold(known):
     # 68 % intervals of 24 stares at S/N 8 and 15. At 65 %, fewer than 9 hold the truth once in 400 runs of each.
     held = np.zeros(2)
     for seed in range(12):

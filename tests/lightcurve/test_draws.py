@@ -24,7 +24,7 @@ def stares(engine: Engine) -> Stares:
 
 
 @pytest.mark.parametrize("magnitude", [7.4, -0.7], ids=["plain", "at saturation"])
-def test_frames_add_up_to_the_engines_exposures(engine: Engine, stares: Stares, magnitude: float) -> None:
+def test_frames_sum_to_exposures_of_the_engine(engine: Engine, stares: Stares, magnitude: float) -> None:
     """The same draws, so the same counts, but where a float's last bit decides a whole DN: hardly one frame in 1e5."""
     one, long = (
         star(magnitude=magnitude, amplitudes=(0.24,), exposure=s, payload=instrument(part=True)) for s in (5.0, 50.0)
@@ -65,7 +65,7 @@ def recipe(components: Components, stare: Stare, flare: np.ndarray, n: int, seed
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_moments_are_those_of_a_recipe(stares: Stares, method: Any) -> None:
+def test_moments_equal_those_of_the_recipe(stares: Stares, method: Any) -> None:
     """Means, covariances within a frame and between frames: 27 numbers within 6 standard errors, 1e-7 by chance."""
     quiet, *flares = star(
         magnitude=4.0, amplitudes=(0.5, 1.0), exposure=5.0, payload=instrument(output_min_nm=300.0, output_max_nm=306.0)
@@ -165,7 +165,7 @@ def mixture_cumulants(components: Components, coefficients: Any, mixture: Any, s
     return float(third / sd**3), float(fourth / sd**4)
 
 
-def test_components_are_the_expectations(stares: Stares) -> None:
+def test_components_equal_the_expectations(stares: Stares) -> None:
     """Means and variances of any mixture of star, sky, dark and flares are those of an expectation made for it."""
     quiet, *flares = star(amplitudes=(0.5, 2.0), exposure=5.0, payload=instrument(part=True))
     rng = np.random.default_rng(2)

@@ -19,7 +19,7 @@ from mauvecl.lightcurve.flares.shapes import SHAPES
 @pytest.mark.parametrize(
     ("kelvin", "share"), [(9000, 0.72246), (10_000, 0.74135), (14_000, 0.68203), (20_000, 0.48199)]
 )
-def test_share_of_a_blackbody_in_mauves_range(kelvin, share):
+def test_share_of_a_blackbody_equals_its_integral(kelvin, share):
     assert share_within(200, 700, kelvin) == pytest.approx(share, abs=6e-6)
 
 
@@ -33,7 +33,7 @@ ELSEWHERE = [
 
 
 @pytest.mark.parametrize(("name", "kelvin", "radius", "cool", "hot"), ELSEWHERE)
-def test_bolometric_energies_by_astropy_and_by_other_tables_of_the_bands(name, kelvin, radius, cool, hot):
+def test_bolometric_energies_agree_with_astropy_and_other_band_tables(name, kelvin, radius, cool, hot):
     # The embedded bands are those of pyphot; with another table of Kepler's or TESS's energies differ by up to 1.4 %.
     used = band(name)
     nm = np.linspace(used.wavelength_nm[0], used.wavelength_nm[-1], 40_001)
@@ -51,7 +51,7 @@ def test_bolometric_energies_by_astropy_and_by_other_tables_of_the_bands(name, k
         assert scale.erg_per_s == pytest.approx(value, rel=0.015)
 
 
-def test_energies_by_an_integral_of_ones_own():
+def test_energies_agree_with_direct_integration():
     # Planck's law written out, Gauss-Legendre between the band's points; CODATA 2018.
     h, c, k = 6.62607015e-27, 2.99792458e10, 1.380649e-16
     found = band("Kepler")
@@ -79,7 +79,7 @@ def test_energies_by_an_integral_of_ones_own():
     assert published == pytest.approx(energies_per_s["bolometric"] / 4 * weighted / bodies, rel=2e-7)
 
 
-def test_a_star_that_is_its_own_blackbody_gives_the_same():
+def test_blackbody_star_agrees_with_the_blackbody_scale():
     from mauvecl.host.stars.flare import blackbody
 
     nm = np.linspace(160, 1200, 20_801)
@@ -96,7 +96,7 @@ def test_a_star_that_is_its_own_blackbody_gives_the_same():
 
 
 @pytest.mark.parametrize("name", list(SHAPES))
-def test_duration_peak_and_energy_follow_from_each_other(name):
+def test_duration_peak_and_energy_are_consistent(name):
     scale = EnergyScale.of_blackbody(1.0, 5778.0, flare_k=10_000.0)
     flare = Event(100.0, 33.0, 0.4, shape=name)
     same = Event.of_energy(flare.energy(scale), scale, peak_s=100.0, half_width_s=33.0, shape=name)

@@ -101,7 +101,7 @@ def test_drawn_light_carries_the_stated_energy(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_a_flare_in_place_of_photosphere_carries_what_it_adds(seed: int) -> None:
+def test_replacing_flare_carries_the_energy_it_adds(seed: int) -> None:
     """The light of the hot patch less that of the photosphere, for stars that are blackbodies."""
     from mauvecl.host.stars.flare import blackbody
 
@@ -119,7 +119,7 @@ def test_a_flare_in_place_of_photosphere_carries_what_it_adds(seed: int) -> None
         assert scale.erg_per_s == pytest.approx(sphere * drawn, rel=5e-4)
 
 
-def test_a_flare_that_cools_fast_keeps_its_energy() -> None:
+def test_fast_cooling_flare_keeps_its_energy() -> None:
     """Cooling within a frame, and flares shorter than one."""
     for half, fold in ((0.5, 0.5), (1.0, 20.0), (60.0, 0.5), (300.0, 3000.0)):
         flare = Event(20_001.3, half, 0.4, Cooling(20_000.0, 6_000.0, fold))

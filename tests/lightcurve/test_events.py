@@ -15,7 +15,7 @@ from mauvecl.lightcurve.flares.shapes import SHAPES
 START = np.arange(400) * 5.0
 
 
-def test_several_peaks_add_up_in_their_temperatures():
+def test_peaks_add_up_per_temperature():
     assert temperatures_of([]).size == 0
     one, two = Event(300.0, 20.0, 0.2), Event(420.0, 60.0, 0.1, 15_000.0, "tovarmendoza2022")
     three = Event(500.0, 10.0, 0.3)
@@ -36,7 +36,7 @@ def test_frames_in_gaps_are_absent_and_others_unchanged():
     np.testing.assert_array_equal(coefficients([flare], START[kept], 5.0, np.array([10_000.0])), whole[kept])
 
 
-def test_a_cooling_flare_keeps_its_light_curve_and_its_spectrum():
+def test_cooling_flare_keeps_its_light_curve_and_spectrum():
     flare = Event(500.0, 60.0, 0.5, Cooling(14_000.0, 6_000.0, 120.0))
     kelvin = temperatures_of([flare])
     found = coefficients([flare], START, 5.0, kelvin)
@@ -55,7 +55,7 @@ def test_a_cooling_flare_keeps_its_light_curve_and_its_spectrum():
         np.testing.assert_allclose(mixed[nm > 300], exact[nm > 300], rtol=0.02)
 
 
-def test_a_flare_that_does_not_cool_is_one_of_a_temperature():
+def test_flare_without_cooling_has_one_temperature():
     steady = Event(500.0, 60.0, 0.5, Cooling(9_000.0, 9_000.0, 100.0))
     assert temperatures_of([steady]).tolist() == [9_000.0]
     plain = Event(500.0, 60.0, 0.5, 9_000.0)
@@ -64,7 +64,7 @@ def test_a_flare_that_does_not_cool_is_one_of_a_temperature():
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_flares_outside_of_the_frames_are_refused_or_named(shape):
+def test_flares_outside_of_the_frames_raise_or_are_reported(shape):
     rng = np.random.Generator(np.random.Philox(81))
     start = np.concatenate([np.arange(100, 400), np.arange(700, 1000)]) * 5.0
     count = {"refused": 0, "named": 0, "inside": 0}

@@ -18,7 +18,7 @@ from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.schema.physical import DAY_S
 
 
-def test_bank_of_the_page():
+def test_bank_of_the_documentation_has_its_rate():
     """Eight filters a factor of two apart: .41 to .48 tests a frame, the median of a day at 3.73 (TIME.md)."""
     bank = Bank(tuple(30 * 2.0**k for k in range(8)), ONE, DAVENPORT, 5.0, KNOWN)
     grid = TemplateGrid.from_bank(bank)
@@ -28,14 +28,14 @@ def test_bank_of_the_page():
     assert grid.trials_per_frame(6.5) > 1.9 * grid.trials_per_frame(3.5)
 
 
-def test_known_answer_of_one_filter():
+def test_rate_of_one_filter_equals_the_closed_form():
     """Frames that know nothing of each other: both phases of a template shorter than a frame are the same filter."""
     alone = TemplateGrid.from_bank(Bank((0.02,), ONE, DAVENPORT, 5.0, KNOWN))
     assert alone.trials_per_frame(5.0) == pytest.approx(1.0, rel=1e-4)
 
 
 @pytest.mark.parametrize("widths", [HALF_WIDTHS_S, (20.0, 40.0, 80.0, 160.0)])
-def test_beside_importance_sampling(widths):
+def test_rate_agrees_with_importance_sampling(widths):
     """The same rate from one alarm a day to one in 10^10 days, of one sum and of three temperatures.
 
     An upper bound, up to a tenth above; four standard errors of the sampled rate, some 8 % each, which thresholds of
@@ -50,7 +50,7 @@ def test_beside_importance_sampling(widths):
         assert -spread < off < 0.1 + spread
 
 
-def test_beside_counts():
+def test_rate_agrees_with_counts():
     """At some alarms a day, where maxima come in clumps: a fifth above at most.
 
     600 stares of six hours: 4 standard errors fail by chance once in 10^4 runs.
@@ -65,7 +65,7 @@ def test_beside_counts():
         assert special.ndtr(-u) * 17_280 * 0.45 < rate.value - spread / 4
 
 
-def test_threshold_by_inversion():
+def test_threshold_inverts_the_rate():
     for rate in (1.0, 1 / 30, 4e-5):
         cut = search_threshold(rate)
         assert TemplateGrid.from_bank(default_bank()).false_alarms_per_second(cut) * 86_400 == pytest.approx(rate)

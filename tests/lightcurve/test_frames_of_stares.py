@@ -13,7 +13,7 @@ from mauvecl.lightcurve.stares.curves import Sinusoid, Table
 from mauvecl.lightcurve.stares.stare import Stare
 
 
-def test_frames_and_gaps():
+def test_frames_skip_gaps():
     stare = Stare.of(5998, gaps=[(1000, 2000), (3001, 3004.9)])
     assert stare.n_frames == 1200 - 200 - 1
     assert stare.duration_s == 6000.0
@@ -23,7 +23,7 @@ def test_frames_and_gaps():
     assert not stare.start_s.flags.writeable
 
 
-def test_a_star_month_is_a_few_numbers_a_frame():
+def test_star_month_needs_little_memory():
     stare = Stare.of(30 * 86_400, thermal=1.0, drifts={"temperature": 0.01})
     assert stare.n_frames == 518_400
     held = sum(a.nbytes for a in (stare.start_s, stare.star, stare.light, stare.sky, stare.temperature_c))
@@ -33,7 +33,7 @@ def test_a_star_month_is_a_few_numbers_a_frame():
 @pytest.mark.parametrize(
     "curve", [Sinusoid(0.3, 400.0, 1.0), Table(np.array([20.0, 33.0, 36.0, 90.0]), np.array([1.0, -2.0, 5.0, 0.5]))]
 )
-def test_curves_are_means_over_frames(curve):
+def test_curves_are_averaged_over_frames(curve):
     def at(t):
         if isinstance(curve, Sinusoid):
             return curve.amplitude * np.sin(2 * np.pi * t / curve.period_s + curve.phase)
@@ -44,7 +44,7 @@ def test_curves_are_means_over_frames(curve):
     np.testing.assert_allclose(curve.mean_over(start, 5.0), exact, atol=1e-12)
 
 
-def test_known_conditions_and_unknowns():
+def test_known_conditions_and_unknowns_are_separate():
     stare = Stare.of(
         ORBIT_S,
         thermal=0.5,
@@ -69,7 +69,7 @@ def test_known_conditions_and_unknowns():
     np.testing.assert_allclose(sine**2 + cosine**2, 1.0, atol=1e-5)
 
 
-def test_the_dark_follows_the_instruments_law():
+def test_dark_current_follows_the_law_of_the_instrument():
     (quiet,) = star(payload=instrument(part=True))
     stare = Stare.of(50.0, thermal=Table(np.array([0.0, 50.0]), np.array([1.0, 1.0])))
     np.testing.assert_allclose(stare.dark_factor(quiet), np.exp(0.0684))

@@ -41,7 +41,7 @@ def day():
 
 @pytest.mark.long
 @pytest.mark.parametrize("half_width", TABLE)
-def test_half_are_found(day, half_width):
+def test_half_are_found_at_the_critical_amplitude(day, half_width):
     """Within 5 % of the table. The median of 1000 amplitudes has an error of 0.7 %: once in 10^6 runs it fails."""
     bank, cut = day
     rng = np.random.default_rng(int(half_width))
@@ -137,7 +137,7 @@ def all_filters(one):
 
 @pytest.mark.long
 @pytest.mark.parametrize("rays", [None, RAYS], ids=["no rays", "cosmic rays"])
-def test_completeness_of_five_cells(injections, stares, rays):
+def test_completeness_of_five_cells_agrees_with_numpy(injections, stares, rays):
     """Against NumPy alone, cell by cell and all together. Six times 4 standard errors: fails once in 10^3 runs.
 
     All together notice flares that come out a sixth too bright, and frames without the rays.
@@ -169,7 +169,7 @@ def test_completeness_of_five_cells(injections, stares, rays):
     assert abs(np.sum(off)) < 4 * np.linalg.norm(spread), off
 
 
-def test_draws_are_common_and_addressed(injections, stares):
+def test_draws_are_common_and_addressed_by_counter(injections, stares):
     """The same whatever the half-widths asked for, and whatever part of the stares is drawn, to the last bit."""
     asked = injections.request(4)
     every = stares.reduced(asked)["critical"]
@@ -184,7 +184,7 @@ def test_draws_are_common_and_addressed(injections, stares):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_places_are_those_of_each_flare_alone_and_of_part_of_the_stare(injections, seed, monkeypatch):
+def test_filters_of_all_flares_equal_those_of_each_alone(injections, seed, monkeypatch):
     """Flares of random half-widths and times: filters of all at once are those of each in the frames around it."""
     rng = np.random.default_rng([26, seed])
     widths = tuple(np.sort(10 ** rng.uniform(0.8, 2.5, 4)))
@@ -219,7 +219,7 @@ def drawn_at(injections, stares, position):
     return asked.reduction, asked.reduction.frame_noise(held["values"], held["glow"])
 
 
-def test_critical_amplitude_is_where_the_search_finds(injections, stares):
+def test_critical_amplitude_agrees_with_the_search(injections, stares):
     """A hair above it the largest value among the templates reaches the threshold, a hair below it does not."""
     injecting, drawn = drawn_at(injections, stares, 11)
     critical = stares.reduced(injections.request(11))["critical"].T
@@ -229,7 +229,7 @@ def test_critical_amplitude_is_where_the_search_finds(injections, stares):
             assert (above >= injections.threshold > below) or root == 0
 
 
-def test_sums_hold_what_the_values_say(injections, stares):
+def test_sums_equal_those_of_the_values(injections, stares):
     """The frames that fits see give the values that the search has."""
     injecting, drawn = drawn_at(injections, stares, 7)
     site, amplitudes = injecting.sites[1], np.array([0.01, 0.03])
@@ -241,7 +241,7 @@ def test_sums_hold_what_the_values_say(injections, stares):
 
 
 @pytest.mark.long
-def test_flares_are_those_that_the_engine_draws(injections, stares):
+def test_flares_equal_those_drawn_by_the_engine(injections, stares):
     """Values of templates against frames with the flare in every pixel, on the same stares: means and variances.
 
     A flare whose own photons, and the jitter of its light, are most of the noise. Fails by chance once in 10^3 runs:
@@ -286,7 +286,7 @@ def test_sums_over_frames_are_exact(injections, stares):
 
 @pytest.mark.long
 @pytest.mark.parametrize(("half_width", "snr"), [(30.0, 30.0), (200.0, 30.0)])
-def test_recovered_flares(half_width, snr):
+def test_recovered_flares_have_their_parameters(half_width, snr):
     """Pulls of all parameters, and coverage. Fails by chance once in 10^4 runs: 4 standard errors of each."""
     stare = Stare.of(9000.0)
     one, templates = survey(stare, Level(), (12.0, 40.0, 150.0, 400.0))

@@ -127,7 +127,7 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_bad_arguments_are_named(name: str) -> None:
+def test_bad_input_raises(name: str) -> None:
     call, key = CALLS[name]
     with refused(key):
         call()
@@ -143,13 +143,13 @@ def test_bad_arguments_are_named(name: str) -> None:
         ("energy,rate\n1e32,1\n", "per_day"),
     ],
 )
-def test_bad_tables_of_rates(tmp_path: Path, text: str, key: str) -> None:
+def test_bad_tables_of_rates_raise(tmp_path: Path, text: str, key: str) -> None:
     (tmp_path / "own.csv").write_text(text)
     with refused(key):
         RateTable.read(tmp_path / "own.csv")
 
 
-def test_bad_requests_for_frames(engine: Engine) -> None:
+def test_bad_requests_for_frames_raise(engine: Engine) -> None:
     stares = Stares(engine.open_device)
     payload = instrument(part=True)
     quiet, flare = star(amplitudes=(1.0,), exposure=5.0, payload=payload)

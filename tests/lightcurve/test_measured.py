@@ -79,7 +79,7 @@ def lit_frames(cooling: Cooling, stare: Stare) -> tuple[list[Expectation], np.nd
     ],
     ids=["cools", "cools-unknown", "steady-unknown"],
 )
-def test_the_temperature_is_followed_with_honest_errors(
+def test_temperature_is_measured_with_correct_errors(
     cooling: Cooling, unknown: dict[str, float] | None, engine: Engine
 ) -> None:
     """Drawn pixels of 20 stares. Pulls of ln T have mean 0 and variance 1 over all bins.
@@ -119,7 +119,7 @@ def test_the_temperature_is_followed_with_honest_errors(
     assert spread > 1.15 if cooling is not STEADY else spread < 1.005
 
 
-def test_known_conditions_gaps_and_units() -> None:
+def test_known_conditions_and_gaps_are_respected() -> None:
     """Frames without noise: 9000 K in every bin, with the right area and luminosity, and no bin over a gap."""
     how = {"thermal": 3.0, "throughput": Sinusoid(0.2, 300.0), "variability": Sinusoid(0.05, 200.0), "orbit_s": 400.0}
     stare = Stare.of(300.0, gaps=[(90.0, 115.0)], **how)  # type: ignore[arg-type]
@@ -154,7 +154,7 @@ FALLING, TRUTH = Cooling(14_000.0, 7000.0, 80.0), np.array([52.0, 40.0, 1.5, 14_
 START: dict[str, Any] = {"peak_s": 50.0, "half_width_s": 30.0}
 
 
-def test_a_joint_fit_finds_shape_and_cooling_without_noise() -> None:
+def test_joint_fit_recovers_shape_and_cooling_without_noise() -> None:
     """Known changes of throughput and detector temperature, a gap; constant temperatures where none falls."""
     how = {"thermal": 3.0, "throughput": Sinusoid(0.2, 300.0), "orbit_s": 400.0}
     stare = Stare.of(300.0, gaps=[(90.0, 115.0)], **how)  # type: ignore[arg-type]
@@ -181,7 +181,7 @@ def test_a_joint_fit_finds_shape_and_cooling_without_noise() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("unknown", [None, {"dark": np.inf, "light": 0.02}], ids=["known", "unknown"])
-def test_joint_fits_have_honest_errors(unknown: dict[str, float] | None, engine: Engine) -> None:
+def test_joint_fits_have_correct_errors(unknown: dict[str, float] | None, engine: Engine) -> None:
     """Drawn pixels of 20 stares: squared distances from the truth by the covariances are chi-squared of 120.
 
     False failures: 1e-6 on each side, and as much for chi-squared of the fits.
@@ -200,7 +200,7 @@ def test_joint_fits_have_honest_errors(unknown: dict[str, float] | None, engine:
 
 
 @pytest.mark.long
-def test_intervals_of_a_joint_fit_are_near_its_errors() -> None:
+def test_intervals_of_a_joint_fit_agree_with_its_errors() -> None:
     """Without noise and for a bright flare the likelihood is nearly normal, so that profile and curvature agree."""
     lit, _ = lit_frames(FALLING, Stare.of(300.0))
     found = fit_cooling(np.array([one.recorded_dn for one in lit]), quiet(), model(), levels=(0.6827,), **START)
@@ -209,7 +209,7 @@ def test_intervals_of_a_joint_fit_are_near_its_errors() -> None:
     np.testing.assert_allclose(high, 1.0, atol=0.15)
 
 
-def test_joint_fits_refuse_what_they_cannot_fit() -> None:
+def test_impossible_joint_fits_raise() -> None:
     frames = np.tile(quiet().recorded_dn, (60, 1))
     with_jump = FlareModel.of(star(), MAUVE, quiet(), jump=True)
     for used, how, key in (
@@ -230,7 +230,7 @@ def test_stares_without_a_flare_have_no_bins(engine: Engine) -> None:
         measure_along(raw, quiet(), model(), snr_per_bin=8.0)
 
 
-def test_bad_frames_are_named() -> None:
+def test_bad_frames_raise() -> None:
     one = quiet().recorded_dn[None]
     for frames, how, key in (
         (one[:, :7], {}, "frames"),

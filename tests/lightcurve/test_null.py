@@ -23,10 +23,10 @@ from mauvecl.study.searches import SearchChoice
 class TestInARow:
     """Three consecutive points above three sigma."""
 
-    def test_rate_of_the_theory(self):
+    def test_simulated_rate_agrees_with_theory(self):
         assert consecutive_alarm_rate(3, 3.0, 5.0) == pytest.approx(4.245e-5, rel=5e-4)
 
-    def test_rate_is_that_of_the_chain(self):
+    def test_rate_equals_that_of_the_chain(self):
         """Runs that begin, by the states of a Markov chain: how many of the last points were above."""
         above, points, frames = float(special.ndtr(-1.5)), 3, 200
         state, alarms = np.array([1.0, 0.0, 0.0, 0.0]), 0.0
@@ -37,25 +37,25 @@ class TestInARow:
             )
         assert consecutive_alarm_rate(points, 1.5, 86_400 / frames) == pytest.approx(alarms, rel=1e-12)
 
-    def test_alarms_of_noise(self):
+    def test_alarms_of_noise_are_counted(self):
         """As many as the rate says: fails by chance once in 10^4 runs (4 standard errors of a Poisson count)."""
         noise = np.random.default_rng(4).standard_normal((500, 17280), dtype=np.float32)
         expected = 500 * consecutive_alarm_rate(3, 2.0, 5.0)
         assert abs(consecutive_alarms(noise, 3, 2.0).sum() - expected) < 4 * np.sqrt(expected)
 
-    def test_a_long_run_is_one_alarm(self):
+    def test_adjacent_frames_above_threshold_are_one_alarm(self):
         values = np.array([0, 4, 4, 4, 4, 4, 0, 4, 4, 0, 4, 4, 4.0])
         assert np.flatnonzero(consecutive_alarms(values, 3, 3.0)).tolist() == [3, 12]
         assert not consecutive_alarms(values[:2], 3, 3.0).any()
 
 
-def test_rates_per_day_month_and_year():
+def test_rates_convert_between_day_month_and_year():
     assert per_day(2.0, "day") == 2.0
     assert per_day(1.0, "month") * 365.25 / 12 == pytest.approx(1.0)
     assert 1 / per_day(1.0, "year") == DAYS["year"]
 
 
-def test_counted_null_by_inversion():
+def test_counted_null_is_inverted():
     """The rate at the threshold of a rate is that rate, within a count."""
     null = CountedRate(np.sort(np.random.default_rng(1).gumbel(size=1000)), 0.5)
     cut = null.threshold(0.3)
@@ -76,7 +76,7 @@ def short():
 
 class TestSampled:
     @pytest.mark.long
-    def test_agrees_with_counting(self, short):
+    def test_rate_agrees_with_counting(self, short):
         """Where both can say. Fails by chance once in 10^3 runs: 4 standard errors at six thresholds."""
         search, tail = short
         rng = np.random.default_rng(5)
@@ -88,7 +88,7 @@ class TestSampled:
             assert abs(p - tail.probability[k]) < 4 * spread
 
     @pytest.mark.long
-    def test_repeats_scatter_by_their_errors(self):
+    def test_repeated_estimates_scatter_by_their_errors(self):
         """Twenty seeds of the default bank at half an orbit: their scatter, and a direct draw of the noise.
 
         Chi-squared of 19 degrees at three thresholds, and the mean of the seeds within 4 standard errors at two where
@@ -112,7 +112,7 @@ class TestSampled:
             q = np.mean(maxima > u)
             assert abs(p.mean() - q) < 4 * np.hypot(p.std() / np.sqrt(20), np.sqrt(q * (1 - q) / n))
 
-    def test_known_answer_of_one_filter(self):
+    def test_rate_of_one_filter_equals_the_closed_form(self):
         """Independent frames: templates shorter than a frame leave P = 1 - (1 - Q)^n."""
         stare = Stare.of(500.0)
         search = Search(Bank((0.02,), ONE, DAVENPORT, 5.0, KNOWN), stare)
@@ -122,7 +122,7 @@ class TestSampled:
         kept = tail.thresholds >= 4.5
         assert tail.probability[kept] == pytest.approx(exact[kept], rel=2e-3)
 
-    def test_threshold_by_inversion(self, short):
+    def test_threshold_inverts_the_rate(self, short):
         _, tail = short
         for rate in (1.0, 1e-2, 1 / DAYS["year"]):
             cut = tail.threshold(rate)
@@ -157,7 +157,7 @@ def stares():
 
 
 @pytest.mark.long
-def test_false_alarms_in_random_stares(stares):
+def test_false_alarms_in_random_stares_are_as_requested(stares):
     """As asked for within 4 standard errors in 50 random stares: once in 10^4 runs it fails by chance.
 
     The cycle is marginalised in time, or the dark in each frame. The plain statistic, which takes all for known,
@@ -188,7 +188,7 @@ def test_false_alarms_in_random_stares(stares):
     assert np.mean(plain) > 0.95
 
 
-def test_false_alarms_where_noise_is_unknown(stares):
+def test_false_alarms_with_unknown_noise_are_as_requested(stares):
     """A star whose level drifts, a detector some degrees warmer or colder: the null is that of the stares drawn.
 
     Counted at thresholds that 30 to 8 % of them exceed: three times 4 standard errors, once in 10^4 runs. The null of

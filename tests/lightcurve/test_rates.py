@@ -29,7 +29,7 @@ from mauvecl.lightcurve.search.completeness import (
 from mauvecl.lightcurve.search.yields import Yield, fit_power_law, recovered_per_day
 
 
-def test_davenport2019() -> None:
+def test_davenport2019_rates_equal_published_values() -> None:
     """TIME.md, section 3."""
     found = davenport2019(mass_msun=0.5, age_myr=100)
     assert float(found.per_day_above(1e33)) == pytest.approx(0.074131, abs=5e-7)
@@ -37,7 +37,7 @@ def test_davenport2019() -> None:
     assert davenport2019(mass_msun=0.5, age_myr=5000).per_day_above(1e33) < found.per_day_above(1e33)
 
 
-def test_altaiponys_convention() -> None:
+def test_rates_follow_the_convention_of_altaipony() -> None:
     """dN/dE = beta E^-alpha, integrated by hand."""
     law = PowerLaw(alpha=1.8, log10_beta=27.0, band="TESS")
     energy = np.geomspace(1e33, 1e34, 200_001)
@@ -49,14 +49,14 @@ def test_altaiponys_convention() -> None:
     assert PowerLaw.through(1.8, 1e33, float(above[0])).log10_beta == pytest.approx(27.0)
 
 
-def test_presets() -> None:
+def test_presets_equal_published_values() -> None:
     assert float(sunlike().per_day_above(7e33)) == pytest.approx(1 / (3000 * 365.25))
     assert 1.5 < preset("G").alpha < preset("K").alpha < preset("M").alpha < 2.1
     # 8 a day of 1000 s and more in Si IV, at 160 times their energy.
     assert float(fiducial2018(1e26).per_day_above(160 * 1e29)) == pytest.approx(8.0)
 
 
-def test_bands() -> None:
+def test_rates_convert_between_bands() -> None:
     """Blackbodies: the same flares, other energies; there and back."""
     law = davenport2019(mass_msun=0.5, age_myr=100)
     factor = band_factor("Kepler", "bolometric", 9000.0)
@@ -71,7 +71,7 @@ def test_bands() -> None:
     assert table.in_band("bolometric", 9000.0).per_day_above(factor * 1e33) == pytest.approx(0.1)
 
 
-def test_own_table(tmp_path: Path) -> None:
+def test_rates_are_read_from_a_table(tmp_path: Path) -> None:
     (tmp_path / "own.csv").write_text("energy,rate\n1e31,2.0\n1e32,0.5\n1e34,0.001\n")
     own = RateTable.read(tmp_path / "own.csv", band="TESS")
     assert own.per_day_above([1e30, 1e31, 1e32, 1e33, 1e34, 1e35]) == pytest.approx(
@@ -86,21 +86,21 @@ def step_at(energy: float, band: str = "Kepler") -> Completeness:
     return Completeness(grid, np.array([0.0, 0.0, 1.0, 1.0]), band, "test")
 
 
-def test_recovered_from_an_energy_on() -> None:
+def test_step_completeness_recovers_the_rate_above_its_energy() -> None:
     law = davenport2019(mass_msun=0.5, age_myr=100)
     assert recovered_per_day(law, step_at(1e33)) == pytest.approx(float(law.per_day_above(1e33)), rel=0.02)
     with refused("band", value="Kepler"):
         recovered_per_day(law, step_at(1e33, "bolometric"))
 
 
-def test_yield_is_poissons_without_scatter() -> None:
+def test_yield_without_scatter_is_poisson() -> None:
     for mean in (0.02, 3.0, 400.0):
         found = Yield.about(mean, 0.0)
         assert (found.low, found.high) == (stats.poisson.ppf(0.025, mean), stats.poisson.ppf(0.975, mean))
         assert found.at_least_one == pytest.approx(-np.expm1(-mean))
 
 
-def test_yield_with_scatter() -> None:
+def test_yield_with_scatter_agrees_with_simulation() -> None:
     """Against 200 000 draws; its quantiles scatter by half a per cent."""
     rng = np.random.default_rng(11)
     draws = rng.poisson(20.0 * 10 ** (0.4 * rng.standard_normal(200_000)))
@@ -109,7 +109,7 @@ def test_yield_with_scatter() -> None:
     assert [found.low, found.high] == pytest.approx(np.quantile(draws, [0.025, 0.975]), rel=0.03, abs=1)
 
 
-def test_gain_of_a_flare_in_a_long_stretch() -> None:
+def test_gain_in_a_long_stretch_equals_the_closed_form() -> None:
     """Far from the ends it is sqrt(.72148 t_half / 5 s): TIME.md, section 4; taking off a line costs little."""
     widths, gain = _gains(shape_of("davenport2014"), 20_000.0, 5.0)
     i = int(np.argmin(np.abs(widths - 60.0)))
@@ -120,7 +120,7 @@ def test_gain_of_a_flare_in_a_long_stretch() -> None:
     assert short[-1].max() < 0.2 * np.sqrt(0.72148 * HALF_WIDTHS_S[1] / 5.0)
 
 
-def test_closed_form_beside_white_noise() -> None:
+def test_closed_form_completeness_agrees_with_white_noise() -> None:
     """What a matched filter of the right width finds in drawn stretches, against the completeness in closed form.
 
     2000 stretches: three standard deviations are 3.4 % at most; of five energies one misses them once in some 70 tests
@@ -147,14 +147,14 @@ def test_closed_form_beside_white_noise() -> None:
         assert float(form.at(energy)) == pytest.approx(found, abs=0.035)
 
 
-def test_completeness_as_a_table() -> None:
+def test_completeness_is_written_as_a_table() -> None:
     table = Completeness(np.array([1e31, 1e32, 1e33]), np.array([0.0, 0.4, 1.0]), "Kepler", "injections")
     assert table.energy_at(0.2) == pytest.approx(10**31.5)
     assert float(table.at(table.energy_at(0.9))) == pytest.approx(0.9)
     assert Completeness(np.array([1e31, 1e33]), np.array([0.0, 0.8]), "Kepler", "x").energy_at(0.9) == np.inf
 
 
-def test_frame_signal() -> None:
+def test_frame_signal_equals_the_sum_over_pixels() -> None:
     """The matched S/N of one frame, as the noise budget has it."""
     from mauvecl import Study
 
@@ -167,7 +167,7 @@ def test_frame_signal() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("alpha", [1.6, 2.1])
-def test_the_yield_closes(alpha: float) -> None:
+def test_power_law_is_recovered_from_drawn_flares(alpha: float) -> None:
     """Flares drawn from a power law and put through the completeness give back exponent and rate.
 
     350 campaigns of some 60 recovered flares, with an error of their energies: 68 +- 5 % within one sigma. By chance a

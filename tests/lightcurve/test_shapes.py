@@ -38,19 +38,19 @@ def between(function, first: float, last: float, kinks: list[float]) -> float:
 
 
 @pytest.mark.parametrize(("name", "what", "value", "within"), KNOWN)
-def test_check_values(name, what, value, within):
+def test_shapes_equal_published_values(name, what, value, within):
     shape = dict(zip(NAMES, ALL, strict=True))[name]
     assert getattr(shape, what) == pytest.approx(value, rel=0, abs=within)
 
 
-def test_the_published_closed_form_of_the_area():
+def test_area_equals_the_published_closed_form():
     shape = SHAPES["tovarmendoza2022"]
     (f1, d1), (f2, d2) = shape.DECAY
     area = shape.A * shape.C * np.sqrt(np.pi) * np.exp((shape.B / shape.C) ** 2) * (f1 / d1 + f2 / d2)
     assert shape.equivalent_duration == pytest.approx(area, rel=1e-13)
 
 
-def test_davenports_rise_decay_and_steps():
+def test_davenport_shape_has_its_rise_and_decay():
     shape = SHAPES["davenport2014"]
     assert float(shape.before(0.0)) == pytest.approx(0.3078476667, abs=1e-10)
     assert float(shape.after(0.0)) == pytest.approx(1.5190371894, abs=1e-10)
@@ -66,13 +66,13 @@ def test_davenports_rise_decay_and_steps():
         ("tovarmendoza2022", {10: 0.89196, 20: 0.97719}),
     ],
 )
-def test_fluence_before(name, shares):
+def test_fluence_before_a_time_is_the_integral(name, shares):
     shape = SHAPES[name]
     for tau, share in shares.items():
         assert float(shape.before(tau)) / shape.equivalent_duration == pytest.approx(share, abs=5e-6)
 
 
-def test_the_published_formula_where_it_does_not_overflow():
+def test_shape_equals_the_published_formula():
     # Tovar Mendoza et al. 2022 as printed, with plain exp and erfc.
     from scipy.special import erfc
 
@@ -89,7 +89,7 @@ def test_the_published_formula_where_it_does_not_overflow():
 
 
 @pytest.mark.parametrize("shape", ALL, ids=NAMES)
-def test_integrals_are_those_of_quadrature(shape):
+def test_integrals_agree_with_quadrature(shape):
     kinks = KINKS[shape.name]
     top = max(kinks) + 3.0
     tail = quad(lambda t: float(shape.at(t)), top, np.inf, epsabs=1e-14)[0] if shape is not TABLE else 0.0
@@ -104,7 +104,7 @@ def test_integrals_are_those_of_quadrature(shape):
 
 
 @pytest.mark.parametrize("shape", ALL, ids=NAMES)
-def test_frames_sum_to_the_whole_and_gaps_take_nothing_else(shape):
+def test_frames_sum_to_the_fluence_outside_of_gaps(shape):
     edges = np.arange(-100, 30_001) * 5.0
     means = shape.mean_over(edges, 777.7, 33.0)
     assert 5.0 * means.sum() == pytest.approx(33.0 * shape.equivalent_duration, rel=1e-12)
@@ -115,7 +115,7 @@ def test_frames_sum_to_the_whole_and_gaps_take_nothing_else(shape):
 
 
 @pytest.mark.parametrize("shape", ALL, ids=NAMES)
-def test_no_frame_of_any_flare_loses_light(shape):
+def test_frames_conserve_light_of_any_flare(shape):
     # Whole stares about 400 random flares: scipy's erfc underflows to 0 before a product with an exponential does.
     rng = np.random.Generator(np.random.Philox(26))
     for _ in range(400):
@@ -125,7 +125,7 @@ def test_no_frame_of_any_flare_loses_light(shape):
         assert (means >= 0).all(), (peak, half, means.min())
 
 
-def test_tovar_mendozas_rise_keeps_its_digits():
+def test_tovar_mendoza_rise_keeps_its_digits():
     # Against quadrature of the shape itself, down to where doubles end.
     shape = SHAPES["tovarmendoza2022"]
     for tau in (-0.2513, -0.4, -1.0, -2.0, -4.0, -6.0):
@@ -144,7 +144,7 @@ def test_a_late_frame_keeps_its_digits():
 
 
 @pytest.mark.parametrize("shape", ALL, ids=NAMES)
-def test_peak_and_width_by_a_fine_scan(shape):
+def test_peak_and_width_agree_with_a_fine_scan(shape):
     tau = np.linspace(-2, 5, 700_001)
     values = shape.at(tau)
     # Davenport's peak is a step's upper edge.
@@ -152,7 +152,7 @@ def test_peak_and_width_by_a_fine_scan(shape):
     assert (values > shape.peak / 2).sum() * 1e-5 == pytest.approx(shape.width, abs=3e-5)
 
 
-def test_the_fiducial_flare_of_an_equivalent_duration():
+def test_fiducial_flare_has_its_equivalent_duration():
     for delta in (100.0, 1000.0, 1e5):
         amplitude, half_width = Fiducial.of(delta)
         shape = SHAPES["fiducial"]
@@ -162,6 +162,6 @@ def test_the_fiducial_flare_of_an_equivalent_duration():
         assert box == pytest.approx(delta / 1.5, rel=1e-12)
 
 
-def test_altaiponys_durations():
+def test_durations_equal_those_of_altaipony():
     assert half_width_of_altaipony(120.0, "davenport2014") == 60.0
     assert half_width_of_altaipony(120.0, "tovarmendoza2022") == 120.0

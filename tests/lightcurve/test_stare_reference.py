@@ -68,7 +68,7 @@ def stares(request: pytest.FixtureRequest, engine: Engine) -> Stares:
 
 @pytest.mark.parametrize("name", long_but(CASES, "plain", "all that wobbles"))
 @pytest.mark.parametrize("method", ["pixels", "cumulants"])
-def test_stares_are_the_twins(stares: Stares, name: str, method: Any) -> None:
+def test_stares_equal_the_reference(stares: Stares, name: str, method: Any) -> None:
     components, stare, flare, amplitudes, more = case(name)
     if more and method == "cumulants":
         with refused("method", value="cumulants"):
@@ -90,7 +90,7 @@ def test_stares_are_the_twins(stares: Stares, name: str, method: Any) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("method", ["pixels", "cumulants"])
-def test_a_split_changes_no_bit(engine: Engine, method: Any) -> None:
+def test_splitting_changes_no_bit(engine: Engine, method: Any) -> None:
     """Whatever the tile, the neighbours or the call: a stare follows from seed and number, a frame from its time."""
     components, stare, flare, amplitudes, _ = case("electrons")
     how: dict[str, Any] = {"seed": SEED, "method": method}
@@ -129,7 +129,7 @@ class Beside:
 
 @pytest.mark.parametrize("method", ["pixels", "cumulants"])
 @pytest.mark.parametrize("name", ["plain", "all that wobbles", "unknown alone"])
-def test_what_flares_need_is_the_twins(stares: Stares, name: str, method: Any) -> None:
+def test_sums_for_flares_equal_the_reference(stares: Stares, name: str, method: Any) -> None:
     """Normals of their own, the light that the frames have; whatever share of the stares is drawn."""
     components, stare, *_ = case(name)
     asked = StaresRequest(

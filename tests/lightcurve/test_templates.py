@@ -38,7 +38,7 @@ def test_sums_have_covariance_one(star, case):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_few_sums_and_temperatures_lose_little(star, case):
+def test_few_temperatures_lose_little_snr(star, case):
     """Flares of 6000-20 000 K at any temperature between those of the templates; in time 1.3 % may go beside."""
     quiet, flares = star
     nuisances = frame_nuisances(quiet, Stare.of(100.0), CASES[case])
@@ -56,7 +56,7 @@ def test_few_sums_and_temperatures_lose_little(star, case):
     assert Templates.of(quiet, flares, TEMPERATURES_K, nuisances=nuisances, rank=1).loss.max() > 0.1
 
 
-def test_refusals(star):
+def test_impossible_templates_raise(star):
     quiet, _ = star
     stare = Stare.of(100.0)
     light = frame_nuisances(quiet, stare, {"light": np.inf})

@@ -82,7 +82,7 @@ def test_false_alarms_with_random_drifts_and_cycles():
 
 
 @pytest.mark.long
-def test_thresholds_allow_for_what_is_left_in():
+def test_thresholds_allow_for_residual_variability():
     """Cycles and drifts that the search does not marginalise over: the threshold rises with them, or is refused.
 
     In six random stares, alarms at the threshold for two stares in ten are as often as asked for, within a factor of
@@ -117,7 +117,7 @@ def drifting():
     return survey(stare, Level(), (25.0, 60.0, 120.0), star="K2.5V", magnitude=5.0)
 
 
-def test_amplitudes_are_found(drifting):
+def test_amplitudes_are_recovered(drifting):
     """Within thousandths of a standard deviation of the prior, for drifts to four of them."""
     one, _ = drifting
     sums, z = drawn(one, np.random.default_rng(2), 6, 2.0)
@@ -125,7 +125,7 @@ def test_amplitudes_are_found(drifting):
     assert np.abs(found - z).max() < 5e-3
 
 
-def test_nothing_to_see_changes_nothing():
+def test_trend_of_zero_changes_nothing():
     """Unknowns of light alone, or a temperature in whose dark no bend is seen: sums are left as they are."""
     for unknowns in ({"drifts": {"star": 0.01}}, {"drifts": {"temperature": 1e-4}}, {}):
         one, _ = survey(Stare.of(6000.0, **unknowns), Level(), (25.0,), part=True)
@@ -133,7 +133,7 @@ def test_nothing_to_see_changes_nothing():
 
 
 @pytest.mark.parametrize("size", [20.0, 100.0, 1000.0])
-def test_flares_are_what_they_are_without_a_drift(drifting, size):
+def test_flares_equal_those_without_a_drift(drifting, size):
     """A flare's value and energy with the drift, for three drifts, are those in the same noise without one.
 
     Within 1 % or half a standard deviation, for flares that a search finds at 20 to 1000.

@@ -18,7 +18,7 @@ FILES = {912: DATA / "spectra" / "ADLeo_912s.dat", 1497: DATA / "flares" / "ADLe
 QUIET, GAP_NM = DATA / "flares" / "adleo_quiescent2.dat", (322.0, 368.0)
 
 
-def test_the_blackbody_is_rejected_and_the_jump_measured(engine: Engine) -> None:
+def test_blackbody_is_rejected_and_jump_is_measured(engine: Engine) -> None:
     """200 exposures of 50 s; of the good fits 1 % have p < 0.01, more than 40 % of them once in 1e40."""
     star = Source.read(QUIET, wavelength_unit="Angstrom", extend="M3V")
     mauve = Instrument.load("mauve")
@@ -47,7 +47,7 @@ def test_the_blackbody_is_rejected_and_the_jump_measured(engine: Engine) -> None
     assert jumps[1497][0] < jumps[1497][1] < jumps[1497][2]
 
 
-def test_pixels_that_are_skipped_do_not_count() -> None:
+def test_skipped_pixels_are_ignored() -> None:
     star, mauve = Source.from_library("M3V").at_magnitude(9), Instrument.load("mauve")
     quiet, lit = (expect(s, mauve, exposure=50.0) for s in (star, star.flaring(0.5, 9000.0)))
     model, nm = FlareModel.of(star, mauve, quiet), quiet.wavelength_nm

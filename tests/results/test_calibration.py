@@ -39,7 +39,7 @@ def scene(number: int) -> tuple:
 
 
 @pytest.mark.long
-def test_false_alarms_come_as_often_as_they_should(engine: Engine) -> None:
+def test_false_alarms_are_as_requested(engine: Engine) -> None:
     """Eighteen sums over 200 scenes, and their scatter; both together fail by chance once in 1e6 runs.
 
     A threshold is an order statistic of N null draws, so that the number of N fresh ones beyond it is beta-binomial.

@@ -13,7 +13,7 @@ from mauvecl.results.detection.campaign import campaign, per_test
 from mauvecl.study.study import Study
 
 
-def test_a_day_of_single_frames() -> None:
+def test_day_of_single_frames_has_its_false_alarms() -> None:
     found = campaign(1e-5, 17_280)
     assert found.tests == 17_280
     assert found.independent == pytest.approx(1 - (1 - 1e-5) ** 17_280)
@@ -31,7 +31,7 @@ def test_overlap_lies_between_the_bounds(stack: int, step: int) -> None:
     assert found.overlapping.high > apart.independent
 
 
-def test_two_overlapping_stacks_exactly() -> None:
+def test_two_overlapping_stacks_equal_the_exact_probability() -> None:
     """Two stacks of two frames that share one: the bivariate normal with correlation one half."""
     found = campaign(0.05, 3, 2, step=1)
     cut = stats.norm.isf(0.05)
@@ -64,7 +64,7 @@ def test_impossible_campaigns_raise(fap: float, frames: int, stack: int, step: i
 
 @pytest.mark.parametrize("wanted", [1e-4, 0.01, 0.5])
 @pytest.mark.parametrize(("frames", "stack"), [(17_280, 1), (17_280, 10), (7, 7)])
-def test_what_a_test_may_have_is_the_inverse(wanted: float, frames: int, stack: int) -> None:
+def test_false_alarm_probability_per_test_is_the_inverse(wanted: float, frames: int, stack: int) -> None:
     one = per_test(wanted, frames, stack)
     there = campaign(one.independent, frames, stack)
     assert there.independent == pytest.approx(wanted, rel=1e-9)
@@ -74,7 +74,7 @@ def test_what_a_test_may_have_is_the_inverse(wanted: float, frames: int, stack: 
     assert one.overlapping is None
 
 
-def test_overlapping_stacks_may_have_more_each() -> None:
+def test_overlapping_stacks_allow_more_per_test() -> None:
     """There and back through other draws: 20 000 campaigns leave 0.05 to 6 %, four standard errors of both."""
     one = per_test(0.05, 600, 10, step=1, seed=1)
     assert one.overlapping is not None
@@ -95,7 +95,7 @@ def test_overlapping_stacks_may_have_more_each() -> None:
         ({"frames": 17_280, "alarms": 1e5}, ("campaign.alarms", "100000", "1728")),
     ],
 )
-def test_wishes_that_cannot_be(campaign_asked: dict, refusal: tuple[str, ...], engine: Engine) -> None:
+def test_impossible_rates_raise(campaign_asked: dict, refusal: tuple[str, ...], engine: Engine) -> None:
     def ask() -> None:
         detect(Study.build({"campaign": campaign_asked}, "test"), engine)
 
@@ -103,7 +103,7 @@ def test_wishes_that_cannot_be(campaign_asked: dict, refusal: tuple[str, ...], e
         ask()
 
 
-def test_a_detection_tells_both(engine: Engine) -> None:
+def test_detection_reports_test_and_campaign(engine: Engine) -> None:
     study = Study.build(
         {
             "star": [{"library": "G2V", "magnitude": 7.4}],

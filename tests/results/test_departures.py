@@ -25,7 +25,7 @@ def found(engine: Engine, *, magnitude: float = 7.4, exposure: float = 5.0, **op
     return {d.statistic: d for d in departures(engine.detect(quiet, [flare], **kind), FAP)}
 
 
-def test_the_nominal_payload_is_gaussian(engine: Engine) -> None:
+def test_nominal_payload_is_gaussian(engine: Engine) -> None:
     """Nothing differs at 50 s: six values beyond 4 standard errors once in 2500 seeds; no cause is worth 1 %."""
     for d in found(engine, exposure=50.0, statistics=tuple(STATISTICS)).values():
         assert not d.differs
@@ -33,7 +33,7 @@ def test_the_nominal_payload_is_gaussian(engine: Engine) -> None:
         assert max(abs(d.skew), abs(d.rounding), abs(d.clipping)) < 0.01
 
 
-def test_skew(engine: Engine) -> None:
+def test_skew_is_predicted(engine: Engine) -> None:
     """A few dark counts and little read noise: Poisson's tail, predicted to a fifth of its effect."""
     d = found(engine, read_noise_dn=1.0, dark_scale_dn_per_s=0.2, magnitude=14.0)["chi2"]
     assert d.why == "skew of the noise"
@@ -41,7 +41,7 @@ def test_skew(engine: Engine) -> None:
     assert d.skew > 0.3
 
 
-def test_clipping(engine: Engine) -> None:
+def test_clipping_is_predicted(engine: Engine) -> None:
     """A bias of five DN below twelve of read noise: what is cut at zero moves every sum."""
     rows = found(engine, bias_dn=5.0, dark_scale_dn_per_s=0.0, magnitude=12.0)
     assert {d.why for d in rows.values()} == {"clipping"}
@@ -50,7 +50,7 @@ def test_clipping(engine: Engine) -> None:
     assert rows["chi2"].clipping < -0.9
 
 
-def test_rounding(engine: Engine) -> None:
+def test_rounding_is_predicted(engine: Engine) -> None:
     """Noise below the ADC's step: most counts are the same, and their sum hardly scatters."""
     range_nm = {"output_min_nm": 200.0, "output_max_nm": 260.0}
     d = found(engine, read_noise_dn=0.35, dark_scale_dn_per_s=0.0, magnitude=20.0, **range_nm)["chi2"]
@@ -59,14 +59,14 @@ def test_rounding(engine: Engine) -> None:
     assert d.rounding < -0.5
 
 
-def test_estimated_variances(engine: Engine) -> None:
+def test_estimated_variances_are_predicted(engine: Engine) -> None:
     """Where photons rule, a low count has a low variance: chi-squared's null is no longer one."""
     kind = {"read_noise_dn": 3.0, "dark_scale_dn_per_s": 0.0, "magnitude": 6.0}
     assert found(engine, **kind, comparison=Comparison(0, True))["chi2"].why == "variances estimated from the counts"
     assert not found(engine, **kind)["chi2"].differs
 
 
-def test_the_causes_are_those_of_the_answer() -> None:
+def test_causes_equal_those_of_the_answer() -> None:
     kind = {"statistic": "chi2", "template": 0, "threshold": 1.0, "fap": 1e-3, "realisations": 10**6}
     from mauvecl.statistics.intervals import Interval
 
@@ -77,7 +77,7 @@ def test_the_causes_are_those_of_the_answer() -> None:
     assert d.error == pytest.approx(np.sqrt(0.999 / 1000))
 
 
-def test_unknowns_that_are_not_drawn_are_named(engine: Engine) -> None:
+def test_undrawn_unknowns_are_reported(engine: Engine) -> None:
     """A prior that nothing scatters by leaves fewer false alarms than the closed form expects."""
     quiet, flare = star(amplitudes=(0.24,))
     found = engine.detect(quiet, [flare], realisations=100_000, seed=1, nuisances={"dark": 0.1})

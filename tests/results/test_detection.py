@@ -45,7 +45,7 @@ def ks_probability(d: Distribution, sf: object) -> float:
 
 @pytest.mark.long
 @pytest.mark.parametrize("statistic", STATISTICS)
-def test_the_null_is_its_closed_form(found: Detection, statistic: str) -> None:
+def test_null_follows_its_closed_form(found: Detection, statistic: str) -> None:
     """At 1e6 realisations of a star where Gaussian limits hold; fails by chance once in 1e6 seeds."""
     d = found.distribution(statistic)
     # The smoothed sum is a generalised chi-squared, which test_smoothing.py looks at.
@@ -58,7 +58,7 @@ def test_the_null_is_its_closed_form(found: Detection, statistic: str) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("statistic", STATISTICS)
 @pytest.mark.parametrize("flare", range(len(AMPLITUDES)))
-def test_a_flare_follows_its_closed_form(found: Detection, statistic: str, flare: int) -> None:
+def test_flare_follows_its_closed_form(found: Detection, statistic: str, flare: int) -> None:
     """The whole distribution under a flare, binned on its own grid: the same test."""
     assert ks_probability(found.distribution(statistic, flare), found.closed_form(statistic, flare).sf) > 1e-6
 
@@ -83,7 +83,7 @@ def test_detection_probabilities_agree_with_the_closed_form(found: Detection, st
 
 
 @pytest.mark.long
-def test_the_paper_flares_have_an_order(found: Detection) -> None:
+def test_flares_of_the_paper_are_ordered(found: Detection) -> None:
     """More flare is never harder to see, and the right template is never beaten (Neyman & Pearson)."""
     probability = {s: [p.value for p in found.detection_probability(1e-3, s)] for s in STATISTICS}
     for values in probability.values():
@@ -108,7 +108,7 @@ def test_thresholds_invert(found: Detection, statistic: str) -> None:
 
 
 @pytest.mark.long
-def test_roc(found: Detection) -> None:
+def test_roc_equals_its_definition(found: Detection) -> None:
     curve = found.roc("matched", 1)
     fap, probability = curve.fap, curve.probability
     assert (fap[0], probability[0]) == (1.0, 1.0)
@@ -125,7 +125,7 @@ def test_roc(found: Detection) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("flare", range(len(AMPLITUDES)))
-def test_the_area_under_a_roc_is_its_closed_form(found: Detection, flare: int) -> None:
+def test_area_under_the_roc_equals_its_closed_form(found: Detection, flare: int) -> None:
     """Of two unit normals a distance d apart it is Phi(d / sqrt(2)): 4 half-widths of DeLong's, 6e-15 by chance."""
     null, with_flare = (found.closed_form("matched", f, template=flare) for f in (None, flare))
     exact = stats.norm.cdf((with_flare.mean - null.mean) / np.hypot(null.std, with_flare.std))
@@ -134,7 +134,7 @@ def test_the_area_under_a_roc_is_its_closed_form(found: Detection, flare: int) -
     assert area.low <= area.value <= area.high
 
 
-def test_delongs_interval_is_that_of_draws_made_apart() -> None:
+def test_delong_interval_agrees_with_repeated_draws() -> None:
     """200 pairs of samples: at least 178 intervals hold the exact area, fewer once in 1e4 runs of new seeds."""
     rng, grid, held = np.random.default_rng(8), Grid(0, 0.0, 1.0), 0
     exact = stats.norm.cdf(1.0 / np.sqrt(2.0))
@@ -151,7 +151,7 @@ def test_delongs_interval_is_that_of_draws_made_apart() -> None:
     assert stats.binom.cdf(177, 200, 0.95) < 3e-4
 
 
-def test_tail_samples_are_the_extremes_and_can_be_drawn_again(engine: Engine) -> None:
+def test_tail_samples_are_reproducible_extremes(engine: Engine) -> None:
     quiet, flare = star(amplitudes=(0.081,))
     kind = {"seed": 3, "start": 70, "statistics": ("chi2", "matched")}
     found = engine.detect(quiet, [flare], realisations=3000, **kind)
@@ -170,7 +170,7 @@ def test_tail_samples_are_the_extremes_and_can_be_drawn_again(engine: Engine) ->
 
 
 @pytest.mark.long
-def test_rare_tails_are_refused_not_extrapolated(found: Detection) -> None:
+def test_rare_tails_raise(found: Detection) -> None:
     with refused("fap", "10000000"):
         found.threshold(1e-5)
     found.threshold(1e-4)
@@ -180,7 +180,7 @@ def test_rare_tails_are_refused_not_extrapolated(found: Detection) -> None:
 
 
 @pytest.mark.long
-def test_table(found: Detection) -> None:
+def test_table_has_all_rows(found: Detection) -> None:
     table = found.table(fap=1e-3)
     assert len(table) == len(AMPLITUDES) * len(STATISTICS)
     chi2 = table[table["statistic"] == "chi2"]
@@ -191,7 +191,7 @@ def test_table(found: Detection) -> None:
     assert all(table[name].info.description for name in ("probability", "threshold", "expected"))
 
 
-def test_unsimulated_statistics_are_refused(engine: Engine) -> None:
+def test_unsimulated_statistics_raise(engine: Engine) -> None:
     quiet, flare = star(amplitudes=(0.24,), payload=instrument(part=True))
     found = engine.detect(quiet, [flare], realisations=1000, seed=1, statistics=("matched",))
     with refused("statistic", "'chi2'"):
@@ -227,7 +227,7 @@ def test_wider_wings_than_the_grid_are_counted(engine: Engine) -> None:
 
 
 @pytest.mark.long
-def test_a_statistic_of_ones_own(engine: Engine) -> None:
+def test_own_weights_define_a_statistic(engine: Engine) -> None:
     """The matched filter given as weights is the matched filter; any other follows its normal."""
     quiet, *flares = star(amplitudes=AMPLITUDES)
     used = np.ones(quiet.wavelength_nm.size, bool)
@@ -259,9 +259,7 @@ def test_a_statistic_of_ones_own(engine: Engine) -> None:
         (np.ones(198), "chi2", ("statistics",)),
     ],
 )
-def test_impossible_weights_are_refused(
-    engine: Engine, weights: np.ndarray, name: str, refusal: tuple[str, ...]
-) -> None:
+def test_impossible_weights_raise(engine: Engine, weights: np.ndarray, name: str, refusal: tuple[str, ...]) -> None:
     quiet, flare = star(amplitudes=(0.1,), payload=instrument(part=True))
     with refused(*refusal):
         engine.detect(quiet, [flare], realisations=10, seed=1, statistics=(Linear(name, weights),))

@@ -109,7 +109,7 @@ def check_distribution(d: Distribution, exact: Sorted) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("number", range(STUDIES))
-def test_every_number_is_that_of_sorting(engine: Engine, number: int) -> None:
+def test_numbers_equal_those_of_sorting(engine: Engine, number: int) -> None:
     (quiet, *flares), how = study(number)
     found = engine.detect(quiet, flares, realisations=N, seed=SEED, **how)
     values = engine.statistic_values(quiet, flares, count=N, seed=SEED, **how)
@@ -157,7 +157,7 @@ def check_answers(found: Detection, statistic: str, k: int, null: Sorted, flare:
 @pytest.mark.long
 @pytest.mark.parametrize("number", [*range(3), 5])
 @pytest.mark.parametrize("width", [1, 16])
-def test_signal_to_noise_is_that_of_sorting(width: int, number: int) -> None:
+def test_snr_equals_that_of_sorting(width: int, number: int) -> None:
     """Means, spreads and quantiles per pixel and element, against the S/N of the raw spectra themselves."""
     (quiet, *_), how = study(number)
     n = 1000
@@ -199,7 +199,7 @@ def test_signal_to_noise_is_that_of_sorting(width: int, number: int) -> None:
 PRIOR = Processes(detector_temperature=Uniform(15.0, 24.0))
 
 
-def test_values_that_are_no_numbers_are_refused(engine: Engine) -> None:
+def test_nan_values_are_refused(engine: Engine) -> None:
     """Weights so large that float32 overflows in the flare: the null is answered, what reads the flare is not."""
     quiet, flare = star(magnitude=5.0, amplitudes=(2.0,), payload=instrument(part=True))
     delta = (flare.signal_dn - quiet.signal_dn).sum()
@@ -218,7 +218,7 @@ def test_values_that_are_no_numbers_are_refused(engine: Engine) -> None:
     assert found.detection_probability(0.2, "matched")[0].value == 1.0
 
 
-def test_all_statistics_are_looked_at() -> None:
+def test_all_statistics_are_tested() -> None:
     """Every statistic, reference, kind of variance, prior and cosmic rays are among the studies."""
     hows = [study(number)[1] for number in range(STUDIES)]
     assert {name for how in hows for name in how["statistics"] if isinstance(name, str)} == set(STATISTICS)

@@ -28,7 +28,7 @@ def seen(engine: Engine, amplitudes: np.ndarray) -> Detection:
     return engine.detect(quiet, flares, **KIND)
 
 
-def test_pieces_of_seven_equal_forty_at_once(engine: Engine) -> None:
+def test_batches_of_flares_equal_all_at_once(engine: Engine) -> None:
     amplitudes = np.geomspace(0.001, 3.0, 40)
     table = seen(engine, amplitudes).table(0.01)
     n = len(KIND["statistics"])
@@ -39,7 +39,7 @@ def test_pieces_of_seven_equal_forty_at_once(engine: Engine) -> None:
             np.testing.assert_array_equal(part[name], whole[name])
 
 
-def test_a_flares_memory_is_bounded(engine: Engine) -> None:
+def test_memory_per_flare_is_bounded(engine: Engine) -> None:
     """From bright flares, whose bins are many, to faint ones; a histogram of all bins would keep 2 MB."""
     sizes = {}
     seen(engine, np.array([0.1])).table(0.01)
@@ -55,7 +55,7 @@ def test_a_flares_memory_is_bounded(engine: Engine) -> None:
     assert (sizes[22] - sizes[6]) / 16 < MOST_OF_A_FLARE
 
 
-def test_shards_of_few_bins_come_back_whole(engine: Engine) -> None:
+def test_sparse_shards_are_restored(engine: Engine) -> None:
     """Counts pass through shards, in any order and twice over, to the same distributions."""
     quiet, *flares = star("G2V", 7.4, amplitudes=(0.01, 1.0), exposure=50.0, payload=PAYLOAD)
     request = DetectRequest(quiet, flares, 20_000, 4)
@@ -71,7 +71,7 @@ def test_shards_of_few_bins_come_back_whole(engine: Engine) -> None:
 
 
 @pytest.mark.parametrize("most", [100_000, 120])
-def test_many_flares_share_the_rows_of_tables(engine: Engine, monkeypatch: pytest.MonkeyPatch, most: int) -> None:
+def test_many_flares_share_table_rows(engine: Engine, monkeypatch: pytest.MonkeyPatch, most: int) -> None:
     monkeypatch.setattr(module, "MOST_ROWS", most)
     study = small(
         star=[{"library": "G2V", "magnitude": 7.4}],
@@ -88,7 +88,7 @@ def test_many_flares_share_the_rows_of_tables(engine: Engine, monkeypatch: pytes
         assert (rows["fap"].min(), rows["fap"].max()) == (0.0, 1.0)
 
 
-def test_pictures_show_some_of_many_flares() -> None:
+def test_pictures_show_a_selection_of_many_flares() -> None:
     for n in (1, 4, 16, 17, 500):
         chosen = pictures._drawn_flares([str(k) for k in range(n)])
         assert len(chosen) == len(set(chosen)) == min(n, 16)

@@ -85,7 +85,7 @@ def test_forecasts_of_blackbodies(row: tuple[Any, ...]) -> None:
 
 
 @pytest.mark.parametrize("row", PUBLISHED_JUMPS, ids=lambda row: f"jump-{row[0]:g}")
-def test_forecasts_of_balmer_jumps_and_what_a_blackbody_makes_of_them(row: tuple[float, ...]) -> None:
+def test_forecasts_of_balmer_jumps_and_of_wrong_blackbodies(row: tuple[float, ...]) -> None:
     jump, snr, *errors, kelvin, chi2, ultraviolet, area = row
     m, x = model(jump=True, distance_pc=5.0), quiet()
     amplitudes = m.amplitudes(9500.0, 0.5, jump=jump)
@@ -105,7 +105,7 @@ def test_forecasts_of_balmer_jumps_and_what_a_blackbody_makes_of_them(row: tuple
 
 
 @pytest.mark.parametrize("name", ["280", "Ca II K", "Ca II H", "H beta", "H alpha"])
-def test_the_snr_of_a_line(name: str) -> None:
+def test_line_snr_equals_its_closed_form(name: str) -> None:
     """1e-12 erg s-1 cm-2 in 50 s at M3V of V = 9: .050, .071, .071, .075 and .066 (specification, three decimals)."""
     wanted = {"280": 0.050, "Ca II K": 0.071, "Ca II H": 0.071, "H beta": 0.075, "H alpha": 0.066}[name]
     m, x = model(lines=(name,)), quiet()
@@ -118,7 +118,7 @@ def test_the_snr_of_a_line(name: str) -> None:
     ("library", "v", "kelvin", "jump", "line"),
     [("K3V", 6.0, 7500.0, 1.8, 3e-12), ("G2V", 8.0, 14_000.0, 3.0, 0.0), ("M3V", 7.0, 25_000.0, 1.2, 8e-12)],
 )
-def test_forecasts_are_those_of_brute_force(
+def test_forecasts_agree_with_brute_force(
     library: str, v: float, kelvin: float, jump: float, line: float, unknown: bool
 ) -> None:
     """Whole spectra through `expect`, derivatives by differences, unknowns as parameters of the information."""
@@ -172,7 +172,7 @@ def bounds(n: int, low: float = 0.94, high: float = 0.96, false: float = 1e-6) -
 @pytest.mark.long
 @pytest.mark.parametrize("unknown", [False, True], ids=["known", "free"])
 @pytest.mark.parametrize("jump", [False, True], ids=["blackbody", "jump"])
-def test_coverage_of_95_percent_intervals(jump: bool, unknown: bool) -> None:
+def test_intervals_of_95_percent_cover(jump: bool, unknown: bool) -> None:
     """24 cells of 600 fits; false failures: 2e-6 x 4 or 5 quantities x 24 cells and as much for all cells together.
 
     S/N is what is left when the unknowns are marginalised over.
@@ -204,7 +204,7 @@ def test_coverage_of_95_percent_intervals(jump: bool, unknown: bool) -> None:
     assert ((low <= covered) & (covered <= high)).all(), covered / (n * cells)
 
 
-def test_a_hot_flare_ends_in_a_lower_limit_of_its_temperature() -> None:
+def test_hot_flare_has_a_lower_limit_of_temperature() -> None:
     """False failures: the coverage of the one-sided limit is 97.5 % or more of 400; fewer than 370 have p < 1e-6."""
     x, m = quiet(), model()
     amplitude = 0.01
@@ -215,7 +215,7 @@ def test_a_hot_flare_ends_in_a_lower_limit_of_its_temperature() -> None:
     assert (found.low[0, :, 0] <= 60_000.0).sum() >= 370
 
 
-def test_without_a_flare_the_amplitude_is_at_its_boundary() -> None:
+def test_amplitude_without_a_flare_is_at_its_boundary() -> None:
     """False failures: half of 400 pull to no light at one temperature; over temperatures fewer, not below 50 (1e-6)."""
     x, m = quiet(), model()
     found = fit(drawn(x, np.zeros(x.wavelength_nm.size), 400, 32), x, m, levels=(0.95,))
@@ -227,7 +227,7 @@ def test_without_a_flare_the_amplitude_is_at_its_boundary() -> None:
     assert found.one_sided[0, none, 0].sum() + np.isinf(found.low[0, none, 0]).sum() > 0
 
 
-def test_bounded_intervals_are_those_of_brute_force() -> None:
+def test_bounded_intervals_agree_with_brute_force() -> None:
     """Jump and lines near their bounds: non-negative least squares of SciPy on grids of temperature and jump."""
     x, m = quiet(), model(jump=True, lines=("Mg II",))
     raw = drawn(x, m.counts(9000.0, m.amplitudes(9000.0, 0.05, jump=1.05, lines=(2e-12,))), 4, 51)
@@ -293,7 +293,7 @@ def test_great_flare_of_ad_leo(
     assert optical.estimates[0, 0] < optical_k[1]
 
 
-def test_limits_at_a_bound_cover() -> None:
+def test_limits_at_a_bound_have_nominal_coverage() -> None:
     """A flare without a jump, fitted with one: half of the fits are at the bound, and limits cover 97.5 %.
 
     At a bound the statistic is 0 or that of Wilks, each in half of the cases (Chernoff 1954). False failures: 1e-6.
@@ -309,7 +309,7 @@ def test_limits_at_a_bound_cover() -> None:
     assert (found.high[0, :, column] > 1.0).all()
 
 
-def test_sums_of_the_device_are_fitted_as_pixels_are(engine: Engine) -> None:
+def test_sums_of_the_device_give_the_fit_of_pixels(engine: Engine) -> None:
     """The same 300 realisations as frames, and as sums that the device makes of their pixels."""
     x = quiet()
     for jump in (1.0, 2.0):
@@ -327,7 +327,7 @@ def test_sums_of_the_device_are_fitted_as_pixels_are(engine: Engine) -> None:
         np.testing.assert_allclose(errors, found.errors, rtol=0.02)
 
 
-def test_the_sums_keep_the_information() -> None:
+def test_sums_keep_the_information() -> None:
     """At most 1 % of the information may be lost: here 1e-4 of an error, in and between the nodes."""
     x = quiet()
     for kelvin in (3100.0, 9500.0, 41_234.0):
@@ -355,7 +355,7 @@ def test_saturated_pixels_do_not_count() -> None:
     assert found.dof == pytest.approx(int((~lit.saturated).sum()) - 2, abs=60)
 
 
-def test_one_frame_is_fitted_alike_in_any_company() -> None:
+def test_fit_does_not_depend_on_other_frames() -> None:
     x, m = quiet(), model(jump=True)
     raws = [drawn(x, m.counts(k, m.amplitudes(k, a, jump=2.0)), 3, 5) for k, a in ((8e3, 0.4), (2e4, 3.0), (5e3, 0.01))]
     together = fit(np.concatenate(raws), x, m)
@@ -381,13 +381,13 @@ def test_one_frame_is_fitted_alike_in_any_company() -> None:
         (lambda: model().amplitudes(9000.0, 0.1, jump=2.0), ("jump",)),
     ],
 )
-def test_what_cannot_be_is_named(call: Any, text: tuple[str, ...]) -> None:
+def test_impossible_requests_raise(call: Any, text: tuple[str, ...]) -> None:
     with refused(*text):
         call()
 
 
 @pytest.mark.long
-def test_intervals_are_those_of_minos_and_near_emcees_posterior() -> None:
+def test_intervals_agree_with_minos_and_emcee() -> None:
     """One spectrum of a flare with a Balmer jump, dark and star unknown: the full likelihood, unknowns as parameters.
 
     Our variance is that of the fitted flare; MINOS moves it along. False failures: emcee's own noise, some 3 % of an

@@ -44,7 +44,7 @@ def atom(values: np.ndarray, fap: float) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_thresholds_exist_where_no_value_is_more_probable(engine: Engine, seed: int) -> None:
+def test_threshold_exists_unless_a_value_is_too_probable(engine: Engine, seed: int) -> None:
     """Over stars near saturation: refused exactly where an independent count of raw values finds such a value.
 
     Values of one pixel are whole DN, many to a bin of the histogram at most: compared where they are clearly apart.
@@ -79,7 +79,7 @@ def test_thresholds_exist_where_no_value_is_more_probable(engine: Engine, seed: 
         assert np.isnan(table["probability"]).all()
 
 
-def test_some_of_these_stars_have_no_threshold(engine: Engine) -> None:
+def test_scenes_include_stars_without_threshold(engine: Engine) -> None:
     """The test above meets both kinds."""
     kinds = set()
     for seed in range(20):
@@ -89,7 +89,7 @@ def test_some_of_these_stars_have_no_threshold(engine: Engine) -> None:
     assert kinds == {True, False}
 
 
-def test_sampled_thresholds_are_refused_there_too(engine: Engine) -> None:
+def test_sampled_threshold_raises_as_well(engine: Engine) -> None:
     """One frame is drawn as a stack: importance sampling meets the same value."""
     quiet, flare = nearly_saturated(3)
     quiet, flare = (replace(x, n_frames=1) for x in (quiet, flare))
@@ -130,7 +130,7 @@ def at_the_rail() -> float:
     return high
 
 
-def test_answers_say_so(engine: Engine) -> None:
+def test_answers_report_missing_thresholds(engine: Engine) -> None:
     magnitude = at_the_rail() + 0.001
     answer = detect(study(magnitude), engine)
     assert np.isnan(answer.table["probability"]).all()
@@ -143,7 +143,7 @@ def test_answers_say_so(engine: Engine) -> None:
     assert not any("every pixel that counts saturates" in text for text in found.messages)
 
 
-def test_a_limit_there_is_refused(engine: Engine) -> None:
+def test_limit_without_threshold_raises(engine: Engine) -> None:
     magnitude = at_the_rail() + 0.001
     asked = study(magnitude, limit={"of": "amplitude", "power": 0.05})
     search = LimitSearch(Case(asked), "matched", engine)

@@ -31,7 +31,7 @@ def found(engine: Engine) -> Detection:
 @pytest.mark.long
 @pytest.mark.parametrize("statistic", STATISTICS)
 @pytest.mark.parametrize("fap", [1e-2, 1e-4, 1e-6])
-def test_brute_force_agrees(found: Detection, statistic: str, fap: float) -> None:
+def test_sampled_tail_agrees_with_brute_force(found: Detection, statistic: str, fap: float) -> None:
     """Realisations beyond the sampled threshold: |z| < 4.5 with both errors, 18 values, 1e-4 by chance."""
     sampled = tail(found, fap, statistic, seed=3)
     null = found.distribution(statistic)
@@ -53,7 +53,7 @@ def plain(engine: Engine) -> Detection:
 @pytest.mark.long
 @pytest.mark.parametrize("statistic", STATISTICS)
 @pytest.mark.parametrize("fap", [1e-3, 1e-6, 1e-9])
-def test_the_closed_form_where_it_is_exact(plain: Detection, statistic: str, fap: float) -> None:
+def test_sampled_tail_agrees_with_the_exact_closed_form(plain: Detection, statistic: str, fap: float) -> None:
     """Within 4 standard errors."""
     sampled = tail(plain, fap, statistic, seed=5)
     exact = plain.closed_form(statistic).sf(sampled.threshold.value)
@@ -76,7 +76,7 @@ UNKNOWNS = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("case", UNKNOWNS)
-def test_brute_force_agrees_with_what_is_unknown(engine: Engine, case: str) -> None:
+def test_sampled_tail_with_unknowns_agrees_with_brute_force(engine: Engine, case: str) -> None:
     """Up to three statistics at two probabilities, each case: |z| < 4.5 with both errors, 16 values, 1e-4 by chance."""
     nuisances, processes = UNKNOWNS[case]
     n = 2_000_000
@@ -94,7 +94,7 @@ def test_brute_force_agrees_with_what_is_unknown(engine: Engine, case: str) -> N
 
 
 @pytest.mark.parametrize("statistic", ["chi2", "matched"])
-def test_no_bin_moves_a_sampled_threshold(engine: Engine, statistic: str) -> None:
+def test_bins_do_not_move_a_sampled_threshold(engine: Engine, statistic: str) -> None:
     """What a detection reports is what was sampled, and flares are counted there, not at the next edge of a bin."""
     quiet, *flares = star(amplitudes=(0.05, 0.1), payload=instrument(**PART))
     found = engine.detect(quiet, flares, realisations=20_000, seed=2, statistics=("chi2", "matched"), tails="sampled")
@@ -115,7 +115,7 @@ def test_no_bin_moves_a_sampled_threshold(engine: Engine, statistic: str) -> Non
 
 
 @pytest.mark.long
-def test_intervals_cover(engine: Engine) -> None:
+def test_tail_intervals_have_nominal_coverage(engine: Engine) -> None:
     """Of 60 intervals of 95 %, at least 50 hold the closed form: fewer once in 2000 runs of new seeds."""
     payload = instrument(dark_scale_dn_per_s=0.0, read_noise_dn=60.0, output_min_nm=350.0, output_max_nm=360.0)
     quiet, flare = star(amplitudes=(0.1,), payload=payload)
@@ -129,7 +129,7 @@ def test_intervals_cover(engine: Engine) -> None:
     assert special.bdtr(49, 60, 0.95) < 5e-4
 
 
-def test_a_detection_uses_it_and_says_so(engine: Engine) -> None:
+def test_detection_reports_sampled_tails(engine: Engine) -> None:
     quiet, *flares = star(amplitudes=(0.05, 0.24), payload=instrument(**PART))
     kind = {"realisations": 100_000, "seed": 2, "statistics": ("chi2", "matched")}
     sampled = engine.detect(quiet, flares, tails="sampled", **kind)
@@ -157,7 +157,7 @@ def test_a_detection_uses_it_and_says_so(engine: Engine) -> None:
         ({"processes": Processes(jitter=Uniform(0.0, 0.05))}, "priors"),
     ],
 )
-def test_what_cannot_be_tilted_is_refused(engine: Engine, options: dict, fact: str) -> None:
+def test_impossible_tilts_raise(engine: Engine, options: dict, fact: str) -> None:
     quiet, flare = star(amplitudes=(0.1,), payload=instrument(**PART))
     found = engine.detect(quiet, [flare], realisations=100, seed=1, statistics=("chi2",), tails="sampled", **options)
     with refused("tails", fact):
@@ -181,14 +181,14 @@ def compared(request: pytest.FixtureRequest, engine: Engine) -> Detection:
 
 @pytest.mark.long
 @pytest.mark.parametrize("statistic", STATISTICS)
-def test_brute_force_agrees_whatever_is_compared(compared: Detection, statistic: str) -> None:
+def test_sampled_tail_agrees_for_every_comparison(compared: Detection, statistic: str) -> None:
     """At 1e-4 of 1e6 realisations: |z| < 4.5 with both errors, 12 values, 1e-4 by chance."""
     sampled, expected = tail(compared, ONE_IN, statistic, seed=4), ONE_IN * FEWER
     beyond = compared.false_alarm_probability(sampled.threshold.value, statistic).value * FEWER
     assert abs(beyond - expected) < 4.5 * np.hypot(np.sqrt(expected), sampled.relative_error * expected)
 
 
-def test_a_sum_in_dn_is_tilted_in_its_own_unit_by_estimated_variances(engine: Engine) -> None:
+def test_sum_in_dn_is_tilted_in_its_unit(engine: Engine) -> None:
     """Weights of one DN each: |z| < 4.5 with both errors, 1e-5 by chance."""
     quiet, _ = star(amplitudes=(0.1,), payload=instrument(**PART))
     own = Linear("own", np.ones(quiet.wavelength_nm.size))
@@ -200,7 +200,7 @@ def test_a_sum_in_dn_is_tilted_in_its_own_unit_by_estimated_variances(engine: En
     assert abs(beyond - fap * n) < 4.5 * np.hypot(np.sqrt(fap * n), sampled.relative_error * fap * n)
 
 
-def test_too_many_exposures_are_refused(engine: Engine) -> None:
+def test_too_many_exposures_raise(engine: Engine) -> None:
     quiet, flare = star(amplitudes=(0.1,), payload=instrument(**PART))
     kind = {"realisations": 100, "seed": 1, "statistics": ("chi2",), "tails": "sampled"}
     found = engine.detect(quiet, [flare], comparison=Comparison(40), **kind)

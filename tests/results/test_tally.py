@@ -38,14 +38,14 @@ def found(values: np.ndarray) -> Distribution:
 BIN = np.sqrt(2 * 1643) * 2**layout.FINE_BITS / layout.STEPS_PER_SIGMA
 
 
-def test_moments(values: np.ndarray, found: Distribution) -> None:
+def test_moments_equal_those_of_the_values(values: np.ndarray, found: Distribution) -> None:
     """A fine step is 1/2048 of a standard deviation; its rounding averages out."""
     assert found.mean == pytest.approx(values.mean(), abs=BIN / 200)
     assert found.std == pytest.approx(values.std(), rel=1e-5)
 
 
 @pytest.mark.parametrize("p", [0.001, 0.5, 0.97])
-def test_quantile_intervals_cover(p: float) -> None:
+def test_quantile_intervals_have_nominal_coverage(p: float) -> None:
     """300 samples of 2000: at least 268 hold the true quantile, fewer once in 5000 runs of new seeds."""
     rng, grid = np.random.default_rng(9), Grid(0, 0.0, 1.0)
     found = [distribution(rng.normal(size=2000), grid).quantile_interval(p) for _ in range(300)]
@@ -57,7 +57,7 @@ def test_quantile_intervals_cover(p: float) -> None:
     )
 
 
-def test_a_quantile_beyond_all_values_has_no_end(found: Distribution) -> None:
+def test_quantile_beyond_all_values_has_an_open_interval(found: Distribution) -> None:
     assert found.quantile_interval(1e-6).low == -np.inf
     assert found.quantile_interval(1 - 1e-6).high == np.inf
     for p in (0.0, 1.0, np.nan):
@@ -65,7 +65,7 @@ def test_a_quantile_beyond_all_values_has_no_end(found: Distribution) -> None:
             found.quantile_interval(p)
 
 
-def test_quantiles(values: np.ndarray, found: Distribution) -> None:
+def test_quantiles_equal_those_of_sorting(values: np.ndarray, found: Distribution) -> None:
     for p in (0.00135, 0.16, 0.5, 0.84, 0.99865):
         assert found.quantile(p) == pytest.approx(np.quantile(values, p), abs=1.5 * BIN)
 
@@ -106,7 +106,7 @@ def bin_of(value: float, grid: Grid) -> float:
 
 @pytest.mark.parametrize("grid", GRIDS.values(), ids=list(GRIDS))
 @pytest.mark.parametrize("values", FAR.values(), ids=list(FAR))
-def test_nothing_has_an_end(values: np.ndarray, grid: Grid) -> None:
+def test_numbers_agree_with_sorting_for_any_float(values: np.ndarray, grid: Grid) -> None:
     """Moments, counts, thresholds and quantiles of any float32 on any grid, against sorting and exact sums."""
     values = values.astype(np.float32)
     found, ordered = distribution(values, grid), np.sort(values.astype(float))
@@ -142,7 +142,7 @@ def test_nothing_has_an_end(values: np.ndarray, grid: Grid) -> None:
     np.testing.assert_allclose(np.diff(edges), np.diff(edges)[0], rtol=1e-6, atol=4 * slack)
 
 
-def test_what_is_no_number_is_refused() -> None:
+def test_nan_is_refused() -> None:
     """Counted, and never left out in silence."""
     found = distribution(np.array([0.0, np.nan, np.inf, -np.inf, 1.0, 1e9]), Grid(0, 0.0, 1.0))
     assert (found.far.undefined, found.far.n, found.counts.sum()) == (3, 1, 2)
@@ -160,7 +160,7 @@ def test_what_is_no_number_is_refused() -> None:
             read()
 
 
-def test_order_and_pieces_change_nothing() -> None:
+def test_order_and_splitting_change_nothing() -> None:
     """The same values backwards, in uneven pieces: every count and both exact sums."""
     values, grid = FAR["every float"].astype(np.float32), GRIDS["unit"]
     whole, parts = Tally([grid]), Tally([grid])
@@ -174,7 +174,7 @@ def test_order_and_pieces_change_nothing() -> None:
     assert ours.second == sum(Fraction(float(x)) ** 2 for x in values[~inside]) * 2**298
 
 
-def test_picture_bins_hold_every_realisation(values: np.ndarray, found: Distribution) -> None:
+def test_picture_bins_contain_every_realisation(values: np.ndarray, found: Distribution) -> None:
     edges, counts = found.histogram(bins=100)
     assert counts.sum() == values.size
     assert len(edges) == len(counts) + 1 <= 101

@@ -34,7 +34,7 @@ def model(**how: bool) -> FlareModel:
     return FlareModel.of(star(), MAUVE, expectations()[0], distance_pc=5.0, **how)
 
 
-def test_two_temperatures_are_found_without_noise() -> None:
+def test_two_temperatures_are_recovered_without_noise() -> None:
     """Second temperatures are tried 0.6 % apart, which is far below their error."""
     quiet, two, _ = expectations()
     found = fit_two(two.recorded_dn, quiet, model())
@@ -53,7 +53,7 @@ def test_two_temperatures_are_found_without_noise() -> None:
 
 
 @pytest.mark.long
-def test_intervals_of_two_temperatures_cover(engine: Engine) -> None:
+def test_intervals_of_two_temperatures_have_nominal_coverage(engine: Engine) -> None:
     """400 drawn exposures. False failures: a coverage of 93 to 97 %, 1e-6 on each side of four quantities."""
     quiet, two, _ = expectations()
     found = fit_two(engine.realise(two, count=400, seed=3), quiet, model(), levels=(0.95,))
@@ -71,7 +71,7 @@ def test_intervals_of_two_temperatures_cover(engine: Engine) -> None:
     assert stats.binom.sf(rejected - 1, 400, 0.01) > 1e-6
 
 
-def test_one_temperature_leaves_the_second_open(engine: Engine) -> None:
+def test_second_temperature_of_a_single_blackbody_is_unconstrained(engine: Engine) -> None:
     """A blackbody of 9000 K: no limit on the second temperature, and the first is that of the plain fit."""
     quiet, _, one = expectations()
     found = fit_two(engine.realise(one, count=20, seed=5), quiet, model(), levels=(0.95,))
@@ -82,7 +82,7 @@ def test_one_temperature_leaves_the_second_open(engine: Engine) -> None:
     assert (found.estimates >= np.array(found.bounds)).all()
 
 
-def test_a_model_with_a_jump_is_refused() -> None:
+def test_model_with_a_jump_raises() -> None:
     quiet, two, _ = expectations()
     with refused("model"):
         fit_two(two.recorded_dn, quiet, model(jump=True))

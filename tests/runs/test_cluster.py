@@ -49,7 +49,7 @@ def workers() -> Iterator[DaskWorkers]:
     found.close()
 
 
-def test_two_processes_give_one_answer(workers: DaskWorkers, engine: Engine, scene: list[Expectation]) -> None:
+def test_two_processes_give_the_answer_of_one(workers: DaskWorkers, engine: Engine, scene: list[Expectation]) -> None:
     quiet, *flares = scene
     pool = Pool(workers)
     assert workers.count == 2
@@ -59,13 +59,13 @@ def test_two_processes_give_one_answer(workers: DaskWorkers, engine: Engine, sce
     assert [device.name for device in pool.devices] == [engine.device.name] * 2
 
 
-def test_stares_by_two_processes(workers: DaskWorkers, engine: Engine) -> None:
+def test_two_processes_give_the_stares_of_one(workers: DaskWorkers, engine: Engine) -> None:
     asked = flaring_stares()
     found = Pool(workers).stares(asked)
     np.testing.assert_array_equal(found["values"], Stares(engine.open_device).reduced(asked)["values"])
 
 
-def test_a_worker_killed_in_mid_run(workers: DaskWorkers, engine: Engine, scene: list[Expectation]) -> None:
+def test_killed_worker_is_replaced(workers: DaskWorkers, engine: Engine, scene: list[Expectation]) -> None:
     """SIGKILL to a process that is counting: its shard is counted by another, and the answer keeps its bits."""
     quiet, *flares = scene
     n, pids = 150_000, list(workers._client.run(os.getpid).values())
@@ -95,7 +95,7 @@ def greeted(port: int, context: ssl.SSLContext | None) -> bool:
         return False
 
 
-def test_nobody_else_can_connect(workers: DaskWorkers) -> None:
+def test_strangers_cannot_connect(workers: DaskWorkers) -> None:
     """Another user of this machine sees the ports; without this run's certificate none of them answers."""
     import psutil
     from distributed import Security
@@ -120,18 +120,18 @@ def test_nobody_else_can_connect(workers: DaskWorkers) -> None:
         assert b"PRIVATE" not in Path(f"/proc/{pid}/cmdline").read_bytes()
 
 
-def test_raw_spectra_by_two_processes(workers: DaskWorkers, tmp_path: Path, engine: Engine) -> None:
+def test_two_processes_give_the_spectra_of_one(workers: DaskWorkers, tmp_path: Path, engine: Engine) -> None:
     study = small().with_settings(["run.realisations=500"])
     bulk.realise(study, tmp_path / "s.zarr", Pool(workers))
     assert bulk.verify(tmp_path / "s.zarr", engine, redraw=True) == []
 
 
-def test_flares_measured_by_two_processes(workers: DaskWorkers, engine: Engine) -> None:
+def test_two_processes_measure_the_flares_of_one(workers: DaskWorkers, engine: Engine) -> None:
     study = Study().with_settings(["star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.5]", "measure.fits=40"])
     assert measure(study, Pool(workers)) == measure(study, engine)
 
 
-def test_a_mistake_on_a_worker_is_a_sentence(workers: DaskWorkers) -> None:
+def test_error_on_a_worker_raises(workers: DaskWorkers) -> None:
     """An error that another try would not mend is not tried again."""
     before = workers.retries
 
@@ -160,7 +160,7 @@ class Silent:
         raise TimeoutError
 
 
-def test_whoever_waits_is_woken_at_the_end(scene: list[Expectation], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_waiting_threads_are_woken_at_the_end(scene: list[Expectation], monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever Dask does: threads that wait for shards, for spectra, and for each other end at once."""
     monkeypatch.setattr("mauvecl.runs.cluster._client", lambda where, distributed: nullcontext(Silent()))
     monkeypatch.setattr(Silent, "run", lambda *given, **how: {}, raising=False)
@@ -194,7 +194,7 @@ def test_whoever_waits_is_woken_at_the_end(scene: list[Expectation], monkeypatch
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_cluster_ends_in_order(stop: signal.Signals, tmp_path: Path) -> None:
+def test_interrupted_cluster_ends_its_workers(stop: signal.Signals, tmp_path: Path) -> None:
     """Two seconds where this was written; five are promised.
 
     Ctrl-C in a terminal reaches the whole process group: workers are not of it, or what they build is cut off aloud.
@@ -289,7 +289,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Pat
 
 
 @pytest.mark.parametrize(("system", "line"), [("slurm", "#SBATCH -p astro"), ("pbs", "#PBS -q astro")])
-def test_the_example_for_batch_systems(system: str, line: str) -> None:
+def test_example_for_batch_systems_runs(system: str, line: str) -> None:
     pytest.importorskip("dask_jobqueue")
     example = Path(__file__).parents[2] / "docs" / "examples" / "batch_cluster.py"
     command = [sys.executable, example, system, "--queue", "astro", "--cores", "4", "--show"]
@@ -300,7 +300,7 @@ def test_the_example_for_batch_systems(system: str, line: str) -> None:
 
 
 @pytest.mark.parametrize("by", ["address", "file"])
-def test_a_cluster_that_is_there(
+def test_existing_cluster_is_used(
     cluster: tuple[str, Path], by: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By address and by scheduler file, from the command line; the tables are those of one machine."""
@@ -316,7 +316,7 @@ def test_a_cluster_that_is_there(
     assert '"retries": 0' in Path("many/run.json").read_text()
 
 
-def test_a_scheduler_that_dies(tmp_path: Path, scene: list[Expectation]) -> None:
+def test_lost_scheduler_raises(tmp_path: Path, scene: list[Expectation]) -> None:
     with by_hand(tmp_path) as (scheduler, file):
         workers = DaskWorkers(str(file))
         pool = Pool(workers)
@@ -333,7 +333,7 @@ def test_a_scheduler_that_dies(tmp_path: Path, scene: list[Expectation]) -> None
         workers.close()
 
 
-def test_a_scheduler_that_dies_while_counts_are_fetched() -> None:
+def test_scheduler_lost_during_a_fetch_raises() -> None:
     workers = DaskWorkers.__new__(DaskWorkers)
     workers._lock, workers._where = threading.Lock(), "tcp://host:8786"
     awaited: Future[Any] = Future()
@@ -359,7 +359,7 @@ def test_a_scheduler_that_dies_while_counts_are_fetched() -> None:
         ("tcp://127.0.0.1:1", DeviceError, "no scheduler answers at tcp://127.0.0.1:1, expected one within"),
     ],
 )
-def test_no_cluster_is_a_sentence(
+def test_missing_cluster_raises(
     where: str, kind: type[Exception], sentence: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mauvecl.runs.cluster.PATIENCE_S", 1.0)
@@ -367,13 +367,13 @@ def test_no_cluster_is_a_sentence(
         DaskWorkers(where)
 
 
-def test_without_dask(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_dask_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with refused("dask", "'mauvecl[cluster]'"):
         DaskWorkers("local:2")
 
 
-def test_without_certificates(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_cryptography_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     """No cluster rather than an open one."""
     monkeypatch.setitem(sys.modules, "cryptography", None)
     with refused("cryptography", "'mauvecl[cluster]'"):

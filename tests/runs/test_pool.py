@@ -69,7 +69,7 @@ class Shuffled(LocalWorkers):
 
 
 @pytest.mark.parametrize("start", [0, 2**32 - 5000])
-def test_any_order_gives_the_engines_answer(engine: Engine, scene: list[Expectation], start: int) -> None:
+def test_order_of_shards_does_not_affect_the_answer(engine: Engine, scene: list[Expectation], start: int) -> None:
     quiet, *flares = scene
     own = Linear("own", np.linspace(0.0, 1.0, quiet.wavelength_nm.size))
     how: dict[str, Any] = {"realisations": N, "seed": 5, "start": start, "statistics": ("chi2", "matched", own)}
@@ -87,7 +87,7 @@ def test_any_order_gives_the_engines_answer(engine: Engine, scene: list[Expectat
 
 
 @pytest.mark.long
-def test_many_flares_noisy_references_and_processes(engine: Engine) -> None:
+def test_shards_of_every_kind_of_request_join(engine: Engine) -> None:
     """Several launches to a request, and everything that a request can carry."""
     quiet, *flares = star(amplitudes=tuple(np.linspace(0.01, 0.3, 17)), payload=instrument(part=True))
     how: dict[str, Any] = {
@@ -102,7 +102,7 @@ def test_many_flares_noisy_references_and_processes(engine: Engine) -> None:
     assert pool.standing.of == 2 * 3
 
 
-def test_several_devices_of_different_form(scene: list[Expectation], engine: Engine) -> None:
+def test_devices_of_different_form_give_one_answer(scene: list[Expectation], engine: Engine) -> None:
     """Two engines, one with 16 realisations to a work-item and one with 1, share the work and the answer's bits."""
     quiet, *flares = scene
     widths = iter((16, 1))
@@ -142,7 +142,7 @@ class Failing:
         return self._engine.count(request, shard, **more)
 
 
-def test_a_failed_launch_is_counted_again(engine: Engine, scene: list[Expectation]) -> None:
+def test_failed_launch_is_repeated(engine: Engine, scene: list[Expectation]) -> None:
     quiet, *flares = scene
     calls: list[int] = []
     made: list[int] = []
@@ -157,7 +157,7 @@ def test_a_failed_launch_is_counted_again(engine: Engine, scene: list[Expectatio
     assert len(made) == 4, "each time with a new context"
 
 
-def test_a_device_that_always_fails_is_one_sentence(engine: Engine, scene: list[Expectation]) -> None:
+def test_device_that_always_fails_raises(engine: Engine, scene: list[Expectation]) -> None:
     quiet, *flares = scene
     pool = Pool(LocalWorkers([None], make=lambda device, progress: Failing(engine, set(range(99)), [])))  # type: ignore[return-value, arg-type]
     with pytest.raises(DeviceError, match=r"failed 3 times at realisations 0 to 4095 .*OUT_OF_RESOURCES.*expected"):
@@ -178,7 +178,7 @@ AXES = {"x": {"quantity": "magnitude", "values": [6, 8, 10]}, "y": {"quantity": 
     ],
     ids=["detect", "snr", "limit", "map", "unknowns"],
 )
-def test_every_study_gives_the_same_table(
+def test_pool_gives_the_table_of_the_engine(
     engine: Engine, ask: Callable[[Study, Any], Any], sections: dict[str, Any]
 ) -> None:
     ours, theirs = ask(small(**sections), engine), ask(small(**sections), Pool(Shuffled(engine, 9)))
@@ -187,7 +187,7 @@ def test_every_study_gives_the_same_table(
         np.testing.assert_array_equal(np.asarray(ours[name]), np.asarray(theirs[name]), err_msg=name)
 
 
-def test_fingerprints_tell_requests_apart(scene: list[Expectation]) -> None:
+def test_fingerprints_distinguish_requests(scene: list[Expectation]) -> None:
     """Everything that changes an answer changes the name of its shards, and nothing else does."""
     quiet, *flares = scene
     base = DetectRequest(quiet, tuple(flares), N, 5, ("chi2", "matched"))
@@ -248,7 +248,7 @@ def at_work(
         return pool.detect(quiet, flares, realisations=N, seed=5), pool, checkpoint
 
 
-def test_an_interrupted_run_goes_on(tmp_path: Path, engine: Engine) -> None:
+def test_interrupted_run_is_resumed(tmp_path: Path, engine: Engine) -> None:
     with pytest.raises(KeyboardInterrupt):
         at_work(tmp_path, engine, interrupting(20_000))
     found, pool, checkpoint = at_work(tmp_path, engine, resume=True)
@@ -259,7 +259,7 @@ def test_an_interrupted_run_goes_on(tmp_path: Path, engine: Engine) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_unfinished_is_not_overwritten(tmp_path: Path, engine: Engine) -> None:
+def test_unfinished_run_is_not_overwritten(tmp_path: Path, engine: Engine) -> None:
     with pytest.raises(KeyboardInterrupt):
         at_work(tmp_path, engine, interrupting(10_000))
     with refused("resume", "`resume=True`", "`restart=True`"):
@@ -271,7 +271,7 @@ def test_what_is_unfinished_is_not_overwritten(tmp_path: Path, engine: Engine) -
     assert pool.standing.resumed == 0
 
 
-def test_counts_of_another_form_are_refused(tmp_path: Path, engine: Engine) -> None:
+def test_counts_of_another_form_raise(tmp_path: Path, engine: Engine) -> None:
     """As an older version left them; also where the manifest is lost, none of its shards is added."""
     with pytest.raises(KeyboardInterrupt):
         at_work(tmp_path, engine, interrupting(10_000))
@@ -289,7 +289,7 @@ def test_counts_of_another_form_are_refused(tmp_path: Path, engine: Engine) -> N
         assert fingerprint(request) != ours
 
 
-def test_two_runs_in_one_folder(tmp_path: Path, engine: Engine) -> None:
+def test_second_run_in_a_folder_raises(tmp_path: Path, engine: Engine) -> None:
     with (
         Checkpoint(tmp_path, "detect", small()),
         refused("lock"),
@@ -298,7 +298,7 @@ def test_two_runs_in_one_folder(tmp_path: Path, engine: Engine) -> None:
 
 
 @pytest.mark.parametrize("place", [0, 20, -1])
-def test_a_flipped_byte_in_a_shard(tmp_path: Path, engine: Engine, place: int) -> None:
+def test_flipped_byte_in_a_shard_is_found(tmp_path: Path, engine: Engine, place: int) -> None:
     with pytest.raises(KeyboardInterrupt):
         at_work(tmp_path, engine, interrupting(20_000))
     first, *_ = sorted((tmp_path / "checkpoint").glob("*.npz"))
@@ -312,7 +312,7 @@ def test_a_flipped_byte_in_a_shard(tmp_path: Path, engine: Engine, place: int) -
     same(found, engine.detect(quiet, flares, realisations=N, seed=5))
 
 
-def test_a_shard_in_anothers_place(tmp_path: Path, engine: Engine) -> None:
+def test_misplaced_shard_is_found(tmp_path: Path, engine: Engine) -> None:
     with pytest.raises(KeyboardInterrupt):
         at_work(tmp_path, engine, interrupting(20_000))
     first, second, *_ = sorted((tmp_path / "checkpoint").glob("*.npz"))
@@ -324,7 +324,7 @@ def test_a_shard_in_anothers_place(tmp_path: Path, engine: Engine) -> None:
 
 
 @pytest.mark.parametrize("spoil", ["flip", "empty", "gone"])
-def test_a_damaged_manifest(tmp_path: Path, engine: Engine, spoil: str) -> None:
+def test_damaged_manifest_is_replaced(tmp_path: Path, engine: Engine, spoil: str) -> None:
     with pytest.raises(KeyboardInterrupt):
         at_work(tmp_path, engine, interrupting(20_000))
     manifest = tmp_path / "checkpoint" / "manifest.json"
@@ -347,7 +347,7 @@ def test_short_runs_leave_no_files(tmp_path: Path, engine: Engine) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_clocks_may_jump(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jumps_of_the_clock_have_no_effect(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     """Wall time runs backwards and leaps; neither shards nor progress care."""
     from mauvecl.cli.console import Meter
 
@@ -363,9 +363,7 @@ def test_clocks_may_jump(tmp_path: Path, engine: Engine, monkeypatch: pytest.Mon
     same(found, engine.detect(quiet, flares, realisations=N, seed=5))
 
 
-def test_a_full_disk_stops_with_a_sentence_and_loses_nothing(
-    tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_disk_raises_and_is_resumed(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     from stores import full_after
 
     with monkeypatch.context() as patch:
@@ -380,7 +378,7 @@ def test_a_full_disk_stops_with_a_sentence_and_loses_nothing(
     same(found, engine.detect(quiet, flares, realisations=N, seed=5))
 
 
-def test_what_is_done_meanwhile_begins_once_and_not_before_the_devices() -> None:
+def test_background_work_begins_once_after_the_devices() -> None:
     quiet, *flares = small().expectations(small().star[0])
     begun: list[int] = []
     pool = Pool(LocalWorkers(), meanwhile=lambda: begun.append(pool.standing.of))
@@ -391,7 +389,7 @@ def test_what_is_done_meanwhile_begins_once_and_not_before_the_devices() -> None
     assert of > 0
 
 
-def test_progress_tells_shards_and_what_was_resumed(tmp_path: Path, engine: Engine) -> None:
+def test_progress_includes_resumed_shards(tmp_path: Path, engine: Engine) -> None:
     with pytest.raises(KeyboardInterrupt):
         at_work(tmp_path, engine, interrupting(20_000))
     told: list[tuple[int, int]] = []

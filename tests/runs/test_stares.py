@@ -50,7 +50,7 @@ class Above:
 @pytest.mark.long
 @pytest.mark.parametrize("method", ["pixels", "cumulants"])
 @pytest.mark.parametrize("reduction", [None, Largest(), Above(500.0)])
-def test_shards_join_to_the_same_bits(engine: Engine, method: Any, reduction: Any) -> None:
+def test_shards_of_stares_join_to_the_same_bits(engine: Engine, method: Any, reduction: Any) -> None:
     """Two engines of different form, in the form that requests travel in, against one call."""
     asked = request(method, reduction=reduction)
     widths = iter((16, 1))
@@ -81,7 +81,7 @@ def test_shards_join_to_the_same_bits(engine: Engine, method: Any, reduction: An
     assert (whole[1] != whole[0]).any()
 
 
-def test_a_run_goes_on_where_it_stopped(engine: Engine, tmp_path: Path) -> None:
+def test_run_of_stares_is_resumed(engine: Engine, tmp_path: Path) -> None:
     asked, study = request(reduction=Largest()), small()
 
     class Stopping(LocalWorkers):
@@ -106,7 +106,7 @@ def test_a_run_goes_on_where_it_stopped(engine: Engine, tmp_path: Path) -> None:
         np.testing.assert_array_equal(found[name], values)
 
 
-def test_fingerprints_tell_requests_of_stares_apart() -> None:
+def test_fingerprints_distinguish_requests_of_stares() -> None:
     base = request()
     quiet = base.components.quiet
     warmer = Stare.of(30.0, jitters={"light": 0.01}, offsets={"temperature": 0.1}, temperature_c=np.nextafter(21.0, 22))

@@ -46,7 +46,7 @@ def unfinished(folder: Path, verb: str, study: Study, question: Any, compute: An
         return kept(checkpoint, question, compute)
 
 
-def test_a_checkpoint_computes_once(tmp_path: Path) -> None:
+def test_checkpoint_computes_once(tmp_path: Path) -> None:
     made = []
 
     def compute() -> dict[str, Any]:
@@ -63,7 +63,7 @@ def test_a_checkpoint_computes_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_plan_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plan_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     study, inject, asked = Study().with_settings(PLAN), planned_injections.inject, []
 
     def counted(question: Study, *engine: Any) -> Any:
@@ -97,7 +97,7 @@ def test_a_plan_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.long
-def test_a_stare_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stare_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The frames that were drawn and the thresholds that were sampled are kept."""
     settings = ["star=[{library = 'M3V', magnitude = 9}, {library = 'K5V', magnitude = 8}]", "stare.duration_s=2000"]
     study = Study().with_settings([*settings, "search.half_widths_s=[30, 120]"])
@@ -134,7 +134,7 @@ def test_a_stare_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.long
-def test_measured_flares_go_on_where_they_stopped(tmp_path: Path) -> None:
+def test_measurement_is_resumed(tmp_path: Path) -> None:
     """Fits that are finished are read, and the answer is that of one engine alone, bit for bit."""
     settings = [
         "star=[{library='M3V', magnitude=9}]",
@@ -176,7 +176,7 @@ def test_measured_flares_go_on_where_they_stopped(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("verb", ["plan", "stare", "measure"])
-def test_killed_and_resumed_as_if_never_stopped(verb: str, tmp_path: Path) -> None:
+def test_killed_run_is_resumed_to_the_same_bits(verb: str, tmp_path: Path) -> None:
     """A killed run goes on, and writes the tables of one that was never stopped."""
     (tmp_path / "targets.csv").write_text("name\neps Eri\nGJ 205\n", encoding="utf-8")
     settings = [word for setting in PLAN[1:] for word in ("--set", setting)]
@@ -205,7 +205,7 @@ def test_killed_and_resumed_as_if_never_stopped(verb: str, tmp_path: Path) -> No
     assert json.loads((tmp_path / "out" / "run.json").read_text())["verb"] == verb
 
 
-def test_an_unfinished_run_is_not_overwritten(tmp_path: Path) -> None:
+def test_unfinished_run_is_not_overwritten(tmp_path: Path) -> None:
     study = Study().with_settings(["star=[{library = 'M3V', magnitude = 9}]"])
     (tmp_path / "mauvecl-stare").mkdir()
     unfinished(tmp_path / "mauvecl-stare", "stare", study, ("some part",), lambda: {"values": np.zeros(1)})

@@ -59,7 +59,7 @@ def path(tmp_path: Path, original: Path) -> Path:
     return Path(shutil.copytree(original, tmp_path / "frames.zarr"))
 
 
-def test_rows_are_the_engines(tmp_path: Path, engine: Engine) -> None:
+def test_rows_equal_those_of_the_engine(tmp_path: Path, engine: Engine) -> None:
     asked = study()
     made = bulk.realise(asked, tmp_path / "frames.zarr", engine)
     assert len(list(made.chunks())) > 4
@@ -78,7 +78,7 @@ def test_rows_are_the_engines(tmp_path: Path, engine: Engine) -> None:
     assert "not a flight calibration" in root.attrs["throughput"]
 
 
-def test_sums_of_frames_have_32_bits_and_components_are_kept(tmp_path: Path, engine: Engine) -> None:
+def test_sums_have_32_bits_and_components_are_kept(tmp_path: Path, engine: Engine) -> None:
     asked = study(40, observation={"exposure_s": 50.0}, bulk={"components": True})
     bulk.realise(asked, tmp_path / "s.zarr", engine)
     quiet, flare = asked.expectations(asked.star[0])
@@ -93,7 +93,7 @@ def test_sums_of_frames_have_32_bits_and_components_are_kept(tmp_path: Path, eng
 
 @pytest.mark.long
 @pytest.mark.parametrize("processes", [{}, {"jitter": {"uniform": (0.0, 0.05)}}])
-def test_frames_kept_apart_add_up_to_the_exposure(tmp_path: Path, engine: Engine, processes: dict[str, Any]) -> None:
+def test_separate_frames_sum_to_the_exposure(tmp_path: Path, engine: Engine, processes: dict[str, Any]) -> None:
     how = {"observation": {"exposure_s": 50.0, "mode": "frames"}, "processes": processes}
     whole = bulk.realise(study(30, **how), tmp_path / "whole.zarr", engine)
     bulk.realise(study(30, **how, bulk={"frames": "all"}), tmp_path / "all.zarr", engine)
@@ -108,7 +108,7 @@ def test_frames_kept_apart_add_up_to_the_exposure(tmp_path: Path, engine: Engine
         np.testing.assert_array_equal(two.values, every.values[:, [0, 7]])
 
 
-def test_every_star_of_every_cell_is_there(tmp_path: Path, engine: Engine) -> None:
+def test_every_star_of_every_cell_is_stored(tmp_path: Path, engine: Engine) -> None:
     asked = study(20, sweep={"axes": [{"quantity": "magnitude", "values": [6.0, 8.0]}]})
     made = bulk.realise(asked, tmp_path / "sweep.zarr", engine)
     assert [scene.path for scene in made.scenes] == [f"star-{k}/{n}" for k in (1, 2) for n in ("quiescent", "flare-1")]
@@ -150,7 +150,7 @@ FAULTS: list[tuple[str, Callable[[Path], object], dict[str, str]]] = [
 
 
 @pytest.mark.parametrize(("break_it", "expected"), [f[1:] for f in FAULTS], ids=[f[0] for f in FAULTS])
-def test_faults_are_found_and_repaired_to_the_bit(
+def test_damage_is_found_and_repaired_to_the_bit(
     path: Path, engine: Engine, break_it: Callable[[Path], object], expected: dict[str, str]
 ) -> None:
     assert bulk.verify(path) == []
@@ -168,7 +168,7 @@ def test_faults_are_found_and_repaired_to_the_bit(
     assert bulk.verify(path, engine, redraw=True) == []
 
 
-def test_redrawing_finds_what_digests_cannot(tmp_path: Path, path: Path, engine: Engine) -> None:
+def test_redrawing_finds_damage_with_valid_digests(tmp_path: Path, path: Path, engine: Engine) -> None:
     """Chunk and digest of another seed's store are consistent, and not this study's."""
     other = tmp_path / "other.zarr"
     bulk.realise(study(run={"seed": 12}), other, engine)
@@ -184,20 +184,20 @@ def test_redrawing_finds_what_digests_cannot(tmp_path: Path, path: Path, engine:
     assert bulk.verify(path, engine, redraw=True) == []
 
 
-def test_strangers_are_named_and_left(path: Path, engine: Engine) -> None:
+def test_foreign_files_are_named_and_kept(path: Path, engine: Engine) -> None:
     (path / "star-1/quiescent/c/99").mkdir()
     (path / "star-1/quiescent/c/99/0").write_bytes(b"?")
     (fault,) = bulk.verify(path, engine, repair=True)
     assert (fault.key, fault.state, fault.mended) == ("star-1/quiescent/c/99/0", "not of this store", False)
 
 
-def test_another_study_is_refused_with_what_differs(path: Path, engine: Engine) -> None:
+def test_another_study_raises_with_the_difference(path: Path, engine: Engine) -> None:
     with refused("store", value=["run.seed", "star.0.magnitude"]):
         bulk.realise(study(run={"seed": 3}).at("magnitude", 7.0), path, engine)
     assert bulk.verify(path) == []
 
 
-def test_places_that_cannot_be(tmp_path: Path, engine: Engine) -> None:
+def test_impossible_places_raise(tmp_path: Path, engine: Engine) -> None:
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "mine.txt").write_text("keep me")
     with refused("store", "'mine.txt'"):
@@ -216,7 +216,7 @@ def test_places_that_cannot_be(tmp_path: Path, engine: Engine) -> None:
         bulk.realise(study(20, bulk={"frames": [7]}), tmp_path / "t.zarr", engine)
 
 
-def test_two_writers_on_one_store(path: Path, engine: Engine) -> None:
+def test_second_writer_raises(path: Path, engine: Engine) -> None:
     with locked(path, "store"):
         with refused("lock", value=str(path)):
             bulk.realise(study(), path, engine)
@@ -226,7 +226,7 @@ def test_two_writers_on_one_store(path: Path, engine: Engine) -> None:
 
 
 @pytest.mark.long
-def test_fifty_kills_at_random(tmp_path: Path, painted: dict[str, bytes]) -> None:
+def test_random_kills_lose_nothing(tmp_path: Path, painted: dict[str, bytes]) -> None:
     """Killed at any moment and resumed: the same files, to the bit."""
     path, kills, stores = tmp_path / "frames.zarr", 0, 0
     moments = random.Random(5)
@@ -247,7 +247,7 @@ def test_fifty_kills_at_random(tmp_path: Path, painted: dict[str, bytes]) -> Non
 
 
 @pytest.mark.long
-def test_a_kill_at_every_step_of_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kill_at_every_step_of_writing_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Before each fsync, each rename and each line of digests, one by one."""
     described, seen, step = Store(tmp_path, study(200)).description(), store.scenes(study(200)), 0
     monkeypatch.setattr(Store, "description", lambda self: described)
@@ -281,7 +281,7 @@ def test_a_kill_at_every_step_of_writing(tmp_path: Path, monkeypatch: pytest.Mon
     assert step > 30
 
 
-def test_a_full_disk_is_one_sentence_and_a_resume(
+def test_full_disk_raises_and_is_resumed(
     tmp_path: Path, painted: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "frames.zarr"
@@ -295,7 +295,7 @@ def test_a_full_disk_is_one_sentence_and_a_resume(
     assert tree(path) == painted
 
 
-def test_a_disk_that_is_really_full_or_read_only(small_disk: Path, painted: dict[str, bytes]) -> None:
+def test_full_or_read_only_file_system_raises(small_disk: Path, painted: dict[str, bytes]) -> None:
     path = small_disk / "frames.zarr"
     filler = small_disk / "filler"
     filler.write_bytes(bytes(1_400_000))
@@ -312,7 +312,7 @@ def test_a_disk_that_is_really_full_or_read_only(small_disk: Path, painted: dict
     assert tree(path) == painted
 
 
-def test_stopped_by_progress_nothing_is_lost(tmp_path: Path, painted: dict[str, bytes]) -> None:
+def test_store_stopped_by_progress_is_resumed(tmp_path: Path, painted: dict[str, bytes]) -> None:
     path = tmp_path / "frames.zarr"
 
     def stop(done: int, total: int) -> None:
@@ -328,7 +328,7 @@ def test_stopped_by_progress_nothing_is_lost(tmp_path: Path, painted: dict[str, 
     assert tree(path) == painted
 
 
-def test_the_fits_export(tmp_path: Path, engine: Engine) -> None:
+def test_fits_export_contains_the_rows(tmp_path: Path, engine: Engine) -> None:
     from astropy.io import fits
     from astropy.wcs import WCS
 
@@ -350,7 +350,7 @@ def test_the_fits_export(tmp_path: Path, engine: Engine) -> None:
         assert "0 warning(s) and 0 error(s)" in told, told
 
 
-def test_fits_holds_studies_with_any_names() -> None:
+def test_fits_export_contains_any_study() -> None:
     name = f'/{"long/" * 30}ein "Stern" \\ λ Vir 🌟.txt'
     asked = Study.build({"star": [{"file": name, "magnitude": 5.0}]}, "test")
     lines = "\n".join(_study(asked.toml()).data["LINE"])
@@ -358,7 +358,7 @@ def test_fits_holds_studies_with_any_names() -> None:
     assert Study.build(tomllib.loads(lines), "fits") == asked
 
 
-def test_the_hdf5_export_of_frames(tmp_path: Path, engine: Engine) -> None:
+def test_hdf5_export_contains_the_frames(tmp_path: Path, engine: Engine) -> None:
     import h5py
 
     made = bulk.realise(
@@ -374,7 +374,7 @@ def test_the_hdf5_export_of_frames(tmp_path: Path, engine: Engine) -> None:
         assert "star-1/quiescent" not in file
 
 
-def test_exports_that_cannot_be(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_impossible_exports_raise(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     made = bulk.realise(study(50), tmp_path / "s.zarr", engine)
     with refused("rows", "0:50"):
         Selection.of(made, rows=(10, 60))
@@ -388,7 +388,7 @@ def test_exports_that_cannot_be(tmp_path: Path, engine: Engine, monkeypatch: pyt
         Selection.of(made)
 
 
-def test_the_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_of_stores_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("study.toml").write_text(study(100).toml())
     run = CliRunner().invoke

@@ -60,7 +60,7 @@ COPIES = ["zarr.json", "star-1/quiescent/zarr.json", "star-1/flare-1/zarr.json"]
 
 
 @pytest.mark.parametrize("copy", COPIES)
-def test_a_byte_of_a_study_changes_no_label(made: Path, copy: str) -> None:
+def test_changed_byte_of_a_study_is_found(made: Path, copy: str) -> None:
     """Wherever it is changed: the store keeps its study, and repair mends the one file."""
     before, right = tree(made), Store.open(made).study
     text = study().toml()
@@ -76,7 +76,7 @@ def test_a_byte_of_a_study_changes_no_label(made: Path, copy: str) -> None:
 
 
 @pytest.mark.parametrize("copy", COPIES)
-def test_contradicting_studies_are_refused(made: Path, copy: str) -> None:
+def test_contradicting_studies_raise(made: Path, copy: str) -> None:
     """Each with its digest: nobody here can know which one was drawn, so nothing is read and nothing written."""
     other = study().toml().replace("seed = 11", "seed = 31")
     relabelled(made / copy, lambda text: other, **signed(other))
@@ -94,7 +94,7 @@ def test_contradicting_studies_are_refused(made: Path, copy: str) -> None:
     assert tree(made) == before
 
 
-def test_no_intact_study_is_no_store(made: Path) -> None:
+def test_store_without_intact_study_raises(made: Path) -> None:
     for copy in COPIES:
         relabelled(made / copy, lambda text: text.replace("seed = 11", "seed = 31"))
     before = tree(made)
@@ -103,7 +103,7 @@ def test_no_intact_study_is_no_store(made: Path) -> None:
     assert tree(made) == before
 
 
-def test_repair_does_not_mix_what_two_studies_draw(made: Path) -> None:
+def test_repair_does_not_mix_two_studies(made: Path) -> None:
     """Every copy replaced alike: the digests of what was written still tell."""
     other = study().toml().replace("seed = 11", "seed = 31")
     for copy in COPIES:
@@ -118,7 +118,7 @@ def test_repair_does_not_mix_what_two_studies_draw(made: Path) -> None:
 
 
 @pytest.mark.parametrize("how", ["python", "command", "forget"])
-def test_a_store_that_is_being_written_is_not_removed(made: Path, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_locked_store_is_not_removed(made: Path, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(made.parent)
     Path("study.toml").write_text(study().toml())
     before = tree(made)
@@ -136,7 +136,7 @@ def test_a_store_that_is_being_written_is_not_removed(made: Path, how: str, monk
 @pytest.mark.long
 @pytest.mark.parametrize("place", ["mine.txt", "star-1/mine.txt", "star-1/quiescent/c/mine", "star-1/quiescent/c/99/0"])
 @pytest.mark.parametrize("kind", ["file", "link"])
-def test_other_peoples_files_are_not_removed(made: Path, place: str, kind: str) -> None:
+def test_foreign_files_are_not_removed(made: Path, place: str, kind: str) -> None:
     elsewhere = made.parent / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / "keep").write_text("me")
@@ -153,7 +153,7 @@ def test_other_peoples_files_are_not_removed(made: Path, place: str, kind: str) 
     assert (elsewhere / "keep").read_text() == "me"
 
 
-def test_a_restart_draws_another_study(made: Path, tmp_path: Path) -> None:
+def test_restart_draws_the_new_study(made: Path, tmp_path: Path) -> None:
     other = study(run={"seed": 3})
     bulk.realise(other, made, PAINTER, restart=True)
     bulk.realise(other, tmp_path / "fresh.zarr", PAINTER)
@@ -163,7 +163,7 @@ def test_a_restart_draws_another_study(made: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_kill_while_a_store_is_removed(made: Path, tmp_path: Path) -> None:
+def test_kill_during_removal_is_recovered(made: Path, tmp_path: Path) -> None:
     """At any file: what is left is a store, and a second restart ends as the first would have."""
     other = study(run={"seed": 3})
     bulk.realise(other, tmp_path / "fresh.zarr", PAINTER)
@@ -188,7 +188,7 @@ def test_a_kill_while_a_store_is_removed(made: Path, tmp_path: Path) -> None:
         assert tree(path) == tree(tmp_path / "fresh.zarr")
 
 
-def test_a_study_that_asks_for_more_than_any_disk_holds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_store_larger_than_any_disk_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """6e15 rows and one chunk of them: each question is answered by what is there, in a second or so."""
     path, asked = tmp_path / "vast.zarr", study(6 * 10**15)
     with refused("run.realisations"):
@@ -212,7 +212,7 @@ def test_a_study_that_asks_for_more_than_any_disk_holds(tmp_path: Path, monkeypa
 
 
 @pytest.mark.parametrize("name", ["f.fits", "f.h5"])
-def test_one_file_is_not_overwritten(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_existing_file_is_not_overwritten(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("study.toml").write_text(study(20).toml())
     Path(name).write_text("mine")

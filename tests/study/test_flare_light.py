@@ -57,7 +57,7 @@ def study_of(name: str, **flare: Any) -> Study:
 
 
 @TOGETHER
-def test_study_has_its_spectrum_and_round_trips_through_toml(name: str, tmp_path: Path) -> None:
+def test_spectrum_of_a_study_round_trips_through_toml(name: str, tmp_path: Path) -> None:
     study, spectrum = study_of(name), TEXTS[name][1]
     nm = spectrum.grid(np.linspace(200.0, 700.0, 1001))
     np.testing.assert_array_equal(study.flare.light().flux(nm), spectrum.flux(nm))
@@ -68,7 +68,7 @@ def test_study_has_its_spectrum_and_round_trips_through_toml(name: str, tmp_path
 
 @TOGETHER
 @pytest.mark.parametrize("band", ["Kepler", "GALEX NUV"])
-def test_the_amplitude_is_the_rise_of_the_bands_photons(name: str, band: str) -> None:
+def test_amplitude_is_the_rise_of_photons_in_the_band(name: str, band: str) -> None:
     star, spectrum = Source.from_library("M3V").at_magnitude(9), TEXTS[name][1]
     lit = star.flaring(0.3, spectrum=spectrum, band=band)
     quiet = np.interp(lit.wavelength_nm, star.wavelength_nm, star.flux_flam)
@@ -81,7 +81,7 @@ def test_the_amplitude_is_the_rise_of_the_bands_photons(name: str, band: str) ->
 
 
 @TOGETHER
-def test_energies_are_those_of_the_light(name: str) -> None:
+def test_energies_equal_those_of_the_light(name: str) -> None:
     """Energies equal the integral of the flux added by `flaring`, extended by the flare's own spectrum."""
     star, spectrum = Source.from_library("M3V").at_magnitude(9), TEXTS[name][1]
     lit = star.flaring(1.0, spectrum=spectrum)
@@ -125,7 +125,7 @@ def test_answers_take_any_spectrum(name: str) -> None:
     assert energy == pytest.approx(scale.erg_per_s * event.equivalent_duration_s, rel=1e-9)
 
 
-def test_search_injects_the_flare_of_the_file_and_has_blackbody_templates() -> None:
+def test_search_injects_the_flare_of_the_file() -> None:
     found = {name: Case(study_of(name)).survey for name in ("blackbody", "file", "jump")}
     np.testing.assert_array_equal(found["file"].templates.directions, found["blackbody"].templates.directions)
     assert not np.array_equal(found["jump"].templates.directions, found["blackbody"].templates.directions)
@@ -141,7 +141,7 @@ def test_search_injects_the_flare_of_the_file_and_has_blackbody_templates() -> N
         ("line_scale", [0.0, 1.0], "lines"),
     ],
 )
-def test_sweeps_over_the_spectrum(quantity: str, values: list[float], name: str) -> None:
+def test_sweep_over_the_spectrum_is_answered(quantity: str, values: list[float], name: str) -> None:
     """More ultraviolet light at the same amplitude gives a higher S/N."""
     study = study_of(name).model_copy(
         update={

@@ -43,7 +43,7 @@ def test_each_star_has_its_own_photosphere() -> None:
     assert own.at("star", "M3V").star[0].effective_temperature_k is None
 
 
-def test_the_sky_is_common_to_both_hypotheses(engine: Engine) -> None:
+def test_sky_is_common_to_both_hypotheses(engine: Engine) -> None:
     """The definition of the signal does not affect detection; a sky 1000 times brighter makes it harder."""
     settings = [
         "run.realisations=20000",

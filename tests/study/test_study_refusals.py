@@ -82,7 +82,7 @@ SETTINGS = [
 
 
 @pytest.mark.parametrize(("setting", "key"), SETTINGS)
-def test_bad_settings_are_named(setting: str, key: str) -> None:
+def test_bad_settings_raise(setting: str, key: str) -> None:
     with refused(key):
         Study().with_settings([setting])
 
@@ -103,7 +103,7 @@ def test_bad_settings_are_named(setting: str, key: str) -> None:
         ("[processes.cosmic_rays]\nrate_per_cm2_s = -1", "processes.cosmic_rays.rate_per_cm2_s"),
     ],
 )
-def test_bad_study_files_are_named(text: str, key: str, tmp_path: Path) -> None:
+def test_bad_study_files_raise(text: str, key: str, tmp_path: Path) -> None:
     (tmp_path / "study.toml").write_text(text)
     with refused(key):
         Study.read(tmp_path / "study.toml")
@@ -111,13 +111,13 @@ def test_bad_study_files_are_named(text: str, key: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("spread", [0, -1.0, True, "much", float("inf"), float("nan"), [1]])
 @pytest.mark.parametrize(("key", "section"), [("dark", {}), ("own.x.sd", {"file": "x.txt"})])
-def test_bad_standard_deviations_are_refused(spread: Any, key: str, section: dict[str, Any]) -> None:
+def test_bad_standard_deviations_raise(spread: Any, key: str, section: dict[str, Any]) -> None:
     given = {"own": {"x": section | {"sd": spread}}} if section else {key: spread}
     with refused(f"nuisances.{key}"):
         Study.build({"nuisances": given}, "test")
 
 
-def test_two_temperatures_of_a_photosphere_are_refused() -> None:
+def test_two_temperatures_of_a_photosphere_raise() -> None:
     with refused("flare.photosphere_temperature_k", value=5200.0):
         Study.build(
             {
@@ -142,7 +142,7 @@ def test_two_temperatures_of_a_photosphere_are_refused() -> None:
         ("name,distance_pc\neps Eri,-3\n", "distance_pc"),
     ],
 )
-def test_bad_tables_of_targets_are_named(tmp_path: Any, text: str, key: str) -> None:
+def test_bad_tables_of_targets_raise(tmp_path: Any, text: str, key: str) -> None:
     (tmp_path / "targets.csv").write_text(text)
     with refused(key):
         read_targets(tmp_path / "targets.csv")

@@ -38,7 +38,7 @@ MAGNITUDES = {"quantity": "magnitude", "values": [6.0, 9.0]}
 EXPOSURES = {"quantity": "exposure", "values": [5.0, 50.0]}
 
 
-def test_cells() -> None:
+def test_cells_are_all_combinations() -> None:
     both = cases(study([MAGNITUDES, EXPOSURES]))
     assert [tuple(case.at.values()) for case in both] == [(6, 5), (6, 50), (9, 5), (9, 50)]
     assert all(case.star.magnitude == case.at["magnitude"] for case in both)
@@ -49,14 +49,14 @@ def test_cells() -> None:
     assert [(case.at, case.study) for case in cases(study([]))] == [({}, study([]))]
 
 
-def test_a_study_with_a_sweep_is_read_back(tmp_path: Any) -> None:
+def test_sweep_is_read_back(tmp_path: Any) -> None:
     asked = study([MAGNITUDES, EXPOSURES], "list", unknowns={"draws": 4, "known": ["qe_scale"]})
     path = tmp_path / "study.toml"
     path.write_text(asked.toml())
     assert Study.read(path) == asked
 
 
-def test_a_detection_of_each_cell_is_its_own(engine: Engine) -> None:
+def test_each_cell_equals_its_own_detection(engine: Engine) -> None:
     """A cell of a sweep has the same bits as the cell alone; columns give the swept values."""
     asked = study([MAGNITUDES, EXPOSURES])
     found = detect(asked, engine)
@@ -71,7 +71,7 @@ def test_a_detection_of_each_cell_is_its_own(engine: Engine) -> None:
     assert list(amplitudes["amplitude"]) == [0.01, 0.1]
 
 
-def test_limits_over_a_sweep(engine: Engine) -> None:
+def test_limits_follow_the_sweep(engine: Engine) -> None:
     """A colder detector and a longer exposure have fainter limits."""
     axes = [{"quantity": "detector_temperature", "values": [13.0, 21.0]}, EXPOSURES]
     result = limiting_magnitude(study(axes), engine)
@@ -83,7 +83,7 @@ def test_limits_over_a_sweep(engine: Engine) -> None:
     assert value[1] > value[0]
 
 
-def test_the_papers_noise_budgets(engine: Engine) -> None:
+def test_noise_budgets_equal_those_of_the_paper(engine: Engine) -> None:
     """For 50 s and 600 s, noise terms add up; photons dominate for the Be star and dark current for the G2V star."""
     found = snr(PAPER_BUDGETS.with_settings(["run.realisations=1000"]), engine)
     assert [s.result.expectation.exposure_s for s in found.stars] == [50.0] * 3 + [600.0] * 3
@@ -99,7 +99,7 @@ def test_the_papers_noise_budgets(engine: Engine) -> None:
     np.testing.assert_allclose(long["total"] / short["total"], np.sqrt(12), rtol=1e-6)
 
 
-def test_snr_grows_as_it_should(engine: Engine) -> None:
+def test_snr_grows_with_exposure(engine: Engine) -> None:
     table = snr(study([MAGNITUDES, EXPOSURES]), engine).element
     by_cell = {
         (m, t): table[(table["magnitude"].value == m) & (table["exposure"].value == t)]["expected"]
@@ -110,7 +110,7 @@ def test_snr_grows_as_it_should(engine: Engine) -> None:
     assert np.all(by_cell[6, 5] > by_cell[9, 5])
 
 
-def test_coverage_is_exact(engine: Engine) -> None:
+def test_gaussian_coverage_is_exact(engine: Engine) -> None:
     """Coverage from histograms equals that from the counts, and the nominal one for normal noise."""
     (quiet,) = star(exposure=5.0, payload=instrument(part=True))
     n = 20_000
@@ -127,7 +127,7 @@ def test_coverage_is_exact(engine: Engine) -> None:
 
 
 @pytest.mark.long
-def test_the_formula_holds_for_the_payload_and_fails_at_the_rail(engine: Engine) -> None:
+def test_formula_holds_for_the_payload_and_fails_at_saturation(engine: Engine) -> None:
     """The formula holds for the nominal payload and fails with a bias near zero, which clips counts."""
     asked = study([MAGNITUDES, EXPOSURES])
     cells = gaussian_report(asked, engine).cells
@@ -144,7 +144,7 @@ def test_the_formula_holds_for_the_payload_and_fails_at_the_rail(engine: Engine)
 @pytest.mark.parametrize("name", ["mauve", "mauve-electrons"])
 @pytest.mark.parametrize("temperature", [21.0, -30.0])
 @pytest.mark.parametrize("sigmas", [3.0, 5.0])
-def test_pixels_beyond_five_sigma(name: str, temperature: float, sigmas: float) -> None:
+def test_pixels_beyond_five_sigma_are_counted(name: str, temperature: float, sigmas: float) -> None:
     """The saddle-point tail agrees with the exact sum over dark counts to 0.3 %; the distribution is skewed upward."""
     (quiet,) = star(exposure=5.0, payload=instrument(name, part=True, temperature_c=temperature))
     p, step = 90, float(quiet.dark_step_dn[90])

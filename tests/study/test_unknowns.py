@@ -88,7 +88,7 @@ def test_limit_over_unknowns_has_the_power_on_average(engine: Engine) -> None:
     assert table["unknown_low"][0] < table["unknown_high"][0]
 
 
-def test_shares_are_those_of_a_linear_model() -> None:
+def test_shares_equal_those_of_a_linear_model() -> None:
     draws = drawn(study({"draws": 2048}))
     column = dict(zip(draws.names, draws.values.T, strict=True))
     outcome = 3.0 * stats.zscore(column["qe_scale"]) + 1.0 * stats.zscore(column["light_loss"])
@@ -98,14 +98,14 @@ def test_shares_are_those_of_a_linear_model() -> None:
     assert found["read_noise_dn"] == pytest.approx(0.0, abs=0.01)
 
 
-def test_averages() -> None:
+def test_average_over_unknowns_equals_the_mean() -> None:
     p = average([Interval(0.2, 0.1, 0.3), Interval(0.4, 0.3, 0.5)])
     assert p.value == pytest.approx(0.3)
     assert p.low == pytest.approx(0.3 - np.hypot(1.96 * 0.1, np.hypot(0.1, 0.1) / 2), abs=1e-3)
     assert average([Interval(1.0, 0.99, 1.0)] * 4).high == 1.0
 
 
-def test_a_map_is_the_mean_of_its_draws(engine: Engine) -> None:
+def test_map_is_the_mean_of_its_draws(engine: Engine) -> None:
     axes = {
         "x": {"quantity": "magnitude", "values": [7.0, 10.5]},
         "y": {"quantity": "amplitude", "values": [0.1, 0.24]},
@@ -118,7 +118,7 @@ def test_a_map_is_the_mean_of_its_draws(engine: Engine) -> None:
     assert set(found.shares["matched"]) == {*drawn(asked).names, REST}
 
 
-def test_values_of_the_study_are_known() -> None:
+def test_values_of_the_study_are_not_drawn() -> None:
     stated = study({}, observation={"temperature_c": 15.0, "changes": {"light_loss": 0.3}})
     assert not {"temperature_c", "light_loss"} & set(drawn(stated).names)
     with refused("unknowns.draws"):

@@ -170,7 +170,7 @@ def run(folder: Path, *words: str) -> None:
     subprocess.run(command, cwd=folder, check=True, capture_output=True)
 
 
-def test_one_edit_answers_the_question_without_a_scroll(browser: Browser, server: Server) -> None:
+def test_one_edit_answers_without_scrolling(browser: Browser, server: Server) -> None:
     """Would Mauve see a 2 % flare on a G2V star of V = 7.4 in 50 s?"""
     page = fresh(browser, server.address, viewport={"width": 1280, "height": 800})
     enter(page, "Magnitude", "7.4")
@@ -190,7 +190,7 @@ def test_one_edit_answers_the_question_without_a_scroll(browser: Browser, server
     page.context.close()
 
 
-def test_a_star_from_a_fresh_page_to_the_same_bits_on_the_command_line(page: Page, tmp_path: Path) -> None:
+def test_page_and_command_line_give_the_same_bits(page: Page, tmp_path: Path) -> None:
     assert page.get_by_text("not a flight calibration").count() == 1, "told once"
     enter(page, "Flare amplitude", "1.9")
     place = page.locator("#plot-excess").bounding_box()
@@ -211,7 +211,7 @@ def test_a_star_from_a_fresh_page_to_the_same_bits_on_the_command_line(page: Pag
     page.get_by_role("button", name="Open run 1").wait_for()
 
 
-def test_pictures_are_drawn_and_taken_along(page: Page) -> None:
+def test_pictures_are_drawn_and_downloaded(page: Page) -> None:
     tab(page, "Spectrum")
     page.locator("#figure-recorded .legend li:visible", has_text="drawn exposure").wait_for()
     for name in ("dark", "bias"):
@@ -235,7 +235,7 @@ def test_pictures_are_drawn_and_taken_along(page: Page) -> None:
         assert Path(coming.value.path()).read_bytes().startswith(first)
 
 
-def test_a_click_on_the_map_sets_the_question(page: Page) -> None:
+def test_click_on_the_map_sets_the_question(page: Page) -> None:
     tab(page, "Limit and map")
     page.locator("#text-map", has_text="At least half").wait_for()
     before = shown(page)
@@ -253,7 +253,7 @@ def test_a_click_on_the_map_sets_the_question(page: Page) -> None:
     )
 
 
-def test_no_answer_beside_a_field_that_is_wrong(page: Page) -> None:
+def test_invalid_field_removes_the_answer(page: Page) -> None:
     before = shown(page)
     place = "document.querySelector('#plot-excess').getBoundingClientRect().y + scrollY"
     top = page.evaluate(place)
@@ -276,7 +276,7 @@ def test_no_answer_beside_a_field_that_is_wrong(page: Page) -> None:
         assert page.get_by_text(told).count() == 0
 
 
-def test_answers_come_while_typing_and_with_sliders(page: Page) -> None:
+def test_typing_and_sliders_update_the_answer(page: Page) -> None:
     before = shown(page)
     field = page.get_by_label("Magnitude", exact=True)
     field.focus()
@@ -299,7 +299,7 @@ def test_answers_come_while_typing_and_with_sliders(page: Page) -> None:
     until(page, lambda: "GJ 581" in page.get_by_label("Star", exact=True).input_value() and "M3V" in shown(page))
 
 
-def test_only_realisations_that_settle_are_offered(page: Page) -> None:
+def test_offered_realisations_suffice_for_the_threshold(page: Page) -> None:
     enter(page, "False-alarm probability", "1e-6")
     field = page.get_by_label("Realisations", exact=True)
     offered = [o.get_attribute("value") for o in field.locator("option:not([disabled])").all()]
@@ -309,7 +309,7 @@ def test_only_realisations_that_settle_are_offered(page: Page) -> None:
     assert "fap=1e-6" in page.url
 
 
-def test_stars_by_any_name_and_back_and_forward(page: Page) -> None:
+def test_star_names_and_browser_history_work(page: Page) -> None:
     before = shown(page)
     field = page.get_by_label("Star", exact=True)
     field.click()
@@ -338,7 +338,7 @@ def test_stars_by_any_name_and_back_and_forward(page: Page) -> None:
     assert page.locator("#panel-noise").is_visible()
 
 
-def test_a_copied_link_is_what_is_seen(browser: Browser, page: Page) -> None:
+def test_copied_link_restores_the_page(browser: Browser, page: Page) -> None:
     enter(page, "False-alarm probability", "0.05")
     enter(page, "Realisations", "10000")
     enter(page, "Flare amplitude", "1.5")
@@ -351,7 +351,7 @@ def test_a_copied_link_is_what_is_seen(browser: Browser, page: Page) -> None:
     second.context.close()
 
 
-def test_a_link_is_text(browser: Browser, server: Server) -> None:
+def test_link_is_escaped(browser: Browser, server: Server) -> None:
     evil = "%21%5Bx%5D(http://127.0.0.1:9/x.png)%3Cimg%20src=http://127.0.0.1:9/y.png%3E"
     asked: list[str] = []
     page = browser.new_page()
@@ -365,7 +365,7 @@ def test_a_link_is_text(browser: Browser, server: Server) -> None:
     page.close()
 
 
-def test_an_upload_good_and_bad(page: Page, tmp_path: Path) -> None:
+def test_uploads_are_used_or_refused(page: Page, tmp_path: Path) -> None:
     before = shown(page)
     wavelength = np.linspace(170.0, 1000.0, 400)
     good, bad = tmp_path / "my star.txt", tmp_path / "bad.txt"
@@ -401,7 +401,7 @@ def test_an_upload_good_and_bad(page: Page, tmp_path: Path) -> None:
     assert "points" in (tmp_path / "study" / "study.toml").read_text()
 
 
-def test_cancel_stops_at_once_while_others_are_served(browser: Browser, page: Page, server: Server) -> None:
+def test_cancel_stops_while_others_are_served(browser: Browser, page: Page, server: Server) -> None:
     enter(page, "Realisations", "4000000")
     page.get_by_role("button", name="Simulate", exact=True).click()
     page.get_by_text(re.compile(r"of 8,000,000 realisations, .* a second")).wait_for()
@@ -420,7 +420,7 @@ def test_cancel_stops_at_once_while_others_are_served(browser: Browser, page: Pa
     assert "in closed form" in shown(page)
 
 
-def test_notices_are_sentences_that_can_be_put_away(page: Page) -> None:
+def test_notices_can_be_dismissed(page: Page) -> None:
     enter(page, "Magnitude", "-1")
     notice = page.get_by_text(re.compile(r"SATURATED: 1\d+ of 1643 pixels")).first
     notice.wait_for()
@@ -434,7 +434,7 @@ def test_notices_are_sentences_that_can_be_put_away(page: Page) -> None:
     answerless(page)
 
 
-def test_limit_and_map(page: Page) -> None:
+def test_limit_and_map_tabs_answer(page: Page) -> None:
     tab(page, "Limit and map")
     simulate(page, "Simulate the map")
     page.get_by_text("64 cells are simulated").wait_for()
@@ -445,7 +445,7 @@ def test_limit_and_map(page: Page) -> None:
     assert b"\n[map.x]\n" in download(page, "map (study)")
 
 
-def test_scenarios_side_by_side(page: Page) -> None:
+def test_scenarios_are_compared(page: Page) -> None:
     first = page.locator("#chance").inner_text()
     page.get_by_role("button", name="Pin", exact=True).click()
     enter(page, "Magnitude", "8")
@@ -480,14 +480,14 @@ def test_scenarios_side_by_side(page: Page) -> None:
     assert page.locator("#pinned .swatch path").get_attribute("stroke") == colours[1]
 
 
-def test_command_and_program_are_offered(page: Page) -> None:
+def test_command_and_program_are_shown(page: Page) -> None:
     page.get_by_role("button", name="Take along", exact=True).click()
     page.get_by_text("mauvecl detect --star G2V --magnitude 8.5").wait_for()
     assert "Study.build(" in page.locator("#as-python").inner_text()
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
-def test_nobody_is_kept_out(browser: Browser, server: Server, theme: str) -> None:
+def test_page_is_accessible(browser: Browser, server: Server, theme: str) -> None:
     """axe-core finds no serious violation on any tab, dialog, or fault."""
     axe = Path(pytest.importorskip("axe_core_python").__file__).parent / "axe.min.js"
     page = fresh(browser, server.address, color_scheme=theme)
@@ -527,7 +527,7 @@ def test_nobody_is_kept_out(browser: Browser, server: Server, theme: str) -> Non
     page.context.close()
 
 
-def test_everything_by_keyboard(page: Page) -> None:
+def test_page_works_by_keyboard(page: Page) -> None:
     """From the first field to a download, with the keys alone; each stop can be seen."""
     page.evaluate("document.body.focus()")
 
@@ -562,7 +562,7 @@ def test_everything_by_keyboard(page: Page) -> None:
     assert Path(coming.value.path()).read_bytes().startswith(b"# %ECSV")
 
 
-def test_a_phone_and_two_hundred_per_cent(browser: Browser, server: Server) -> None:
+def test_page_fits_a_phone_and_zoom(browser: Browser, server: Server) -> None:
     """390 pixels wide, and 1280 pixels at 200 %: the answer first, nothing to scroll sideways for."""
     for width, height in ((390, 844), (640, 400)):
         page = fresh(browser, server.address, viewport={"width": width, "height": height})
@@ -580,7 +580,7 @@ def test_a_phone_and_two_hundred_per_cent(browser: Browser, server: Server) -> N
         page.context.close()
 
 
-def test_no_visitor_is_sent_elsewhere(browser: Browser, server: Server) -> None:
+def test_page_loads_nothing_from_elsewhere(browser: Browser, server: Server) -> None:
     """The page asks no other server for anything."""
     page = browser.new_page()
     asked: list[str] = []
@@ -592,7 +592,7 @@ def test_no_visitor_is_sent_elsewhere(browser: Browser, server: Server) -> None:
     assert elsewhere == []
 
 
-def test_a_lost_connection_blocks_says_so_and_comes_back(browser: Browser, server: Server, tmp_path: Path) -> None:
+def test_lost_connection_is_reported_and_restored(browser: Browser, server: Server, tmp_path: Path) -> None:
     page = fresh(browser, f"{server.address}?magnitude=9")
     wavelength = np.linspace(170.0, 1000.0, 400)
     np.savetxt(tmp_path / "star.txt", np.transpose([wavelength, np.full(400, 1e-12)]))

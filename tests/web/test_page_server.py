@@ -62,7 +62,7 @@ HOSTILE = "![x](http://127.0.0.1:1/x.png) <img src=http://127.0.0.1:1/y.png>"
 @pytest.mark.parametrize(
     "text", ["", " ", "7,4", "1e999", "nan", "inf", "-inf", "seven", "1_0", "0x10", "٣", "1e400000"]
 )
-def test_no_number_is_guessed(name: str, text: str) -> None:
+def test_invalid_numbers_are_faults(name: str, text: str) -> None:
     state = State()
     state.enter({name: text})
     read: Any = FIELDS[name].read
@@ -76,7 +76,7 @@ def test_no_number_is_guessed(name: str, text: str) -> None:
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-def test_ranges_end_where_they_say(name: str) -> None:
+def test_ranges_include_their_ends(name: str) -> None:
     read: Any = FIELDS[name].read
     reach = read.range
     text = str if read.whole else "{:.17g}".format
@@ -92,7 +92,7 @@ def test_ranges_end_where_they_say(name: str) -> None:
                 read(text(beyond))
 
 
-def test_stars_by_any_name_they_have() -> None:
+def test_stars_are_found_by_any_name() -> None:
     state = State()
     for given, library in (
         ("GJ 581", "M3V"),
@@ -114,7 +114,7 @@ def test_stars_by_any_name_they_have() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "  ", "eps Eri", "AU Mic", "53.23 -9.46", "19h22m00s -11d12m00s"])
-def test_a_target_to_see_is_a_name_or_coordinates(text: str) -> None:
+def test_target_is_a_name_or_coordinates(text: str) -> None:
     state = State()
     state.enter({"see": text})
     assert not state.faults
@@ -129,7 +129,7 @@ def test_a_target_to_see_is_a_name_or_coordinates(text: str) -> None:
      ("lines", "Mg II=-1"), ("balmer_jump", "0.5"), ("balmer_jump", "2,5"), ("second_temperature_k", "12"),
      ("second_area", "")],
 )  # fmt: skip
-def test_a_spectrum_that_is_wrong_is_a_fault(name: str, text: str) -> None:
+def test_invalid_spectrum_is_a_fault(name: str, text: str) -> None:
     state = State()
     state.enter({name: text})
     assert state.faults.keys() == {name}
@@ -138,7 +138,7 @@ def test_a_spectrum_that_is_wrong_is_a_fault(name: str, text: str) -> None:
     assert not state.faults
 
 
-def test_the_flares_spectrum_is_that_of_the_study() -> None:
+def test_flare_spectrum_equals_that_of_the_study() -> None:
     state = State()
     assert state.question().study().flare.is_blackbody
     state.enter({"balmer_jump": "2.5", "lines": " mg ii = 0.03, 280=0.01"})
@@ -151,7 +151,7 @@ def test_the_flares_spectrum_is_that_of_the_study() -> None:
     assert state.question().study().flare.spectrum.second_area == 0.05
 
 
-def test_a_plan_needs_a_target_that_is_known() -> None:
+def test_plan_needs_a_known_target() -> None:
     state = State()
     state.enter({"see": "12 34", "hours": "50"})
     study = state.question().study()
@@ -160,7 +160,7 @@ def test_a_plan_needs_a_target_that_is_known() -> None:
         campaign_plan(study)
 
 
-def test_target_and_time_are_asked_for_where_the_sky_is_theirs() -> None:
+def test_sky_of_a_target_needs_target_and_time() -> None:
     state = State()
     state.enter({"target": "bogus", "time": "tomorrow"})
     assert not state.faults, "nobody asks for them"
@@ -180,7 +180,7 @@ def test_target_and_time_are_asked_for_where_the_sky_is_theirs() -> None:
     assert not state.faults
 
 
-def test_stars_in_words() -> None:
+def test_stars_are_described_in_words() -> None:
     assert [star_words(name) for name in ("G2V", "M3V", "A0V", "K2.5V", "Sun", "Vega")] == [
         "a G2V star",
         "an M3V star (spectrum of GJ 581)",
@@ -191,7 +191,7 @@ def test_stars_in_words() -> None:
     ]
 
 
-def test_a_link_is_what_was_entered_right_or_wrong() -> None:
+def test_link_contains_what_was_entered() -> None:
     first, second = State(), State()
     first.enter(
         {
@@ -214,7 +214,7 @@ def test_a_link_is_what_was_entered_right_or_wrong() -> None:
     assert len(second.link) < 10_000
 
 
-def test_realisations_settle_the_false_alarm_probability() -> None:
+def test_realisations_suffice_for_the_false_alarm_probability() -> None:
     state = State()
     state.enter({"fap": "0.0001", "realisations": "100000"})
     assert "expected at least 100" in state.faults["realisations"]
@@ -227,7 +227,7 @@ def test_realisations_settle_the_false_alarm_probability() -> None:
     assert state.question().study().run.tails == "sampled"
 
 
-def test_presets_are_questions() -> None:
+def test_presets_are_valid_questions() -> None:
     for given in PRESETS.values():
         state = State()
         state.enter(given)
@@ -257,7 +257,7 @@ def star_file(path: Path) -> bytes:
         (0.0, "< 0.01 %"),
     ],
 )
-def test_nothing_is_certain(value: float, told: str) -> None:
+def test_probabilities_are_never_shown_as_certain(value: float, told: str) -> None:
     assert percent(value) == told
 
 
@@ -267,7 +267,7 @@ def closed(tmp_path_factory: pytest.TempPathFactory) -> ClosedForms:
 
 
 @pytest.mark.parametrize("tab", TABS)
-def test_every_picture_finds_all_its_data(closed: ClosedForms, tab: str) -> None:
+def test_every_picture_has_its_data(closed: ClosedForms, tab: str) -> None:
     """A figure's sources and the data that come are of the same names and columns, in both themes and on all axes."""
     for picture in TABS[tab].pictures:
         drawn = picture.drawn(closed, {})
@@ -284,7 +284,7 @@ def test_every_picture_finds_all_its_data(closed: ClosedForms, tab: str) -> None
 
 
 @pytest.mark.parametrize("statistic", ["matched", "chi2", "uv_excess"])
-def test_the_card_is_the_engines_own_closed_form(statistic: str, tmp_path: Path) -> None:
+def test_card_shows_the_closed_form(statistic: str, tmp_path: Path) -> None:
     """What an answer on the command line is compared with, known without a scene that could be drawn."""
     state = State()
     state.enter({"statistic": statistic, "magnitude": "6", "unknown": "the usual"})
@@ -299,7 +299,7 @@ def test_the_card_is_the_engines_own_closed_form(statistic: str, tmp_path: Path)
     assert closed.null.sf(at) == pytest.approx([theory.closed_form(statistic).sf(x) for x in at], abs=2e-4)
 
 
-def test_other_light_is_another_question(closed: ClosedForms) -> None:
+def test_changed_light_changes_the_question(closed: ClosedForms) -> None:
     """Scaled light gives what a question at that magnitude and amplitude gives."""
     at = limit.odds(closed, 10.0, np.array([1.0, 3.0]))
     assert limit.odds(closed, 8.5, np.ones(1))[0].probability == pytest.approx(closed.chance, abs=1e-12)
@@ -310,7 +310,7 @@ def test_other_light_is_another_question(closed: ClosedForms) -> None:
 
 
 @pytest.mark.parametrize("statistic", STATISTICS)
-def test_the_curve_and_the_map_are_the_closed_form(statistic: str, tmp_path: Path) -> None:
+def test_curve_and_map_show_the_closed_form(statistic: str, tmp_path: Path) -> None:
     """Between the points that are computed, too: the curve to 1 %, the map to 0.05 mag and its rows."""
     state = State()
     state.enter({"statistic": statistic, "amplitude_percent": "5"})
@@ -326,13 +326,13 @@ def test_the_curve_and_the_map_are_the_closed_form(statistic: str, tmp_path: Pat
         assert np.interp(-level, -row, columns) == pytest.approx(np.interp(-level, -y, x), abs=0.05 + shift)
 
 
-def test_the_excess_is_the_matched_statistics_own(closed: ClosedForms) -> None:
+def test_excess_equals_that_of_the_matched_statistic(closed: ClosedForms) -> None:
     """Squares of the excess per pixel add up to the matched S/N, squared."""
     pixel, _ = closed.excess
     assert np.sqrt(np.sum(pixel**2)) == pytest.approx(closed.odds.flaring.mean, rel=1e-9)
 
 
-def test_the_trade_claims_no_half_beyond_its_axis(closed: ClosedForms, tmp_path: Path) -> None:
+def test_trade_reports_no_value_beyond_its_axis(closed: ClosedForms, tmp_path: Path) -> None:
     """Where more than half are detected at the least false-alarm probability shown, half of them are below it."""
     trade = next(picture for picture in TABS["detection"].pictures if picture.name == "roc")
     half = float(re.findall(r"half of them at (\S+)\. A", trade.drawn(closed, {}).text)[0])
@@ -362,7 +362,7 @@ ALIASES = "".join(f"#   a{i}: &a{i} [{', '.join(8 * [f'*a{i - 1}'])}]\n" for i i
         ),
     ],
 )
-def test_bombs_end_in_a_sentence_and_take_little(bomb: Callable[[], bytes]) -> None:
+def test_decompression_bombs_are_refused_early(bomb: Callable[[], bytes]) -> None:
     content = bomb()
 
     def spent() -> tuple[float, int]:
@@ -382,7 +382,7 @@ def test_bombs_end_in_a_sentence_and_take_little(bomb: Callable[[], bytes]) -> N
     assert spent()[1] <= max(most, own, 700 * 1024)
 
 
-def test_an_unknown_spectrum_by_upload() -> None:
+def test_uploaded_spectrum_answers_as_on_the_command_line() -> None:
     found = read_pairs("stray.txt", b"# nm DN\n200 1\n450 3.5\n700 1\n")
     assert found == ((200.0, 1.0), (450.0, 3.5), (700.0, 1.0))
     odd = b"", b"200 1\n", b"200 1 2\n300 1 2\n", b"300 1\n200 1\n", b"\xff\xfe", b"a b\nc d\n", b"1 nan\n2 1\n"
@@ -460,9 +460,7 @@ class Talk:
 
 
 @pytest.mark.long
-def test_an_upload_that_fails_in_any_way_leaves_no_answer(
-    served: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_failed_upload_leaves_no_answer(served: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     good = star_file(tmp_path / "star.txt")
     uploaded = "?star=uploaded+star"
     faults = InputError("no spectrum"), RuntimeError("odd"), MemoryError(), ValueError("unequal columns"), KeyError(1)
@@ -494,7 +492,7 @@ def test_an_upload_that_fails_in_any_way_leaves_no_answer(
     served(work)
 
 
-def test_answers_go_on_while_an_upload_is_read(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_answers_continue_while_an_upload_is_read(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     wait = threading.Event()
 
     def slow(name: str, content: bytes) -> Any:
@@ -516,7 +514,7 @@ def test_answers_go_on_while_an_upload_is_read(served: Any, monkeypatch: pytest.
     served(work)
 
 
-def test_a_fault_of_our_own_leaves_no_answer(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_internal_error_leaves_no_answer(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     async def work(host: str) -> None:
         talk = await Talk.begin(host)
         with monkeypatch.context() as patch:
@@ -530,7 +528,7 @@ def test_a_fault_of_our_own_leaves_no_answer(served: Any, monkeypatch: pytest.Mo
     served(work)
 
 
-def test_of_questions_in_a_row_the_last_is_answered(served: Any) -> None:
+def test_last_of_several_questions_is_answered(served: Any) -> None:
     async def work(host: str) -> int:
         talk = await Talk.begin(host)
         last = 100
@@ -551,7 +549,7 @@ def test_of_questions_in_a_row_the_last_is_answered(served: Any) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", SIMULATIONS)
-def test_cancel_ends_whatever_is_computed(served: Any, kind: str) -> None:
+def test_cancel_ends_every_computation(served: Any, kind: str) -> None:
     """Each is ended once it has begun, and the next one is computed."""
     link = "?realisations=4000000&see=eps+Eri"
 
@@ -605,7 +603,7 @@ assert COMMANDS.keys() == {name for tab in TABS.values() for name in tab.files}
 
 
 @pytest.mark.long
-def test_every_table_is_the_same_bytes_on_the_command_line(served: Any, tmp_path: Path) -> None:
+def test_downloads_equal_the_files_of_the_command_line(served: Any, tmp_path: Path) -> None:
     """With a study that is taken from the page, of an uploaded star and an uploaded unknown."""
     link = "?realisations=10000&fap=0.05&statistic=chi2&magnitude=7&star=uploaded+star&own_unknown=uploaded+spectrum"
     link += "&see=eps+Eri"
@@ -663,7 +661,7 @@ def test_every_table_is_the_same_bytes_on_the_command_line(served: Any, tmp_path
         "?second_temperature_k=30000&second_area=0.1",
     ],
 )
-def test_command_and_program_are_the_question(link: str, tmp_path: Path) -> None:
+def test_command_and_program_reproduce_the_question(link: str, tmp_path: Path) -> None:
     state = State()
     state.follow(link)
     question = state.question()
@@ -693,7 +691,7 @@ def test_command_and_program_are_the_question(link: str, tmp_path: Path) -> None
 # Who is let in
 
 
-def test_addresses_are_checked_before_anything_is_served() -> None:
+def test_invalid_addresses_raise_before_serving() -> None:
     for address in ("", "0.0.0.0", "::", "no such host"):
         with refused("address", value=address):
             access.hosts(address, 5006, [])
@@ -706,7 +704,7 @@ def test_addresses_are_checked_before_anything_is_served() -> None:
 
 
 @pytest.mark.parametrize("address", ["", "no such host", "0.0.0.0"])
-def test_serve_refuses_an_address_in_a_sentence(address: str, tmp_path: Path) -> None:
+def test_serve_command_refuses_invalid_addresses(address: str, tmp_path: Path) -> None:
     done = run("serve", "--address", address, folder=tmp_path, code=2)
     assert re.fullmatch(r"mauvecl: --address '[^\n]*\n", done.stderr)
 
@@ -775,7 +773,7 @@ def test_ipv6_is_served(served: Any) -> None:
     served(work, "::1")
 
 
-def test_so_many_visitors_and_no_more(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_visitors_is_limited(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(access, "MAX_VISITORS", 2)
 
     async def work(host: str) -> None:
@@ -794,7 +792,7 @@ def test_so_many_visitors_and_no_more(served: Any, monkeypatch: pytest.MonkeyPat
     served(work)
 
 
-def test_a_page_that_nobody_uses_is_let_go(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unused_page_is_closed(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     async def work(host: str) -> None:
         connection = await opened(host, Origin=f"http://{host}")
         await connection.read_message()
@@ -838,7 +836,7 @@ POINTLESS = [
 
 
 @pytest.mark.long
-def test_nonsense_gives_no_traceback_and_no_path(served: Any, caplog: pytest.LogCaptureFixture) -> None:
+def test_invalid_messages_give_no_traceback_and_no_path(served: Any, caplog: pytest.LogCaptureFixture) -> None:
     told: list[str] = []
 
     async def work(host: str) -> None:
@@ -877,7 +875,7 @@ def test_nonsense_gives_no_traceback_and_no_path(served: Any, caplog: pytest.Log
     assert all("\n" not in line and len(line) < 1500 for line in lines)
 
 
-def test_every_question_may_lack_its_fields(served: Any, caplog: pytest.LogCaptureFixture) -> None:
+def test_messages_without_fields_are_answered_or_refused(served: Any, caplog: pytest.LogCaptureFixture) -> None:
     """Messages that hold only what they ask are answered or refused, and no handler fails."""
     questions = [name.removeprefix("_ask_") for name in dir(visitor.Visitor) if name.startswith("_ask_")]
     assert len(questions) >= 8
@@ -941,7 +939,7 @@ def test_connections_are_bounded(served: Any, monkeypatch: pytest.MonkeyPatch) -
     served(work)
 
 
-def test_the_first_load_is_small_and_packed(served: Any) -> None:
+def test_first_load_is_small_and_compressed(served: Any) -> None:
     """2.5 MB is the most that the issue allows; nothing for formulas is among it."""
 
     async def work(host: str) -> float:
@@ -967,5 +965,5 @@ def test_the_first_load_is_small_and_packed(served: Any) -> None:
     assert served(work) < 0.6
 
 
-def test_uploads_have_a_limit_that_a_message_can_carry() -> None:
+def test_upload_limit_fits_into_a_message() -> None:
     assert MOST_UPLOADED + 4096 < server.MESSAGE
