@@ -2,9 +2,9 @@
 
     python bench/same_bits.py [--output FILE.ecsv]
 
-The first column is the NumPy twin's. Drivers outside the system's list are found through ``OCL_ICD_VENDORS``, a folder
-of .icd files, each naming a driver's library (Intel's is libintelocl.so of the wheel intel-opencl-rt). Oclgrind is
-added where it is installed.
+The first column is the NumPy reference's. Drivers outside the system's list are found through ``OCL_ICD_VENDORS``, a
+folder of .icd files, each naming a driver's library (Intel's is libintelocl.so of the wheel intel-opencl-rt). Oclgrind
+is added if it is installed.
 """
 
 from __future__ import annotations
@@ -53,18 +53,18 @@ def main() -> int:
     output = parser.parse_args().output
     from mauvecl.device import selftest
 
-    twin = {name: selftest.reference_digests(name) for name in selftest.CASES}
+    reference = {name: selftest.reference_digests(name) for name in selftest.CASES}
     with tempfile.TemporaryDirectory() as folder:
         run = subprocess.run(
             [sys.executable, "-c", CHILD], env=vendors(Path(folder)), stdout=subprocess.PIPE, text=True, check=True
         )
     found = [json.loads(line) for line in run.stdout.splitlines()]
-    columns = {"case": [], "part": [], "twin": []} | {f"device {i}": [] for i in range(len(found))}
-    for name, parts in twin.items():
+    columns = {"case": [], "part": [], "reference": []} | {f"device {i}": [] for i in range(len(found))}
+    for name, parts in reference.items():
         for part, digest in parts.items():
             columns["case"].append(name)
             columns["part"].append(part)
-            columns["twin"].append(digest)
+            columns["reference"].append(digest)
             for i, one in enumerate(found):
                 columns[f"device {i}"].append(one["digests"][name][part])
     table = Table(columns)
@@ -72,7 +72,7 @@ def main() -> int:
     for i, one in enumerate(found):
         device = one["device"]
         label = f"{device['platform']}: {device['name']}, driver {device['driver']}"
-        equal = one["scalar"] and list(table[f"device {i}"]) == list(table["twin"])
+        equal = one["scalar"] and list(table[f"device {i}"]) == list(table["reference"])
         same &= equal
         print(f"{i} = {label}; promises: {device['promise']}; {'EQUAL' if equal else 'DIFFERENT'}")
         table.meta[f"device {i}"] = f"{label}; promises: {device['promise']}"

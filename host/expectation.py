@@ -151,11 +151,11 @@ class Expectation(Drawable, ContentEquality):
         return f"{self.name!r} on {self.instrument}, {exposure}"
 
     def _repr_html_(self) -> str:
-        told = "".join(f"<br><small>{html.escape(text)}</small>" for text in self.messages)
+        messages = "".join(f"<br><small>{html.escape(text)}</small>" for text in self.messages)
         name, where = html.escape(self.name), html.escape(self.instrument)
         return (
             f"<b>{name}</b> on {where}, {self.exposure_s:g} s in {self.n_frames} frames: best "
-            f"S/N {self.snr().max():.3g} a pixel, {self.snr_per_element().max():.3g} an element{told}"
+            f"S/N {self.snr().max():.3g} a pixel, {self.snr_per_element().max():.3g} an element{messages}"
         )
 
     def __post_init__(self) -> None:
@@ -498,7 +498,7 @@ def expect(
             "source origin": source.origin,
             "source notes": "; ".join(source.notes),
             "source history": "; ".join(source.history),
-            "source remarks": "; ".join(source.told),
+            "source remarks": "; ".join(source.messages),
             "source digest": source.digest,
             "sky": sky.description,
             "sky digest": "" if zodiacal is None else zodiacal.digest,
@@ -511,7 +511,7 @@ def expect(
             "exposure": f"{n_frames} x {instrument.frame_s:g} s",
         },
     )
-    messages = [*_saturation(plain), *(f"{source.name}: {text}." for text in source.told)]
+    messages = [*_saturation(plain), *(f"{source.name}: {text}." for text in source.messages)]
     drawn = np.sqrt(plain.variance_dn2) / (n_frames * plain.gain_dn_per_electron)
     messages += negative_means_message(source, instrument, electrons, drawn, order)
     if signal == "paper" and plain.sky_electrons.any():
@@ -540,7 +540,11 @@ def _continued_to_reach(source: Source, instrument: Instrument) -> Source:
         return source
     range_nm = (instrument.output_min_nm, instrument.output_max_nm)
     nm, flux, messages = continued(source.name, nm, source.flux_flam, range_nm, Line.of(instrument))
-    return replace(source, wavelength_nm=nm, flux_flam=flux, told=(*source.told, *messages)) if messages else source
+    return (
+        replace(source, wavelength_nm=nm, flux_flam=flux, messages=(*source.messages, *messages))
+        if messages
+        else source
+    )
 
 
 def _elements(instrument: Instrument) -> tuple[NDArray[np.int32], Float]:

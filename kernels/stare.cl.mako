@@ -1,10 +1,10 @@
 ## Frames of stares. Only the strengths of a few spectra vary between frames and stares; see
 ## mauvecl/lightcurve/stares/frame_components.py. Vector lanes are stares if pixels are drawn, and frames if sums are drawn.
-#define STARE_POINTERS(r) __global const Staring *r staring, __global const uint *r numbers, __global const float *r known, \
+#define STARE_POINTERS(r) __global const StareJob *r stare_job, __global const uint *r numbers, __global const float *r known, \
     __global const float *r curves, __global const uint *r kinds, __global const float *r flares, __global const float *r amplitudes
 #define STARE STARE_POINTERS(restrict)
 #define STARE_GIVEN STARE_POINTERS()
-#define STARE_PASSED staring, numbers, known, curves, kinds, flares, amplitudes
+#define STARE_PASSED stare_job, numbers, known, curves, kinds, flares, amplitudes
 
 % if in_time:
 #define OF_FRAME(array) LOAD((array) + frame)
@@ -29,10 +29,10 @@ INLINE floatv exponential_less_one(floatv x)
 }
 
 /* Amplitudes of a stare's unknowns, in standard deviations. */
-INLINE void unknowns_of(const Staring staring, uintv realisation, uint realisation_high, uint seed_low, uint seed_high, floatv *z)
+INLINE void unknowns_of(const StareJob stare_job, uintv realisation, uint realisation_high, uint seed_low, uint seed_high, floatv *z)
 {
     const Address at = address(realisation, realisation_high, 0u, seed_low, seed_high);
-    for (uint u = 0; u < staring.unknown_count; u += 4u) {
+    for (uint u = 0; u < stare_job.unknown_count; u += 4u) {
         const Words x = words_at(&at, ${streams["stare_unknown"]}u, u / 4u);
         const uintv w[4] = {x.a, x.b, x.c, x.d};
         normal_pair(w, z + u);
@@ -42,13 +42,13 @@ INLINE void unknowns_of(const Staring staring, uintv realisation, uint realisati
 
 INLINE Strengths strengths_of(STARE_GIVEN, uint frame, const floatv *jitter, const floatv *z)
 {
-    const uint stride = staring->padded_frames;
+    const uint stride = stare_job->padded_frames;
 % if jittered:
-    floatv moved[4] = {(floatv)0.0f, jitter[0] * staring->light_jitter, jitter[1] * staring->sky_jitter, jitter[2] * staring->temperature_jitter};
+    floatv moved[4] = {(floatv)0.0f, jitter[0] * stare_job->light_jitter, jitter[1] * stare_job->sky_jitter, jitter[2] * stare_job->temperature_jitter};
 % else:
     floatv moved[4] = {(floatv)0.0f, (floatv)0.0f, (floatv)0.0f, (floatv)0.0f};
 % endif
-    for (uint u = 0; u < staring->unknown_count; u++) {
+    for (uint u = 0; u < stare_job->unknown_count; u++) {
         const floatv more = OF_FRAME(curves + u * stride);
         for (uint kind = 0; kind < 4u; kind++)
             if (kinds[u] == kind) moved[kind] = FMA(z[u], more, moved[kind]);
@@ -57,6 +57,6 @@ INLINE Strengths strengths_of(STARE_GIVEN, uint frame, const floatv *jitter, con
     s.light = moved[1];
     s.star = FMA(OF_FRAME(known), TOGETHER(moved[1], moved[0]), OF_FRAME(known + stride));
     s.sky = FMA(OF_FRAME(known + 2u * stride), TOGETHER(moved[1], moved[2]), OF_FRAME(known + 3u * stride));
-    s.dark = FMA(OF_FRAME(known + 4u * stride), exponential_less_one(moved[3] * staring->dark_slope), OF_FRAME(known + 5u * stride));
+    s.dark = FMA(OF_FRAME(known + 4u * stride), exponential_less_one(moved[3] * stare_job->dark_slope), OF_FRAME(known + 5u * stride));
     return s;
 }

@@ -8,12 +8,12 @@ void stare_glow(__global const Job *restrict job, STARE, const uint first_low, c
                 const uint row_count, const uint first_row, __global float *restrict values)
 {
     /* values[stare][statistic, then light minus one][frame] */
-    const uint stare = get_global_id(0), stride = staring->padded_frames;
+    const uint stare = get_global_id(0), stride = stare_job->padded_frames;
     const uint begin = get_global_id(1) * frames_each, end = least(begin + frames_each, stride);
     const uintv realisation = (uintv)(first_low + stare);
     floatv unknown[${4 * unknown_groups + 1}];
 % if unknown_groups:
-    unknowns_of(*staring, realisation, first_high, job->seed_low, job->seed_high, unknown);
+    unknowns_of(*stare_job, realisation, first_high, job->seed_low, job->seed_high, unknown);
 % endif
     for (uint frame = begin; frame < end; frame += ${width}u) {
         const uintv number = LOAD(numbers + frame);

@@ -8,11 +8,11 @@ void stare_pixels(SCENE, STARE, const uint first_low, const uint first_high, con
 {
     /* values[frame][scenario][statistic][stare] */
     const uint item = get_global_id(0), frame = first_frame + get_global_id(1), padded = job->padded_count;
-    const uint scenario_count = staring->scenario_count;
+    const uint scenario_count = stare_job->scenario_count;
     const uintv realisation = (uintv)(first_low + item * ${width}u) + LANE_INDEX;
     floatv unknown[${4 * unknown_groups + 1}];
 % if unknown_groups:
-    unknowns_of(*staring, realisation, first_high, job->seed_low, job->seed_high, unknown);
+    unknowns_of(*stare_job, realisation, first_high, job->seed_low, job->seed_high, unknown);
 % endif
     const Address at = address(realisation, first_high, numbers[frame], job->seed_low, job->seed_high);
     floatv jitter[4];
@@ -26,14 +26,14 @@ void stare_pixels(SCENE, STARE, const uint first_low, const uint first_high, con
 % if spectra:
     /* Flares per stare, or common to all; lanes outside the wanted range use the nearest row. */
     floatv flare[${scenarios}][${spectra}];
-    const uint rows = staring->flare_rows, amplitude_rows = staring->amplitude_rows;
+    const uint rows = stare_job->flare_rows, amplitude_rows = stare_job->amplitude_rows;
     for (uint i = 0; i < ${width}u; i++) {
         const uint row = least(most(item * ${width}u + i, start_row), stop_row - 1u) - start_row;
-        __global const float *from = flares + (size_t)(rows > 1u ? row : 0u) * ${spectra}u * staring->padded_frames + frame;
+        __global const float *from = flares + (size_t)(rows > 1u ? row : 0u) * ${spectra}u * stare_job->padded_frames + frame;
         for (uint k = 0; k < scenario_count; k++)
             for (uint j = 0; j < ${spectra}u; j++)
-                ((float *)flare[k])[j * ${width}u + i] = from[j * staring->padded_frames]
-                    * (known[6u * staring->padded_frames + frame] * amplitudes[k * amplitude_rows + (amplitude_rows > 1u ? row : 0u)]);
+                ((float *)flare[k])[j * ${width}u + i] = from[j * stare_job->padded_frames]
+                    * (known[6u * stare_job->padded_frames + frame] * amplitudes[k * amplitude_rows + (amplitude_rows > 1u ? row : 0u)]);
     }
     for (uint k = 0; k < scenario_count; k++)
         for (uint j = 0; j < ${spectra}u; j++) flare[k][j] = FMA(strengths.light, flare[k][j], flare[k][j]);

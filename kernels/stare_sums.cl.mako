@@ -38,12 +38,12 @@ void stare_sums(__global const Job *restrict job, STARE, const uint first_low, c
                 __global const float *restrict table, const uint row_count, const uint first_row, __global float *restrict values)
 {
     /* values[scenario][stare][statistic][frame] */
-    const uint stare = get_global_id(0), stride = staring->padded_frames, scenario_count = staring->scenario_count;
+    const uint stare = get_global_id(0), stride = stare_job->padded_frames, scenario_count = stare_job->scenario_count;
     const uint begin = get_global_id(1) * frames_each, end = least(begin + frames_each, stride);
     const uintv realisation = (uintv)(first_low + stare);
     floatv unknown[${4 * unknown_groups + 1}];
 % if unknown_groups:
-    unknowns_of(*staring, realisation, first_high, job->seed_low, job->seed_high, unknown);
+    unknowns_of(*stare_job, realisation, first_high, job->seed_low, job->seed_high, unknown);
 % endif
     __global const float *whole = table + ${row * (4 + spectra)}u;
     for (uint frame = begin; frame < end; frame += ${width}u) {
@@ -70,8 +70,8 @@ void stare_sums(__global const Job *restrict job, STARE, const uint first_low, c
         for (uint k = 0; k < scenario_count; k++) {
 % if spectra:
             floatv flare[${spectra}];
-            const floatv amplitude = OF_FRAME(known + 6u * stride) * amplitudes[k * staring->amplitude_rows + (staring->amplitude_rows > 1u ? stare : 0u)];
-            __global const float *from = flares + (size_t)(staring->flare_rows > 1u ? stare : 0u) * ${spectra}u * stride;
+            const floatv amplitude = OF_FRAME(known + 6u * stride) * amplitudes[k * stare_job->amplitude_rows + (stare_job->amplitude_rows > 1u ? stare : 0u)];
+            __global const float *from = flares + (size_t)(stare_job->flare_rows > 1u ? stare : 0u) * ${spectra}u * stride;
             for (uint j = 0; j < ${spectra}u; j++) {
                 flare[j] = OF_FRAME(from + j * stride) * amplitude;
                 flare[j] = FMA(strengths.light, flare[j], flare[j]);

@@ -2,8 +2,8 @@
 
     python tools/mutation_check.py [NAME ...]
 
-Most are made in the kernels and in their NumPy twin alike, so that it is not enough that the two differ: known answers,
-exact distributions or chance must tell. Exit code 0 if every test noticed.
+Most are made in the kernels and in their NumPy reference alike, so that a comparison of the two is not enough: known
+answers, exact distributions or tests of chance must fail. The exit code is 0 if every mutation makes its test fail.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 
 PHILOX, NORMAL, POISSON = (f"kernels/{name}.cl.mako" for name in ("philox", "normal", "poisson"))
-TWIN = "mauvecl/noise/reference.py"
+REFERENCE = "mauvecl/noise/reference.py"
 
 
 @dataclass(frozen=True)
@@ -141,14 +141,14 @@ MUTATIONS = {
         "tests/results/test_ends.py::test_snr_equals_that_of_sorting[16-0]",
     ),
     "7 rounds": Mutation(
-        ((PHILOX, "range(3, 10)", "range(3, 7)"), (TWIN, "for r in range(10):", "for r in range(7):")),
+        ((PHILOX, "range(3, 10)", "range(3, 7)"), (REFERENCE, "for r in range(10):", "for r in range(7):")),
         "tests/kernels/test_philox.py::test_known_answers",
     ),
     "swapped words": Mutation(
         (
             (PHILOX, "Words out = {c0, c1, c2, c3};", "Words out = {c1, c0, c2, c3};"),
             SWAPPED,
-            (TWIN, "return (c0.astype(np.uint32), c1.astype", "return (c1.astype(np.uint32), c0.astype"),
+            (REFERENCE, "return (c0.astype(np.uint32), c1.astype", "return (c1.astype(np.uint32), c0.astype"),
         ),
         "tests/kernels/test_philox.py::test_known_answers",
     ),
@@ -158,7 +158,7 @@ MUTATIONS = {
     "rounded normal for the dark": Mutation(
         (
             (POISSON, "nearest(FMA(z, FMA(z, curve, (floatv)slope), (floatv)offset))", "nearest(z * slope + offset)"),
-            (TWIN, "nearest(fma(z, fma(z, curve, slope), offset))", "nearest(z * slope + offset)"),
+            (REFERENCE, "nearest(fma(z, fma(z, curve, slope), offset))", "nearest(z * slope + offset)"),
         ),
         "tests/kernels/test_poisson.py::test_pearson_of_the_expansion",
     ),
@@ -185,7 +185,7 @@ MUTATIONS = {
     "fifth cumulants of varying dark forgotten": Mutation(
         (
             ("kernels/detector.cl.mako", "dark * r->dark_fifth", "factors->dark * 0.0f"),
-            (TWIN, 'dark * r["dark_fifth"]', "dark * np.float32(0)"),
+            (REFERENCE, 'dark * r["dark_fifth"]', "dark * np.float32(0)"),
         ),
         "tests/kernels/test_joint_bound.py::test_factors_follow_the_cumulants",
     ),
@@ -200,7 +200,7 @@ MUTATIONS = {
     "24-bit uniforms": Mutation(
         (
             (NORMAL, "TO_FLOAT(w[${2 * i}]) + 0.5f", "TO_FLOAT(w[${2 * i}] & (uintv)0xffffff00u) + 0.5f"),
-            (TWIN, "t = radius_word.astype", "t = (radius_word & np.uint32(0xFFFFFF00)).astype"),
+            (REFERENCE, "t = radius_word.astype", "t = (radius_word & np.uint32(0xFFFFFF00)).astype"),
         ),
         "tests/kernels/test_normal.py::test_a_thousand_million_draws",
     ),

@@ -38,7 +38,7 @@ class OwnStar:
     notes: tuple[str, ...]
     dereddened: bool
     path: Path
-    told: tuple[str, ...] = ()
+    messages: tuple[str, ...] = ()
     measured_nm: tuple[float, float] | None = None
     unscaled: str = ""
 
@@ -67,10 +67,10 @@ def _described(path: Path) -> OwnStar | None:
     if not {"name", "origin", "spectrum_sha256"} <= set(meta):
         return None
     notes = tuple(str(note) for note in meta.get("notes", ()))
-    told = tuple(str(text) for text in meta.get("told", ()))
+    messages = tuple(str(text) for text in meta.get("told", ()))
     measured = meta.get("measured_nm")
     return OwnStar(
-        str(meta["name"]), str(meta["origin"]), notes, bool(meta.get("dereddened")), path, told,
+        str(meta["name"]), str(meta["origin"]), notes, bool(meta.get("dereddened")), path, messages,
         None if measured is None else (float(measured[0]), float(measured[1])), str(meta.get("unscaled", "")),
     )  # fmt: skip
 
@@ -164,7 +164,7 @@ def add(
         "kept_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "dereddened": dereddened,
         "notes": list(source.notes),
-        "told": list(source.told),
+        "told": list(source.messages),
         "unscaled": source.unscaled,
     }
     if source.measured_nm is not None:

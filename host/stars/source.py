@@ -64,7 +64,7 @@ class Source(Drawable, ContentEquality):
         Operations applied to the spectrum.
     scale : str
         Explanation of the magnitude to which the spectrum was scaled; empty if it was not.
-    told : tuple of str
+    messages : tuple of str
         Assumptions, continuations and merged orders, which every answer reports.
     measured_nm : tuple of float, optional
         Range without the parts that were continued at the level of the ends; the whole range by default.
@@ -95,7 +95,7 @@ class Source(Drawable, ContentEquality):
     notes: tuple[str, ...] = ()
     history: tuple[str, ...] = ()
     scale: str = ""
-    told: tuple[str, ...] = ()
+    messages: tuple[str, ...] = ()
     measured_nm: Annotated[tuple[float, float], Unit("nm")] | None = None
     unscaled: str = ""
     temperature_k: Temperature | None = None
@@ -126,7 +126,7 @@ class Source(Drawable, ContentEquality):
             wavelength, flux = own_stars.spectrum(mine)
             return cls(
                 wavelength, flux, mine.name, mine.origin, mine.notes,
-                told=mine.told, measured_nm=mine.measured_nm, unscaled=mine.unscaled,
+                messages=mine.messages, measured_nm=mine.measured_nm, unscaled=mine.unscaled,
             )  # fmt: skip
         entry = catalogue.find(name)
         table = catalogue.spectrum_table(entry["file"])
@@ -140,7 +140,9 @@ class Source(Drawable, ContentEquality):
                 f"library spectrum {entry['name']} is {entry['star']}; {entry['uv_quality']}",
                 f"photosphere of {entry['temperature_k']} K: {entry['temperature_source']}",
             ),
-            told=(f"noise rules its ultraviolet below {noisy} nm, where its flux is an upper limit",) if noisy else (),
+            messages=(f"noise rules its ultraviolet below {noisy} nm, where its flux is an upper limit",)
+            if noisy
+            else (),
             unscaled="" if entry["level"] == "as seen" else f"the library keeps it at {entry['level']}",
             temperature_k=float(entry["temperature_k"]),
         )
@@ -156,8 +158,8 @@ class Source(Drawable, ContentEquality):
     ) -> Self:
         """Read a spectrum from a file of text, ECSV, VOTable or FITS.
 
-        `told` lists assumptions and changes. Undefined ends beyond 200-700 nm are dropped. Dark ends within 180-750 nm
-        are continued at their level.
+        `messages` lists assumptions and changes. Undefined ends beyond 200-700 nm are dropped. Dark ends within
+        180-750 nm are continued at their level.
 
         Parameters
         ----------
@@ -188,7 +190,7 @@ class Source(Drawable, ContentEquality):
         name: str,
         origin: str,
         notes: tuple[str, ...] = (),
-        told: tuple[str, ...] = (),
+        messages: tuple[str, ...] = (),
         extend: str | Source | None = None,
         is_file: bool = False,
     ) -> Self:
@@ -197,17 +199,17 @@ class Source(Drawable, ContentEquality):
         check_measured(name, wavelength)
         wavelength, flux, cut = without_undefined_ends(name, wavelength, flux)
         if is_file or extend is not None:
-            told += (coverage(wavelength),)
-        told += remarks(wavelength, flux)
+            messages += (coverage(wavelength),)
+        messages += remarks(wavelength, flux)
         if extend is not None:
             other = cls.from_library(extend) if isinstance(extend, str) else extend
             wavelength, flux, added = extended(name, wavelength, flux, other.name, other.wavelength_nm, other.flux_flam)
-            told += added
+            messages += added
         check_flux(name, wavelength, flux)
         measured = (float(wavelength[0]), float(wavelength[-1]))
         wavelength, flux, added = continued(name, wavelength, flux, dark_only=True)
         return cls(
-            wavelength, flux, name, origin, (*notes, *cut), told=(*told, *added),
+            wavelength, flux, name, origin, (*notes, *cut), messages=(*messages, *added),
             measured_nm=measured if added else None,
         )  # fmt: skip
 
@@ -424,7 +426,11 @@ class Source(Drawable, ContentEquality):
         if geometry == "replaces":
             title += f" photosphere of {photosphere:g} K"
         return replace(
-            self, wavelength_nm=nm, flux_flam=flux, history=(*self.history, title), told=(*self.told, *light.messages)
+            self,
+            wavelength_nm=nm,
+            flux_flam=flux,
+            history=(*self.history, title),
+            messages=(*self.messages, *light.messages),
         )
 
     def reddened(self, ebv: Reddening, *, rv: float = 3.1, law: Literal["G23", "F19", "CCM89"] = "G23") -> Self:

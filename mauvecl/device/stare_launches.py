@@ -63,7 +63,7 @@ class StareLaunches(Launches):
         """Upload the flares of the next stares."""
         self._scenarios = len(flares.amplitudes)
         self._flares = [
-            self._fill("staring", self._stare.stare_struct(flares)),
+            self._fill("stare_job", self._stare.stare_struct(flares)),
             *self._known,
             self._shared(flares.rows) if self._device.record.kind == "cpu" else self._fill("flares", flares.rows),
             self._fill("amplitudes", flares.amplitudes),

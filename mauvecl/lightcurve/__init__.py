@@ -1,1 +1,1 @@
-"""Flares in time: their shapes and energies, stares at a star, what a search finds in them."""
+"""Flares in time: shapes and energies, stares at a star, and searches for flares in stares."""

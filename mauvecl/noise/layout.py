@@ -160,7 +160,7 @@ MIXTURE = np.dtype(
 
 #: Properties common to all frames of a stare: number of frames without and with padding, unknowns, jitters, slope of
 #: the dark with temperature, and numbers of rows of flares and of their amplitudes (one, or one per stare).
-STARING = np.dtype(
+STARE_JOB = np.dtype(
     [
         ("frame_count", "u4"),
         ("padded_frames", "u4"),
@@ -200,7 +200,7 @@ STRUCTS = {
     "Element": ELEMENT,
     "Grid": GRID,
     "Mixture": MIXTURE,
-    "Staring": STARING,
+    "StareJob": STARE_JOB,
 }
 
 #: Statistics with a channel in every scenario, in the kernel's order; linear statistics follow them.

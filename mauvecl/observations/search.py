@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.search.bank import Bank, Level
+from mauvecl.lightcurve.search.bank import Bank, Baseline
 from mauvecl.lightcurve.search.importance_sampling import SampledRate, sample_rate
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.search.survey import select_frames
@@ -134,7 +134,7 @@ class SeriesSurvey:
         ones = np.ones(n)
         stare = Stare(start, cadence, ones, ones, ones, np.zeros(n))
         bank = Bank(half_widths(stare), np.ones((1, 1)), shape, cadence,
-                    Level(window_s=max(WINDOW_S, WINDOW_FRAMES * cadence)))  # fmt: skip
+                    Baseline(window_s=max(WINDOW_S, WINDOW_FRAMES * cadence)))  # fmt: skip
         scale = float(np.median(level.error[used]))
         sums = ((flux - level.level)[used] / scale)[:, None]
         return cls(
@@ -222,7 +222,7 @@ class SeriesSurvey:
     def _residual(self, quiet: NDArray[np.bool_]) -> Float:
         """Return the residuals of quiescent frames from a straight line in each window, in standard deviations."""
         y = self.sums[:, 0] / np.sqrt(self.variance)
-        windows = (self.stare.start_s // self.bank.level.window_s).astype(np.int64)
+        windows = (self.stare.start_s // self.bank.baseline.window_s).astype(np.int64)
         residual = []
         for window in np.unique(windows[quiet]):
             here = quiet & (windows == window)

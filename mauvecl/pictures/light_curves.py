@@ -59,7 +59,7 @@ def light_curves(plt: Any, one: StarStare) -> Any:
 
 
 @styled_picture
-def beside(plt: Any, answers: Sequence[tuple[str, StareAnswer]], band: int = 0) -> Any:
+def compare_light_curves(plt: Any, answers: Sequence[tuple[str, StareAnswer]], band: int = 0) -> Any:
     """Plot a band's light curves of several answers, with a row per star and a column per answer.
 
     Parameters

@@ -15,7 +15,7 @@ from mauvecl.study.sections import Section
 from mauvecl.study.stare_section import ShapeName
 
 if TYPE_CHECKING:
-    from mauvecl.lightcurve.search.bank import Bank, Level
+    from mauvecl.lightcurve.search.bank import Bank, Baseline
     from mauvecl.lightcurve.stares.stare import Stare
     from mauvecl.study.study import Study
 
@@ -78,18 +78,18 @@ class SearchChoice(Section):
         import numpy as np
 
         from mauvecl.lightcurve.flares.shapes import shape_of
-        from mauvecl.lightcurve.search.bank import Bank, Level
+        from mauvecl.lightcurve.search.bank import Bank, Baseline
 
-        level = Level(self.offset, self.slope, False, WINDOW_S if self.window_s is None else self.window_s)
+        level = Baseline(self.offset, self.slope, False, WINDOW_S if self.window_s is None else self.window_s)
         return Bank(self.half_widths_s, np.ones((1, 1)), shape_of(self.shape), frame_s, level)
 
-    def level(self, stare: Stare, orbit_s: float) -> Level:
+    def level(self, stare: Stare, orbit_s: float) -> Baseline:
         """Return the baseline model for a stare."""
-        from mauvecl.lightcurve.search.bank import Level
+        from mauvecl.lightcurve.search.bank import Baseline
 
         cycle = self.cycle if self.cycle is not None else any("cosine" in u.name for u in stare.unknowns)
         window = self.window_s if self.window_s is not None else CYCLE_ORBITS * orbit_s if cycle else WINDOW_S
-        return Level(self.offset, self.slope, cycle, window)
+        return Baseline(self.offset, self.slope, cycle, window)
 
     def spreads(self) -> dict[str, float]:
         """Return the standard deviations of the parameters of `frame`; infinite for "free"."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.lightcurve.flares.energies import EnergyScale, Kind, amplitude_of, amplitude_of_peak
-from mauvecl.lightcurve.flares.events import Cooling, Event, check_seen, coefficients, temperatures_of
+from mauvecl.lightcurve.flares.events import Cooling, Event, check_contributions, coefficients, temperatures_of
 from mauvecl.lightcurve.stares.light_curves import StareExpectation
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.noise.priors import Normal, Prior
@@ -139,7 +139,7 @@ def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare
 def expect_stare(case: Case) -> StareExpectation:
     """Compute the expectation of a case's stare with its flares."""
     stare, events = case.stare, case.events
-    check_seen(events, stare.start_s, stare.frame_s)
+    check_contributions(events, stare.start_s, stare.frame_s)
     kelvin = temperatures_of(events)
     amplitudes = coefficients(events, stare.start_s, stare.frame_s, kelvin)
     return StareExpectation(case.one_frame.quiet, stare, case.one_frame.flare_electrons(kelvin), amplitudes)
@@ -148,7 +148,7 @@ def expect_stare(case: Case) -> StareExpectation:
 def unused_lines(case: Case) -> list[str]:
     """Return messages about settings without effect on the stare: the exposure, and flares that peak outside it."""
     exposure_s, frame_s = case.study.observation.exposure_s, case.stare.frame_s
-    lines = check_seen(case.events, case.stare.start_s, frame_s)
+    lines = check_contributions(case.events, case.stare.start_s, frame_s)
     if exposure_s != frame_s:
         lines.insert(
             0, f"A stare is made of frames of {frame_s:g} s: observation.exposure_s = {exposure_s:g} s is not used."

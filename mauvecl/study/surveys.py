@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mauvecl.lightcurve.flares.shapes import shape_of
 from mauvecl.lightcurve.search.bank import Bank
-from mauvecl.lightcurve.search.flare_fit import Fit
+from mauvecl.lightcurve.search.flare_fit import SingleFlareFit
 from mauvecl.lightcurve.search.survey import Survey
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates, frame_nuisances
 from mauvecl.lightcurve.stares.frame_components import Components
@@ -36,9 +36,9 @@ class StarSurvey:
     survey: Survey  # its only flare component is the study's flare
 
     @property
-    def fit(self) -> Fit:
+    def fit(self) -> SingleFlareFit:
         """Fit of detected flares."""
-        return Fit(self.survey.bank, self.templates)
+        return SingleFlareFit(self.survey.bank, self.templates)
 
     @property
     def unit_snr(self) -> float:

@@ -108,7 +108,7 @@ def write_spectrum(source: Source, folder: Path) -> Path:
     if not path.exists():
         table = Table({"wavelength": source.wavelength_nm, "flux": source.flux_flam})
         table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
-        table.meta |= {"name": UPLOADED, "told": list(source.told)}
+        table.meta |= {"name": UPLOADED, "told": list(source.messages)}
         path.parent.mkdir(exist_ok=True)
         table.write(path, format="ascii.ecsv")
     return path

@@ -61,7 +61,7 @@ def read_limited(content: bytes) -> Source:
             words["name"],
             words["origin"],
             tuple(words["notes"]),
-            told=tuple(words["told"]),
+            messages=tuple(words["told"]),
             measured_nm=None if measured is None else (measured[0], measured[1]),
             unscaled=words["unscaled"],
         )

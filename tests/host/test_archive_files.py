@@ -103,7 +103,7 @@ def test_read_right(name: str, options: dict[str, Any], read: Any, v: float | No
         # Zero points of V differ by 0.03 mag; the M7 dwarf varies, and catalogues with it.
         assert star.magnitude("V") == pytest.approx(v, abs=0.15 if "extend" in options else 0.06)
     messages = expect(star.at_magnitude(8.0), Instrument.load("mauve"), exposure=50.0).messages
-    assert all(any(text in message for message in messages) for text in star.told)
+    assert all(any(text in message for message in messages) for text in star.messages)
 
 
 @pytest.mark.parametrize(("name", "options", "sentence"), REFUSED, ids=[entry[0] for entry in REFUSED])
@@ -116,7 +116,7 @@ def test_unusable_archive_files_raise(name: str, options: dict[str, Any], senten
 @pytest.mark.parametrize(("name", "options", "sentence"), SHORT, ids=[entry[0] for entry in SHORT])
 def test_short_spectra_need_an_extension(name: str, options: dict[str, Any], sentence: tuple[str, ...]) -> None:
     star = Source.read(HERE / name, **options)
-    assert any(text.startswith("its own points cover") for text in star.told)
+    assert any(text.startswith("its own points cover") for text in star.messages)
     with refused(*sentence):
         expect(replace(star, unscaled=""), Instrument.load("mauve"), exposure=5.0)
 
@@ -131,7 +131,7 @@ def test_short_spectra_suffice_for_a_narrower_range() -> None:
 
 
 def test_messages_of_archive_files() -> None:
-    told = {name: Source.read(HERE / name, **options).told for name, options, *_ in RIGHT}
+    told = {name: Source.read(HERE / name, **options).messages for name, options, *_ in RIGHT}
     assert told["18sco_stis_004.fits"] == ("its own points cover 171.042-31891.2 nm",)
     assert told["sun_reference_stis_002.fits"] == ("its own points cover 119.5-2695.74 nm",)
     assert "its own points cover 290.033-2497.72 nm, 82% of 200-700 nm" in told["vb8_stiswfcnic_004.fits"]
@@ -184,7 +184,9 @@ def test_calspec_files_that_start_within_the_line_function_are_continued() -> No
     for start in (180.02, 180.10, 199.95):
         kept = star.wavelength_nm >= start
         short = Source.from_arrays(star.wavelength_nm[kept], star.flux_flam[kept], name="short")
-        assert any(f"starts at {star.wavelength_nm[kept][0]:g} nm and is continued to 180 nm" in t for t in short.told)
+        assert any(
+            f"starts at {star.wavelength_nm[kept][0]:g} nm and is continued to 180 nm" in t for t in short.messages
+        )
         found = expect(short, mauve, exposure=50.0)
         # A tenth of the noise at most, and a tenth of the light.
         error = np.abs(found.signal_dn - whole.signal_dn)

@@ -39,7 +39,7 @@ def test_noise_dominated_ultraviolet_is_reported() -> None:
     """M5V and M6V are brighter at 300 nm than M4V: their files say that this is noise, and so does every answer."""
     limits = {"M0V": 0.0, "M1V": 240.0, "M3V": 0.0, "M4V": 240.0, "M5V": 300.0, "M6V": 300.0}
     for name, limit in limits.items():
-        told = Source.from_library(name).told
+        told = Source.from_library(name).messages
         assert told == (
             (f"noise rules its ultraviolet below {limit:g} nm, where its flux is an upper limit",) * (limit > 0)
         )

@@ -189,7 +189,7 @@ def test_short_spectrum_is_kept_with_its_extension(archive: str, tmp_path: Path)
     with refused("base", "VB8", "290.033-2497.72", "200-700"):
         hst_collections.fetch("calspec:VB 8", base=base, show_progress=False)
     kept = hst_collections.fetch("calspec:VB 8", base=base, show_progress=False, extend="M3V")
-    assert any("continued by M3V" in text for text in kept.told)
+    assert any("continued by M3V" in text for text in kept.messages)
     star = Source.from_library("VB 8")
     direct = Source.read(WHOLE.parent / "vb8_stiswfcnic_004.fits", extend="M3V")
     np.testing.assert_array_equal(star.flux_flam, direct.flux_flam)

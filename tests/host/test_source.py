@@ -222,7 +222,7 @@ def test_calspec_file_is_read(sun: Source) -> None:
     assert star.name == "18SCO"
     # V = 5.50 (SIMBAD); 5.456 with Vega at zero.
     assert star.magnitude() == pytest.approx(5.50, abs=0.02)
-    assert star.told == ("its own points cover 171.042-31891.2 nm",)
+    assert star.messages == ("its own points cover 171.042-31891.2 nm",)
     mauve = Instrument.load("mauve")
     real, class_mean = (expect(s, mauve, exposure=50) for s in (star.at_magnitude(7.4), sun))
     visible = real.wavelength_nm > 320
@@ -360,7 +360,7 @@ def test_other_numbers_of_the_span() -> None:
     whole = Source.from_arrays(grid(), hot, name="hot")
     finer = np.append(180.1, grid()[11:])
     short = Source.from_arrays(finer, np.interp(finer, grid(), hot), name="short")
-    assert any("starts at 180.1 nm and is continued to 180 nm" in text for text in short.told)
+    assert any("starts at 180.1 nm and is continued to 180 nm" in text for text in short.messages)
     mauve = Instrument.load("mauve")
     one, other = (expect(star.at_magnitude(5.0), mauve, exposure=5.0) for star in (whole, short))
     np.testing.assert_allclose(one.source_electrons, other.source_electrons, rtol=2e-4)
@@ -383,7 +383,7 @@ def test_extension_by_another_star(sun: Source) -> None:
         expect(Source.from_arrays(*short), mauve, exposure=5.0)
     for extension in ("G2V", Source.from_library("G2V")):
         star = Source.from_arrays(*short, name="short", extend=extension)
-        assert sum("it is continued by G2V, scaled by" in text for text in star.told) == 2
+        assert sum("it is continued by G2V, scaled by" in text for text in star.messages) == 2
         np.testing.assert_allclose(
             expect(star.at_magnitude(7.4), mauve, exposure=5).source_electrons,
             expect(sun, mauve, exposure=5).source_electrons,
@@ -394,7 +394,7 @@ def test_extension_by_another_star(sun: Source) -> None:
     with refused("extend", "3000-3002", "0%", "200-700"):
         Source.from_arrays([3000.0, 3001.0, 3002.0], [1.0, 1.0, 1.0], extend="G2V")
     whole = Source.from_arrays(sun.wavelength_nm, sun.flux_flam, extend="G2V")
-    assert "reaches no farther and is not used" in whole.told[-1]
+    assert "reaches no farther and is not used" in whole.messages[-1]
 
 
 def noisy(level: float) -> tuple[np.ndarray, np.ndarray]:

@@ -175,7 +175,7 @@ RIGHT = {
 @pytest.mark.parametrize("case", RIGHT)
 def test_read_right(tmp_path: Path, case: str) -> None:
     star = read(tmp_path, RIGHT[case])
-    assert is_right(star), star.told
+    assert is_right(star), star.messages
 
 
 @pytest.mark.parametrize(
@@ -190,7 +190,7 @@ def test_read_right(tmp_path: Path, case: str) -> None:
     ],
 )
 def test_conversions_are_reported(tmp_path: Path, case: str, message: str) -> None:
-    assert any(message in told for told in read(tmp_path, RIGHT[case]).told)
+    assert any(message in told for told in read(tmp_path, RIGHT[case]).messages)
 
 
 ONE, TWO = FLUX, 2 * FLUX
@@ -412,7 +412,7 @@ def test_any_table_is_read_correctly_or_raises(
         # Without another column of light there is nothing to ask.
         assert {"flux_2", "observed_flux", "model_flux", "w_max", "wave_lo", "wave_hi", "foo"} & set(extras), error  # noqa: PT017
     else:
-        assert is_right(star), star.told
+        assert is_right(star), star.messages
 
 
 PROSE = """vacuum wavelengths; Fluxes calibrated; sky subtracted; error estimates; wavelength flux; V = 7.3 mag; log g
@@ -442,7 +442,7 @@ def test_prose_in_a_header_changes_nothing(
     except InputError as error:
         assert "\n" not in str(error)  # noqa: PT017
     else:
-        assert is_right(star), star.told
+        assert is_right(star), star.messages
 
 
 def test_column_names_are_recognised_in_any_style() -> None:

@@ -30,7 +30,7 @@ def alike(path: Path | str, rtol: float = 1e-9, told: str | None = None, **optio
     star = Source.read(path, **options)
     np.testing.assert_allclose(star.wavelength_nm, NM, rtol=rtol)
     np.testing.assert_allclose(star.flux_flam, FLUX, rtol=rtol)
-    assert told is None or any(told in text for text in star.told), star.told
+    assert told is None or any(told in text for text in star.messages), star.messages
     return star
 
 
@@ -96,7 +96,7 @@ MICRON = NM / 1000
 def test_text_with_its_units(tmp_path: Path, text: str) -> None:
     (tmp_path / "star").write_text(text, encoding="utf-8")
     star = alike(tmp_path / "star", rtol=1e-8)
-    assert not any("ASSUMED" in one for one in star.told)
+    assert not any("ASSUMED" in one for one in star.messages)
 
 
 @pytest.mark.parametrize("pack", [gzip.compress, bz2.compress, lzma.compress, bytes])
@@ -190,7 +190,7 @@ def test_air_becomes_vacuum_where_the_file_says_air(tmp_path: Path) -> None:
     for name, content in cases.items():
         (tmp_path / name).write_bytes(content)
         star = Source.read(tmp_path / name)
-        assert any("in air, converted to vacuum" in text for text in star.told), name
+        assert any("in air, converted to vacuum" in text for text in star.messages), name
         inside = NM > 210
         np.testing.assert_allclose(star.wavelength_nm[-inside.sum() :], NM[inside], rtol=1e-7)
     alike_path = tmp_path / "v.fits"
@@ -220,14 +220,14 @@ def test_tables_that_name_their_units(tmp_path: Path) -> None:
 
 def test_assumed_units_are_reported(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text(lines(NM, FLUX))
-    assert [text.split(",")[0] for text in alike(tmp_path / "a.txt").told] == [
+    assert [text.split(",")[0] for text in alike(tmp_path / "a.txt").messages] == [
         "ASSUMED: wavelength in nm",
         "ASSUMED: flux in erg / (Angstrom s cm2)",
         "its own points cover 170-998 nm",
     ]
     (tmp_path / "b.txt").write_text(lines(10 * NM, PER_NM))
     star = alike(tmp_path / "b.txt", wavelength_unit="Angstrom", flux_unit="W m-2 nm-1")
-    assert star.told == ("its own points cover 170-998 nm",)
+    assert star.messages == ("its own points cover 170-998 nm",)
     alike(tmp_path / "b.txt", wavelength_unit=u.AA, flux_unit=u.W / u.m**2 / u.nm)
     (tmp_path / "c.fits").write_bytes(table(units=(None, None)))
     alike(tmp_path / "c.fits", told="ASSUMED: wavelength in Angstrom")
@@ -289,7 +289,7 @@ def test_the_measured_range_is_always_reported(tmp_path: Path, low: float, high:
     nm = np.linspace(low, high, 2000)
     (tmp_path / "short.txt").write_text(lines(nm, 1e-13 + 1e-15 * nm, head="# nm FLAM\n"))
     star = Source.read(tmp_path / "short.txt", extend="G2V")
-    assert star.told[0] == f"its own points cover {low:g}-{high:g} nm, {part}% of 200-700 nm"
+    assert star.messages[0] == f"its own points cover {low:g}-{high:g} nm, {part}% of 200-700 nm"
 
 
 def test_a_gap_is_not_measured(tmp_path: Path) -> None:

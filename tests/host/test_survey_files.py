@@ -130,7 +130,7 @@ def test_lamost(tmp_path: Path, form: Any) -> None:
     measured = (star.wavelength_nm > 371) & (star.wavelength_nm < 700)
     np.testing.assert_allclose(star.flux_flam[measured], 1e15 * light(10 * star.wavelength_nm[measured]), rtol=1e-3)
     assert star.name == "LAMOST J1"
-    assert any("cover 369.999-909.913 nm, 66% of 200-700 nm" in text for text in star.told), star.told
+    assert any("cover 369.999-909.913 nm, 66% of 200-700 nm" in text for text in star.messages), star.messages
     mauve = Instrument.load("mauve")
     with refused("magnitude", "LAMOST"):
         expect(star, mauve, exposure=5.0)
@@ -180,7 +180,7 @@ def test_desi_fibres_and_arms(tmp_path: Path) -> None:
     assert red.wavelength_nm[[0, -1]] == pytest.approx([576.0, 762.0])
     with refused("row", "4", "3", "1"):
         read_spectrum(Path(f"{path}[row 4]"))
-    assert any("continued by K5V" in text for text in Source.read(f"{path}[row 1]", extend="K5V").told)
+    assert any("continued by K5V" in text for text in Source.read(f"{path}[row 1]", extend="K5V").messages)
 
 
 def test_one_desi_target(tmp_path: Path) -> None:

@@ -9,14 +9,14 @@ from scenes import instrument
 
 from mauvecl import Sky, Source, expect
 from mauvecl.lightcurve.flares.shapes import SHAPES
-from mauvecl.lightcurve.search.bank import Bank, Level
+from mauvecl.lightcurve.search.bank import Bank, Baseline
 from mauvecl.lightcurve.search.survey import Survey
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates, frame_nuisances
 from mauvecl.lightcurve.stares.frame_components import Components
 
 DAVENPORT = SHAPES["davenport2014"]
 ONE = np.ones((1, 1))
-KNOWN = Level(offset=False, slope=False, window_s=0.0)
+KNOWN = Baseline(offset=False, slope=False, window_s=0.0)
 
 
 @cache

@@ -9,7 +9,7 @@ import pytest
 from refusals import refused
 
 from mauvecl.host.stars.flare import blackbody
-from mauvecl.lightcurve.flares.events import Cooling, Event, check_seen, coefficients, temperatures_of
+from mauvecl.lightcurve.flares.events import Cooling, Event, check_contributions, coefficients, temperatures_of
 from mauvecl.lightcurve.flares.shapes import SHAPES
 
 START = np.arange(400) * 5.0
@@ -75,10 +75,10 @@ def test_flares_outside_of_the_frames_raise_or_are_reported(shape):
         whole = event.half_width_s * event.form.equivalent_duration
         if mean.max() < 1e-9 * event.form.peak and 5.0 * mean.sum() < 1e-9 * whole:
             with refused("peak_s", value=event.peak_s):
-                check_seen([event], start, 5.0)
+                check_contributions([event], start, 5.0)
             count["refused"] += 1
             continue
-        sentences = check_seen([event], start, 5.0)
+        sentences = check_contributions([event], start, 5.0)
         best = start[np.argmax(mean)]
         if sentences:
             # The largest light is then at an edge of the frames.

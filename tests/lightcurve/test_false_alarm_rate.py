@@ -8,7 +8,7 @@ from scipy import special
 from searches import DAVENPORT, KNOWN, ONE
 
 from mauvecl.lightcurve.defaults import HALF_WIDTHS_S
-from mauvecl.lightcurve.search.bank import Bank, Level
+from mauvecl.lightcurve.search.bank import Bank, Baseline
 from mauvecl.lightcurve.search.completeness import default_bank, search_threshold
 from mauvecl.lightcurve.search.counted_rate import CountedRate
 from mauvecl.lightcurve.search.false_alarm_rate import TemplateGrid
@@ -42,7 +42,7 @@ def test_rate_agrees_with_importance_sampling(widths):
     one bank share: fails by chance once in 10^4 runs.
     """
     directions = ONE if widths is HALF_WIDTHS_S else np.array([[1.0, 0.0], [0.95, 0.312], [0.8, 0.6]])
-    bank = Bank(widths, directions, DAVENPORT, 5.0, Level(window_s=900.0))
+    bank = Bank(widths, directions, DAVENPORT, 5.0, Baseline(window_s=900.0))
     tail, grid = sample_rate(Search(bank, Stare.of(12_000.0)), seed=2, draws=120), TemplateGrid.from_bank(bank)
     for u, p, error in zip(tail.thresholds[4:], tail.probability[4:], tail.error[4:], strict=True):
         truth = -np.log1p(-p) / (tail.days * 86_400)

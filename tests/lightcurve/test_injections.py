@@ -13,9 +13,9 @@ from searches import DAVENPORT, KNOWN, ONE, spectra, survey
 
 from mauvecl.device.stare_engine import Stares
 from mauvecl.lightcurve.search import injection_sites
-from mauvecl.lightcurve.search.bank import Bank, Level
+from mauvecl.lightcurve.search.bank import Bank, Baseline
 from mauvecl.lightcurve.search.counted_rate import consecutive_alarm_rate, consecutive_alarms
-from mauvecl.lightcurve.search.flare_fit import Fit
+from mauvecl.lightcurve.search.flare_fit import SingleFlareFit
 from mauvecl.lightcurve.search.importance_sampling import sample_rate
 from mauvecl.lightcurve.search.injection_sites import OVERLAP, sites_of
 from mauvecl.lightcurve.search.injections import Injections
@@ -71,7 +71,7 @@ def test_half_are_found_at_the_critical_amplitude(day, half_width):
 
 
 STARE = Stare.of(900.0, gaps=[(600, 640)], jitters={"light": 0.01})
-LEVEL = Level(window_s=400.0)
+LEVEL = Baseline(window_s=400.0)
 #: Rays that add about as much noise again as the frames have.
 RAYS = CosmicRays(rate_per_cm2_s=200.0)
 #: Half-widths and amplitudes.
@@ -289,7 +289,7 @@ def test_sums_over_frames_are_exact(injections, stares):
 def test_recovered_flares_have_their_parameters(half_width, snr):
     """Pulls of all parameters, and coverage. Fails by chance once in 10^4 runs: 4 standard errors of each."""
     stare = Stare.of(9000.0)
-    one, templates = survey(stare, Level(), (12.0, 40.0, 150.0, 400.0))
+    one, templates = survey(stare, Baseline(), (12.0, 40.0, 150.0, 400.0))
     rng = np.random.default_rng(31)
     n = 150
     peaks = 4000 + 50 * rng.random(n)
@@ -300,7 +300,9 @@ def test_recovered_flares_have_their_parameters(half_width, snr):
     sums = rng.standard_normal((n, stare.n_frames, response.size)) + course[:, :, None] * response + 3.0
     sums += 0.01 * stare.start_s[:, None]
     start = one.search.largest(sums)
-    found = Fit(one.bank, templates).recover(sums, stare.start_s, peak_s=start.peak_s, half_width_s=start.half_width_s)
+    found = SingleFlareFit(one.bank, templates).run(
+        sums, stare.start_s, peak_s=start.peak_s, half_width_s=start.half_width_s
+    )
     duration = amplitude * half_width * DAVENPORT.equivalent_duration
     pulls = {
         "peak": (found.peak_s - peaks) / found.peak_error_s,

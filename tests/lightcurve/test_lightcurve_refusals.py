@@ -23,7 +23,7 @@ from mauvecl.lightcurve.flares.energies import EnergyScale
 from mauvecl.lightcurve.flares.events import Cooling, Event, coefficients, temperatures_of
 from mauvecl.lightcurve.flares.rates import PowerLaw, RateTable, davenport2019, fiducial2018, preset
 from mauvecl.lightcurve.flares.shapes import Fiducial, TableShape, shape_of
-from mauvecl.lightcurve.search.bank import Bank, Level
+from mauvecl.lightcurve.search.bank import Bank, Baseline
 from mauvecl.lightcurve.search.completeness import Completeness, DurationLaw, frame_signal, search_threshold
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.search.yields import fit_power_law
@@ -87,8 +87,8 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "exponent of durations": (lambda: DurationLaw(exponent=2.0), "exponent"),
     "scatter of durations": (lambda: DurationLaw(scatter_dex=9.0), "scatter_dex"),
     "half width of durations": (lambda: DurationLaw(half_width_s=0.0), "half_width_s"),
-    "slope of a baseline": (lambda: Level(offset=False, slope=True), "slope"),
-    "window of a baseline": (lambda: Level(window_s=-1.0), "window_s"),
+    "slope of a baseline": (lambda: Baseline(offset=False, slope=True), "slope"),
+    "window of a baseline": (lambda: Baseline(window_s=-1.0), "window_s"),
     "half widths of a bank": (lambda: Bank((2.0, 1.0), ONE, DAVENPORT, 5.0, KNOWN), "half_widths_s"),
     "frames of a bank": (lambda: Bank((20.0,), ONE, DAVENPORT, 0.0, KNOWN), "frame_s"),
     "directions of a bank": (lambda: Bank((20.0,), 0 * ONE, DAVENPORT, 5.0, KNOWN), "directions"),

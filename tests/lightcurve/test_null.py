@@ -10,11 +10,11 @@ from searches import DAVENPORT, KNOWN, ONE, survey
 
 from mauvecl.device.stare_engine import Stares
 from mauvecl.lightcurve.defaults import DAYS, per_day
-from mauvecl.lightcurve.search.bank import Bank, Level
+from mauvecl.lightcurve.search.bank import Bank, Baseline
 from mauvecl.lightcurve.search.counted_rate import CountedRate, consecutive_alarm_rate, consecutive_alarms
 from mauvecl.lightcurve.search.importance_sampling import LADDER, sample_rate
 from mauvecl.lightcurve.search.search import Search
-from mauvecl.lightcurve.search.unknown_shifts import Scatter
+from mauvecl.lightcurve.search.unknown_shifts import UnknownShifts
 from mauvecl.lightcurve.stares.curves import Sinusoid
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.study.searches import SearchChoice
@@ -69,7 +69,7 @@ def test_counted_null_is_inverted():
 def short():
     """Return a search of two sums over a stare with a gap, and its null by importance sampling."""
     stare = Stare.of(9000.0, gaps=[(4000, 5000)])
-    bank = Bank((20.0, 60.0, 180.0), np.array([[1.0, 0.0], [0.8, 0.6]]), DAVENPORT, 5.0, Level(window_s=900.0))
+    bank = Bank((20.0, 60.0, 180.0), np.array([[1.0, 0.0], [0.8, 0.6]]), DAVENPORT, 5.0, Baseline(window_s=900.0))
     search = Search(bank, stare)
     return search, sample_rate(search, seed=2, draws=400)
 
@@ -147,7 +147,7 @@ def random_stare(rng):
         drifts={"star": rng.uniform(0.001, 0.01), "temperature": rng.uniform(0.01, 0.1)},
         cycles={"temperature": rng.uniform(0.05, 0.3)},
     )
-    level = Level(cycle=known_cycle, window_s=20_000.0)
+    level = Baseline(cycle=known_cycle, window_s=20_000.0)
     return stare, level, None if known_cycle else {"dark": np.inf}
 
 
@@ -170,7 +170,7 @@ def test_false_alarms_in_random_stares_are_as_requested(stares):
         stare, level, free = random_stare(rng)
         one, _ = survey(stare, level, (25.0, 120.0), more=free)
         days = stare.observed_s / 86_400
-        tail = sample_rate(one.search, seed=number, draws=25).under(Scatter.of(one, number))
+        tail = sample_rate(one.search, seed=number, draws=25).under(UnknownShifts.of(one, number))
         cut = tail.threshold(-np.log1p(-asked) / days).value
         sums = stares.frames(one.components, stare, count=draws, seed=100 + number, method="cumulants")
         alarms += int(np.sum(one.search.largest(one.net(sums)).maximum > cut))
@@ -200,10 +200,10 @@ def test_false_alarms_with_unknown_noise_are_as_requested(stares):
         drifts={"star": 0.07},
         offsets={"temperature": 4.0},
     )  # fmt: skip
-    one, _ = survey(stare, Level(window_s=1200.0), (25.0, 80.0), magnitude=9.5, part=True)
+    one, _ = survey(stare, Baseline(window_s=1200.0), (25.0, 80.0), magnitude=9.5, part=True)
     known = sample_rate(one.search, seed=3, draws=60)
-    tail, n = known.under(Scatter.of(one, 3)), 500
-    maxima = stares.reduced(one.null(n, 8))["maximum"]
+    tail, n = known.under(UnknownShifts.of(one, 3)), 500
+    maxima = stares.reduced(one.largest_value_request(n, 8))["maximum"]
     for u in (4.0, 4.5, 5.0):
         k = int(np.flatnonzero(tail.thresholds == u)[0])
         p = np.mean(maxima > u)
@@ -211,4 +211,4 @@ def test_false_alarms_with_unknown_noise_are_as_requested(stares):
         assert abs(p - tail.probability[k]) < 4 * spread
         assert np.exp(tail.log_rate(u)[0]) == pytest.approx(-np.log1p(-tail.probability[k]) / tail.days, rel=0.1)
     assert known.probability[k] < p / 10
-    assert known.under(Scatter.of(survey(Stare.of(7000.0), KNOWN, (25.0,), part=True)[0], 3)) is known
+    assert known.under(UnknownShifts.of(survey(Stare.of(7000.0), KNOWN, (25.0,), part=True)[0], 3)) is known

@@ -95,7 +95,7 @@ def test_step_completeness_recovers_the_rate_above_its_energy() -> None:
 
 def test_yield_without_scatter_is_poisson() -> None:
     for mean in (0.02, 3.0, 400.0):
-        found = Yield.about(mean, 0.0)
+        found = Yield.of_expected(mean, 0.0)
         assert (found.low, found.high) == (stats.poisson.ppf(0.025, mean), stats.poisson.ppf(0.975, mean))
         assert found.at_least_one == pytest.approx(-np.expm1(-mean))
 
@@ -104,7 +104,7 @@ def test_yield_with_scatter_agrees_with_simulation() -> None:
     """Against 200 000 draws; its quantiles scatter by half a per cent."""
     rng = np.random.default_rng(11)
     draws = rng.poisson(20.0 * 10 ** (0.4 * rng.standard_normal(200_000)))
-    found = Yield.about(20.0, 0.4)
+    found = Yield.of_expected(20.0, 0.4)
     assert found.at_least_one == pytest.approx((draws > 0).mean(), abs=0.002)
     assert [found.low, found.high] == pytest.approx(np.quantile(draws, [0.025, 0.975]), rel=0.03, abs=1)
 

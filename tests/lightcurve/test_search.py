@@ -8,7 +8,7 @@ from scipy import special
 from searches import DAVENPORT, KNOWN, ONE
 
 from mauvecl.lightcurve.defaults import HALF_WIDTHS_S
-from mauvecl.lightcurve.search.bank import Bank, Level
+from mauvecl.lightcurve.search.bank import Bank, Baseline
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.stares.stare import Stare
 
@@ -29,7 +29,7 @@ def filtered(search, sums, curves):
             edges = np.column_stack([at, at + 1]) * bank.frame_s
             shape = DAVENPORT.mean_over(edges, t.phases[row.phase] * bank.frame_s, t.half_width_s)
             root = np.sqrt(weight[inside])
-            terms = [at.astype(float) ** p for p in bank.level.powers] + [c[inside] for c in curves]
+            terms = [at.astype(float) ** p for p in bank.baseline.powers] + [c[inside] for c in curves]
             left = root * shape
             if terms:
                 columns = root[:, None] * np.array(terms).T
@@ -40,7 +40,7 @@ def filtered(search, sums, curves):
             yield rho[:, :, onset], found
 
 
-@pytest.mark.parametrize("level", [KNOWN, Level(window_s=600.0), Level(cycle=True, window_s=600.0)])
+@pytest.mark.parametrize("level", [KNOWN, Baseline(window_s=600.0), Baseline(cycle=True, window_s=600.0)])
 def test_filters_are_least_squares_over_gaps(level):
     """Correlations by FFT against a fit for each template, with gaps, unequal variances, and a level that moves."""
     stare = Stare.of(6000.0, gaps=[(1000, 1500), (3000, 3050)])
@@ -60,7 +60,7 @@ def test_filters_are_least_squares_over_gaps(level):
 def test_template_is_the_filter():
     """`template` gives the weights behind a value, of variance one."""
     stare = Stare.of(3000.0, gaps=[(900, 1100)])
-    bank = Bank((41.0,), np.array([[0.6, 0.8]]), DAVENPORT, 5.0, Level(window_s=400.0))
+    bank = Bank((41.0,), np.array([[0.6, 0.8]]), DAVENPORT, 5.0, Baseline(window_s=400.0))
     search = Search(bank, stare)
     sums = np.random.default_rng(2).standard_normal((1, stare.n_frames, 2))
     ((row, rho),) = search.values(sums)
@@ -72,7 +72,7 @@ def test_template_is_the_filter():
 
 def test_largest_finds_the_flare():
     stare = Stare.of(40_000.0, gaps=[(25_000, 27_000)])
-    search = Search(Bank(HALF_WIDTHS_S, ONE, DAVENPORT, 5.0, Level(window_s=30_000.0)), stare)
+    search = Search(Bank(HALF_WIDTHS_S, ONE, DAVENPORT, 5.0, Baseline(window_s=30_000.0)), stare)
     edges = np.column_stack([stare.start_s, stare.start_s + 5])
     sums = 2.0 * DAVENPORT.mean_over(edges, 20_003.0, 150.0)[None, :, None] + 7.0
     found = search.largest(sums)
@@ -81,7 +81,7 @@ def test_largest_finds_the_flare():
     assert found.amplitude[0] == pytest.approx(2.0, rel=0.05)
 
 
-@pytest.mark.parametrize("level", [KNOWN, Level()])
+@pytest.mark.parametrize("level", [KNOWN, Baseline()])
 def test_bank_loses_little_in_time(level):
     """Half-widths of 10-1800 s at any place of their frames lose at most 1.3 % of S/N (spectra: 0.7 %)."""
     bank = Bank(HALF_WIDTHS_S, ONE, DAVENPORT, 5.0, level)

@@ -8,8 +8,8 @@ from refusals import refused
 from searches import DAVENPORT, survey
 
 from mauvecl.lightcurve.defaults import per_day
-from mauvecl.lightcurve.search.bank import Level
-from mauvecl.lightcurve.search.flare_fit import Fit
+from mauvecl.lightcurve.search.bank import Baseline
+from mauvecl.lightcurve.search.flare_fit import SingleFlareFit
 from mauvecl.lightcurve.search.importance_sampling import sample_rate
 from mauvecl.lightcurve.stares.curves import Sinusoid
 from mauvecl.lightcurve.stares.stare import Stare
@@ -57,7 +57,7 @@ def random_stare(rng):
         offsets={"temperature": rng.uniform(0.1, 1.0)} if rng.integers(2) else {},
         cycles={"temperature": rng.uniform(0.05, 0.5)} if cycle else {},
     )
-    return stare, Level(cycle=cycle, window_s=17_000.0 if cycle else 1800.0)
+    return stare, Baseline(cycle=cycle, window_s=17_000.0 if cycle else 1800.0)
 
 
 @pytest.mark.long
@@ -72,7 +72,7 @@ def test_false_alarms_with_random_drifts_and_cycles():
     for number in range(20):
         stare, level = random_stare(rng)
         one, _ = survey(stare, level, (25.0, 120.0, 600.0), star="K2.5V", magnitude=5.0)
-        tail = one.tail(number)
+        tail = one.sampled_rate(number)
         cut = tail.threshold(-np.log1p(-asked) / (stare.observed_s / 86_400)).value
         alarms += int(np.sum(one.search.largest(one.net(drawn(one, rng, count)[0])).maximum > cut))
         cut = tail.threshold(per_day(1.0, "month")).value
@@ -94,10 +94,10 @@ def test_thresholds_allow_for_residual_variability():
         how = {"cycles": rng.uniform(6e-4, 1.2e-3)} if rng.integers(2) else {"drifts": rng.uniform(6e-4, 1.2e-3)}
         ((kind, sd),) = how.items()
         stare = Stare.of(rng.uniform(7000, 11_000), **{kind: {"temperature": sd}})
-        level = Level(slope=kind == "cycles", window_s=12_000.0)
+        level = Baseline(slope=kind == "cycles", window_s=12_000.0)
         one, _ = survey(stare, level, (25.0, 120.0, 600.0), star="K2.5V", magnitude=5.0)
         rate = -np.log1p(-asked) / (stare.observed_s / 86_400)
-        tail = one.tail(number)
+        tail = one.sampled_rate(number)
         assert tail.shifted
         maxima = one.search.largest(one.net(drawn(one, rng, count)[0])).maximum
         alarms += int(np.sum(maxima > tail.threshold(rate).value))
@@ -105,16 +105,16 @@ def test_thresholds_allow_for_residual_variability():
     expected, spread = 6 * count * asked, np.sqrt(6 * count * asked * (1 - asked))
     assert expected / 1.3 - 4 * spread < alarms < 1.3 * expected + 4 * spread
     assert plain > 1.5 * alarms
-    one, _ = survey(Stare.of(6000.0, drifts={"temperature": 0.1}), Level(slope=False), (25.0,), part=True)
+    one, _ = survey(Stare.of(6000.0, drifts={"temperature": 0.1}), Baseline(slope=False), (25.0,), part=True)
     with refused("false_alarms"):
-        one.tail(1).threshold(per_day(1.0, "month"))
+        one.sampled_rate(1).threshold(per_day(1.0, "month"))
 
 
 @pytest.fixture(scope="module")
 def drifting():
     """Return a star whose detector warms by an unknown 0.3 deg C per hour, and its templates."""
     stare = Stare.of(11_360.0, drifts={"temperature": 0.3})
-    return survey(stare, Level(), (25.0, 60.0, 120.0), star="K2.5V", magnitude=5.0)
+    return survey(stare, Baseline(), (25.0, 60.0, 120.0), star="K2.5V", magnitude=5.0)
 
 
 def test_amplitudes_are_recovered(drifting):
@@ -128,7 +128,7 @@ def test_amplitudes_are_recovered(drifting):
 def test_trend_of_zero_changes_nothing():
     """Unknowns of light alone, or a temperature in whose dark no bend is seen: sums are left as they are."""
     for unknowns in ({"drifts": {"star": 0.01}}, {"drifts": {"temperature": 1e-4}}, {}):
-        one, _ = survey(Stare.of(6000.0, **unknowns), Level(), (25.0,), part=True)
+        one, _ = survey(Stare.of(6000.0, **unknowns), Baseline(), (25.0,), part=True)
         assert one.trend is None
 
 
@@ -139,7 +139,7 @@ def test_flares_equal_those_without_a_drift(drifting, size):
     Within 1 % or half a standard deviation, for flares that a search finds at 20 to 1000.
     """
     one, templates = drifting
-    plain, _ = survey(Stare.of(11_360.0), Level(), (25.0, 60.0, 120.0), star="K2.5V", magnitude=5.0)
+    plain, _ = survey(Stare.of(11_360.0), Baseline(), (25.0, 60.0, 120.0), star="K2.5V", magnitude=5.0)
     peak, width = 3000.0, 60.0
     edges = np.column_stack([one.stare.start_s, one.stare.start_s + 5.0])
     shape = DAVENPORT.mean_over(edges, peak, width)
@@ -150,7 +150,7 @@ def test_flares_equal_those_without_a_drift(drifting, size):
     flare = amplitude * shape[:, None] * response
     x, weights = one.components.quiet, one.components.weights
     noise = np.random.default_rng(4).standard_normal((1, one.stare.n_frames, len(weights)))
-    fit, values, energies = Fit(one.bank, templates), [], []
+    fit, values, energies = SingleFlareFit(one.bank, templates), [], []
     for drift in (None, -2.5, 1.0, 3.0):
         sums = noise + flare
         if drift is not None:
@@ -158,7 +158,7 @@ def test_flares_equal_those_without_a_drift(drifting, size):
             sums = sums + np.expm1(x.conditions["dark_slope_per_c"] * change)[:, None] * (weights @ x.dark_dn)
         net = (plain if drift is None else one).net(sums)
         values.append(one.search.largest(net).maximum[0])
-        found = fit.recover(
+        found = fit.run(
             net, one.stare.start_s, peak_s=[peak], half_width_s=[width],
             variance=one.search.variance,
         )  # fmt: skip

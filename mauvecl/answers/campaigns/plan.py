@@ -348,7 +348,7 @@ def plan(
         recovered = None
         if rates is not None:
             days = observed * 3600 / DAY_S
-            recovered = Yield.about(0.0, 0.0) if its is None else Yield.of(rates, its, days)
+            recovered = Yield.of_expected(0.0, 0.0) if its is None else Yield.of(rates, its, days)
         return Planned(one, exposed, observed, its, rates, recovered, best, why)
 
     planned: list[Planned] = []

@@ -304,9 +304,9 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
     known, survey = case.survey, case.survey.survey
     drawn = None
     if choice.nulls:
-        maxima = _reduced(engine, survey.null(choice.nulls, seed, processes))["maximum"]
+        maxima = _reduced(engine, survey.largest_value_request(choice.nulls, seed, processes))["maximum"]
         drawn = CountedRate(np.sort(maxima), survey.stare.observed_s / DAY_S)
-    tail = survey.tail(seed)
+    tail = survey.sampled_rate(seed)
     threshold = (
         tail.threshold(choice.rate) if choice.null == "sampled" or drawn is None else drawn.threshold(choice.rate)
     )

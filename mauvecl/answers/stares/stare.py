@@ -421,7 +421,7 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> SearchResu
         survey = replace(known.survey, components=staring.components(known.templates.weights))
 
         def computed() -> Arrays:
-            tail = survey.tail(study.run.seed)
+            tail = survey.sampled_rate(study.run.seed)
             return {"threshold": np.array(tail.threshold(study.search.rate).value), "shifted": np.array(tail.shifted)}
 
         tail = kept(checkpoint, ("threshold", survey, study.text()), computed)

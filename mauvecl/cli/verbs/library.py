@@ -142,7 +142,7 @@ def _tell(star: OwnStar, quiet: bool) -> None:
     lines = [
         f"Kept {star.name}: --star {json.dumps(star.name) if ' ' in star.name else star.name}",
         *star.notes,
-        *star.told,
+        *star.messages,
     ]
     if star.unscaled:
         lines.append(f"It needs --magnitude: {star.unscaled}.")

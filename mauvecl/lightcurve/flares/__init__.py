@@ -1,1 +1,1 @@
-"""One flare: its shape in time, its energy, and how often there are such."""
+"""Flares: shapes in time, energies and rates."""

@@ -93,12 +93,12 @@ class EnergyScale:
         """
         if source.unscaled:
             raise InputError(
-                f"the flux of {source.name} is of no scale: {source.unscaled}",
+                f"the flux of {source.name} has no absolute scale: {source.unscaled}",
                 "a magnitude",
                 key="source",
                 value=source.name,
             )
-        source.magnitude(band)  # refuses a band that the spectrum does not cover
+        source.magnitude(band)  # raises InputError if the spectrum does not cover the band
         return cls._of_light(
             source.wavelength_nm,
             source.flux_flam,

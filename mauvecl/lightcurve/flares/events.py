@@ -187,7 +187,7 @@ class Event:
         return float(self.amplitude * per_s)
 
 
-def check_seen(events: Sequence[Event], start_s: Float, frame_s: float) -> list[str]:
+def check_contributions(events: Sequence[Event], start_s: Float, frame_s: float) -> list[str]:
     """Return a message for each flare that peaks outside the frames but contributes light to them.
 
     Raises InputError if a flare contributes no light.
@@ -199,8 +199,8 @@ def check_seen(events: Sequence[Event], start_s: Float, frame_s: float) -> list[
         share = float(mean.sum()) * frame_s / event.half_width_s / event.form.equivalent_duration
         if max(share, float(mean.max()) / event.form.peak) < LEAST_LIGHT:
             raise InputError(
-                f"flare {number}, which peaks at {event.peak_s:g} s, sheds no light into the frames of the stare",
-                f"some between {start_s[0]:g} and {start_s[-1] + frame_s:g} s and not in a gap",
+                f"flare {number}, which peaks at {event.peak_s:g} s, adds no light to the frames of the stare",
+                f"light between {start_s[0]:g} and {start_s[-1] + frame_s:g} s and outside gaps",
                 key="peak_s",
                 value=event.peak_s,
             )
@@ -208,7 +208,7 @@ def check_seen(events: Sequence[Event], start_s: Float, frame_s: float) -> list[
         last = int(np.searchsorted(start_s, peak_s, side="right")) - 1
         if last < 0 or peak_s >= start_s[last] + frame_s:
             sentences.append(
-                f"Flare {number} peaks at {event.peak_s:g} s, outside of the frames of the stare, which hold "
+                f"Flare {number} peaks at {event.peak_s:g} s, outside the frames of the stare, which contain "
                 f"{100 * share:.3g} % of its light."
             )
     return sentences

@@ -199,9 +199,13 @@ class RateTable(Rates):
         if energy.ndim != 1 or energy.shape != rate.shape or energy.size < 2:
             raise InputError.of("per_day", rate.size, f"one rate for each of {energy.size} energies, at least 2")
         if not (np.isfinite(energy).all() and (energy > 0).all() and (np.diff(energy) > 0).all()):
-            raise InputError("energies of a table of rates do not ascend", "ascending ones above 0", key="energy_erg")
+            raise InputError(
+                "the energies of a table of rates do not ascend", "ascending energies above 0", key="energy_erg"
+            )
         if not (np.isfinite(rate).all() and (rate > 0).all() and (np.diff(rate) <= 0).all()):
-            raise InputError("rates of a table do not fall", "falling rates above 0, per day", key="per_day")
+            raise InputError(
+                "the rates of a table increase with energy", "decreasing rates above 0, per day", key="per_day"
+            )
 
     @classmethod
     def read(cls, path: str | Path, band: str = "Kepler") -> Self:

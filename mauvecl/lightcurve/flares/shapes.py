@@ -312,7 +312,7 @@ class TableShape(Shape):
     tau: Float
     values: Float
     name: str = "table"
-    source: str = "a table of one's own"
+    source: str = "user-defined table"
 
     def __post_init__(self) -> None:
         tau, values = np.array(self.tau, np.float64), np.array(self.values, np.float64)
@@ -321,12 +321,12 @@ class TableShape(Shape):
             raise InputError.of("values", values.size, f"one for each of {tau.size} times, at least 2", where=name)
         if not (np.isfinite(tau).all() and (np.diff(tau) > 0).all()):
             raise InputError(
-                f"{name} has times that do not ascend", "finite ones in ascending order", key="tau", value=tau
+                f"the times of {name} do not ascend", "finite times in ascending order", key="tau", value=tau
             )
         if not (np.isfinite(values).all() and values.min() >= 0 and values.max() > 0):
             raise InputError(
-                f"{name} has values from {values.min():g} to {values.max():g}",
-                "finite ones of at least 0, some above it",
+                f"the values of {name} range from {values.min():g} to {values.max():g}",
+                "finite values of at least 0, some above 0",
                 key="values",
                 value=values,
             )

@@ -1,1 +1,1 @@
-"""Looking for flares in stares: a bank of filters, its false alarms, what it finds of injected flares, and yields."""
+"""Searches for flares in stares: template banks, false alarms, completeness from injections, and yields."""

@@ -278,7 +278,9 @@ class _StareSearch:
         # The baseline under a flare is the median of the surrounding frames without excess noise.
         times = self.sums.edges[:, 0]
         for start, stop in _runs(loud):
-            near = ~loud & (np.abs(times - times[(start + stop) // 2]) < self.sums.survey.bank.level.window_s / 2 + 1)
+            near = ~loud & (
+                np.abs(times - times[(start + stop) // 2]) < self.sums.survey.bank.baseline.window_s / 2 + 1
+            )
             level = np.median(left[near], axis=0) if near.any() else np.zeros(left.shape[1])
             rows = slice(start, stop)
             evened[rows] = level + (left[rows] - level) / np.sqrt(excess[rows])[:, None]
@@ -375,7 +377,7 @@ def _measured(
     snr = float(np.sqrt(max(gain, 0.0)))
     missing = ""
     if at_low[PEAK] or at_high[PEAK]:
-        missing = "its best fit peaks outside of the stare"
+        missing = "its best fit peaks outside the stare"
     elif at_low[WIDTH] or at_high[WIDTH]:
         missing = f"its best fit is {'wider' if at_high[WIDTH] else 'narrower'} than the half-widths of the bank"
     elif not best.converged:

@@ -29,7 +29,7 @@ LEAST_SHARE = 0.25
 
 
 @dataclass(frozen=True)
-class Level:
+class Baseline:
     """Baseline under a flare: the terms that are marginalised over in each window.
 
     Attributes
@@ -93,14 +93,14 @@ class Bank:
         ones for a single light curve.
     shape : Shape
     frame_s : float
-    level : Level
+    baseline : Baseline
     """
 
     half_widths_s: tuple[float, ...]
     directions: Float
     shape: Shape
     frame_s: float
-    level: Level = Level()
+    baseline: Baseline = Baseline()
 
     def __post_init__(self) -> None:
         widths = self.half_widths_s
@@ -140,6 +140,6 @@ class Bank:
 
     def window(self, half_width_s: float) -> tuple[int, int]:
         """Return the number of frames of the window before and after the peak."""
-        half = self.level.window_s / 2
+        half = self.baseline.window_s / 2
         lead, tail = (max(reach * half_width_s, half) / self.frame_s for reach in (LEAD, TAIL))
         return int(np.ceil(lead)), int(np.ceil(tail))

@@ -72,7 +72,7 @@ class Interval:
 
 
 class SearchedStare(Protocol):
-    """What fits need of a stare and its search, simulated (`survey.Survey`) or observed."""
+    """Interface of a stare and its search for fits; the stare is simulated (`survey.Survey`) or observed."""
 
     @property
     def stare(self) -> Stare:
@@ -214,7 +214,7 @@ class StareSums:
 
         The shape is (n_frame, n_term).
         """
-        powers = self.survey.bank.level.powers
+        powers = self.survey.bank.baseline.powers
         time = self.edges[used].mean(axis=1)
         terms: list[Float] = []
         if powers:
@@ -226,7 +226,7 @@ class StareSums:
             knots = np.concatenate([np.zeros(degree), inner, np.full(degree, float(pieces))])
             design = scipy.interpolate.BSpline.design_matrix(place, knots, degree).toarray()
             terms += list(design.T)
-        if self.survey.bank.level.cycle and self.survey.curves is not None:
+        if self.survey.bank.baseline.cycle and self.survey.curves is not None:
             terms += list(self.survey.curves[:, used])
         return np.array(terms).reshape(len(terms), time.size).T
 
@@ -377,14 +377,14 @@ class Block:
                 fixed = j, column, float(middle + sign * step), factor
                 return self.fit(straight if start is None else start, fixed)
 
-            reached, probes = _reached(refit, best.chi2, rises, sd * np.sqrt(rises), furthest), list(BEYOND)
+            reached, probes = _interval_end(refit, best.chi2, rises, sd * np.sqrt(rises), furthest), list(BEYOND)
             while probes and reached.better is None and reached.step < furthest:
-                # Behind a rise there may be another fall, of another optimum.
+                # Another optimum may follow beyond a rise.
                 step = min(reached.step * probes.pop(0), furthest)
                 fits = [refit(step, start) for start in (None, reached.theta, theta)]
                 one = min(fits, key=lambda fit: fit.chi2)
                 if one.chi2 - best.chi2 < rises * (1.0 - CLOSE) ** 2:
-                    reached = _reached(refit, best.chi2, rises, step, furthest, one.theta)
+                    reached = _interval_end(refit, best.chi2, rises, step, furthest, one.theta)
             if reached.better is not None:
                 return Interval(np.nan, np.nan), self.fit(reached.better.theta)
             found.append((float(middle + sign * reached.step), reached.open))
@@ -401,34 +401,31 @@ class Block:
 
 
 @dataclass(frozen=True, eq=False)
-class _Reached:
-    """Where chi-squared has risen by what it is to rise by: the way from the best fit, and whether it runs on.
+class _IntervalEnd:
+    """One end of an interval from the profile likelihood."""
 
-    Where a fit is better than the best one, `better` is that fit.
-    """
-
-    step: float
-    open: bool
-    theta: Float
-    better: BlendFit | None = None
+    step: float  # distance from the best fit
+    open: bool  # chi-squared does not rise enough within the range of the fit
+    theta: Float  # parameters at the end
+    better: BlendFit | None = None  # fit that is better than the best one, if profiling found one
 
 
-def _reached(
+def _interval_end(
     refit: Callable[[float, Float | None], BlendFit], chi2: float, rises: float, step: float, furthest: float,
     start: Float | None = None,
-) -> _Reached:  # fmt: skip
-    """Return the end of an interval on one side, from a first guess of the way to it.
+) -> _IntervalEnd:  # fmt: skip
+    """Return the end of an interval on one side of the best fit.
 
     Parameters
     ----------
     refit : callable
-        The best fit at some way from the best, from a start or from the tangent.
+        Returns the best fit at a distance from the best one, from given or extrapolated starting parameters.
     chi2, rises : float
-        Of the best fit, and what it is to rise by.
+        Chi-squared of the best fit, and its rise at the end of the interval.
     step, furthest : float
-        First guess, and the way to the end of what is fitted.
+        First guess of the distance to the end, and distance to the bound of the fit.
     start : ndarray, optional
-        Where the first fit begins.
+        Starting parameters of the first fit.
     """
     inner, outer, root_inner, root_outer = 0.0, np.inf, 0.0, np.inf
     for _ in range(MAX_REFITS):
@@ -436,10 +433,10 @@ def _reached(
         step = min(step, furthest)
         one = refit(step, start)
         if one.chi2 - chi2 < -BETTER:
-            return _Reached(step, False, one.theta, one)
+            return _IntervalEnd(step, False, one.theta, one)
         root = float(np.sqrt(max(one.chi2 - chi2, 0.0) / rises))
         if abs(root - 1.0) < CLOSE or (at_end and root < 1.0):
-            return _Reached(step, at_end and root < 1.0 - CLOSE, one.theta)
+            return _IntervalEnd(step, at_end and root < 1.0 - CLOSE, one.theta)
         start = one.theta
         if root < 1.0:
             inner, root_inner = step, root
@@ -448,7 +445,7 @@ def _reached(
         if np.isinf(outer):
             step *= min(1.0 / max(root, 0.25), 4.0) * 1.02
         else:
-            # Nearly straight between the two: regula falsi, away from the ends.
+            # The root of the rise is nearly linear: use regula falsi, but keep away from both ends.
             share = (1.0 - root_inner) / (root_outer - root_inner)
             step = inner + (outer - inner) * float(np.clip(share, 0.08, 0.92))
-    return _Reached(step, root < 1.0 - CLOSE, one.theta)
+    return _IntervalEnd(step, root < 1.0 - CLOSE, one.theta)

@@ -78,7 +78,8 @@ class TemplateGrid:
     def from_bank(cls, bank: Bank) -> TemplateGrid:
         """Compute the correlations between all neighbouring templates of a bank."""
         rows = [
-            [_detrended(template, shape, bank.level.powers) for shape in template.shapes] for template in bank.templates
+            [_detrended(template, shape, bank.baseline.powers) for shape in template.shapes]
+            for template in bank.templates
         ]
         per_frame, onset, width = [], [], []
         for k, (template, filters) in enumerate(zip(bank.templates, rows, strict=True)):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mauvecl.schema.tables import Column
 
 if TYPE_CHECKING:
-    from mauvecl.lightcurve.search.flare_fit import Fit, FittedFlares
+    from mauvecl.lightcurve.search.flare_fit import FittedFlares, SingleFlareFit
     from mauvecl.lightcurve.search.injection_sites import InjectionSite
 
 Float = NDArray[np.float64]
@@ -31,7 +31,7 @@ FIT_QUANTITIES = ("energy", "amplitude", "half_width", "temperature", "peak", "c
 class Refit:
     """Injected flares to fit if they are detected."""
 
-    fit: Fit
+    fit: SingleFlareFit
     amplitudes: Float  # injected amplitudes, shape (n_half_width, n_amplitude)
     temperature_k: float  # temperature of the injected flares
     count: int  # number of stares per peak time with fits, the first ones

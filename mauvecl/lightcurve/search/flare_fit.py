@@ -53,7 +53,7 @@ class FittedFlares:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class SingleFlareFit:
     """Least-squares fit of single flares.
 
     Attributes
@@ -67,7 +67,7 @@ class Fit:
     bank: Bank
     templates: Templates
 
-    def recover(
+    def run(
         self,
         sums: NDArray[Any],
         start_s: Float,
@@ -180,14 +180,14 @@ class Fit:
         """Return weights of frames, zero outside the windows, (n, n_frame), and baseline terms, (n, n_frame, p)."""
         n, frame_s = peak.size, self.bank.frame_s
         weight = np.zeros((n, start_s.size))
-        terms = np.zeros((n, start_s.size, len(self.bank.level.powers) + (0 if curves is None else len(curves))))
+        terms = np.zeros((n, start_s.size, len(self.bank.baseline.powers) + (0 if curves is None else len(curves))))
         for k in range(n):
             lead, tail = self.bank.window(float(width[k]))
             since = (start_s - peak[k]) / frame_s
             inside = (since >= -lead - 1) & (since <= tail)
             weight[k, inside] = 1.0 if variance is None else 1.0 / variance[inside]
             time = since / (lead + tail)
-            rows = [time**power for power in self.bank.level.powers] + list([] if curves is None else curves)
+            rows = [time**power for power in self.bank.baseline.powers] + list([] if curves is None else curves)
             for j, row in enumerate(rows):
                 terms[k, :, j] = row
         if terms.shape[2]:

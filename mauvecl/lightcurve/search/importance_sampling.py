@@ -30,7 +30,7 @@ from mauvecl.statistics.intervals import CONFIDENCE, Interval
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.search.search import Search
-    from mauvecl.lightcurve.search.unknown_shifts import Scatter
+    from mauvecl.lightcurve.search.unknown_shifts import UnknownShifts
 
 Float = NDArray[np.float64]
 
@@ -91,22 +91,22 @@ class SampledRate:
         columns = np.vander(u - u.mean(), min(POWERS, u.size), increasing=True) / relative[:, None]
         return np.asarray(np.linalg.pinv(columns) @ (logs / relative))
 
-    def under(self, scatter: Scatter) -> SampledRate:
+    def under(self, shifts: UnknownShifts) -> SampledRate:
         """Return the rate for stares whose noise differs from the noise that the search assumes."""
-        if scatter.known:
+        if shifts.is_nominal:
             return self
         # The rate is tabulated finely enough for linear interpolation.
-        shifted = bool(scatter.shifts.any())
-        low, high = self.thresholds[0] / scatter.scales.max(), self.thresholds[-1] / scatter.scales.min()
+        shifted = bool(shifts.shifts.any())
+        low, high = self.thresholds[0] / shifts.scales.max(), self.thresholds[-1] / shifts.scales.min()
         # Shifted values exceed a threshold as often as unshifted ones exceed a much lower one.
         fine = np.linspace(0.0 if shifted else low, high, FINE)
         polynomial = np.polynomial.polynomial.polyval(fine - self.thresholds[self._trusted].mean(), self._fit())
         rates = np.exp(scipy.special.log_ndtr(-fine) + polynomial)
         probability, error = np.zeros((2, self.thresholds.size))
         for k, threshold in enumerate(self.thresholds):
-            each = scatter.alarmed(threshold, self.days, lambda u: np.interp(u, fine, rates))
-            probability[k] = scatter.weights @ each
-            spread = np.sqrt(np.sum((scatter.weights * (each - probability[k])) ** 2))
+            each = shifts.alarm_probability(threshold, self.days, lambda u: np.interp(u, fine, rates))
+            probability[k] = shifts.weights @ each
+            spread = np.sqrt(np.sum((shifts.weights * (each - probability[k])) ** 2))
             error[k] = np.hypot(spread, probability[k] * self.error[k] / self.probability[k])
         return SampledRate(self.thresholds, probability, error, self.days, shifted)
 
@@ -191,8 +191,8 @@ def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate
     shares = np.cumsum(weights * sizes[:, None])
     variance = search.variance[:, None]
     estimates = np.empty((draws, len(LADDER)))
-    # Each draw is of noise, and of what moves its template's own value by one: that in time the template's direction,
-    # so that it takes one more sum. Few at once, so that they stay in the caches.
+    # One more sum holds the response that changes the chosen template's own value by one, since it is proportional to
+    # the template in time. Batches are small so that they fit into the processor's caches.
     directions = search.bank.directions
     batch = max(1, BATCH // (8 * (n_sum + 1) * search.n_grid))
     for first in range(0, draws, batch):

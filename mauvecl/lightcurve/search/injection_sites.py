@@ -27,7 +27,7 @@ OVERLAP = 0.3
 STEP = 2.0**-18
 #: Largest ratio of half-widths of template and flare, and half-widths before and after the peak with templates.
 WIDEST, BEFORE, AFTER = 10.0, 3.0, 5.0
-#: Frames up to which a stare is searched as a whole: its search is there, and no part of it is much smaller.
+#: Number of frames up to which the whole stare is searched; its search exists, and a part would hardly be smaller.
 WHOLE = 20_000
 
 
@@ -60,7 +60,7 @@ class InjectionSite:
 
 
 def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float, response: Float) -> tuple[InjectionSite, ...]:
-    """Return flares of several half-widths that peak at one time, and the templates that can find each.
+    """Return the sites of flares of several half-widths that peak at one time.
 
     Parameters
     ----------
@@ -69,17 +69,17 @@ def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float, response:
         Half-widths of the flares.
     peak_s : float
     response : ndarray, shape (n_sum,)
-        Mean sums of a flare of one amplitude in a frame.
+        Mean sums of a frame for a flare of unit amplitude.
     """
     bank = survey.bank
     reaches = [_Reach.of(bank, width, peak_s) for width in widths_s]
-    search, first = _near(survey, reaches)
+    search, first = _search_near(survey, reaches)
     stare = search.stare
     edges = np.column_stack([stare.start_s, stare.start_s + bank.frame_s])
     means = np.array([stare.light * bank.shape.mean_over(edges, peak_s, width) for width in widths_s])
-    # A flare's sums are its course in time the response, so that one correlation serves all temperatures.
+    # A flare's sums are the product of its shape and the response, so that one correlation serves all temperatures.
     along = (bank.directions @ response)[:, None]
-    seen: list[list[_Seen]] = [[] for _ in reaches]
+    seen: list[list[_NearbyTemplates]] = [[] for _ in reaches]
     for number, (row, correlated) in enumerate(search.correlations(means[:, :, None])):
         times = (stare.numbers[0] + row.peaks + row.template.phases[row.phase]) * bank.frame_s
         for found, reach, value in zip(seen, reaches, correlated[:, 0], strict=True):
@@ -87,25 +87,25 @@ def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float, response:
                 inside = (times >= reach.first_s) & (times <= reach.last_s) & (row.per_amplitude > 0)
                 onsets = np.flatnonzero(inside)
                 onsets = onsets[(along * value[onsets]).max(axis=0, initial=0) > 0]
-                found.append(_Seen(number, onsets, times[onsets], along * value[onsets]))
+                found.append(_NearbyTemplates(number, onsets, times[onsets], along * value[onsets]))
     for found in seen:
         largest = max((float(one.values.max(initial=0)) for one in found), default=0.0)
         found[:] = [one.above(OVERLAP * largest) for one in found]
     filters = _filters(search, [one for found in seen for one in found])
     return tuple(
-        _place(search, first, width, peak_s, mean, found, filters)
+        _site(search, first, width, peak_s, mean, found, filters)
         for width, mean, found in zip(widths_s, means, seen, strict=True)
     )
 
 
 @dataclass(frozen=True)
 class _Reach:
-    """Templates that are tried for a flare, and the frames that they reach to, s."""
+    """Templates that are tried for a flare, and the frames that they cover."""
 
     half_widths_s: tuple[float, ...]
-    first_s: float
+    first_s: float  # earliest and latest peak of a template
     last_s: float
-    begin_s: float
+    begin_s: float  # start and end of the frames
     end_s: float
 
     @classmethod
@@ -119,23 +119,23 @@ class _Reach:
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """Templates of one row of a search that see a flare, and their values, shape (n_temperature, n)."""
+class _NearbyTemplates:
+    """Templates of one row of a search near a flare."""
 
     row: int
-    onsets: NDArray[np.int64]
-    times_s: Float
-    values: NDArray[Any]
+    onsets: NDArray[np.int64]  # shape (n,)
+    times_s: Float  # peak times, shape (n,)
+    values: NDArray[Any]  # values, or whether they exceed a limit, shape (n_temperature, n)
 
-    def above(self, least: float) -> _Seen:
-        """Return those with a value of at least this at any temperature; values become whether each has it."""
+    def above(self, least: float) -> _NearbyTemplates:
+        """Return the templates that reach a value at any temperature, with `values` true where they reach it."""
         counts = self.values >= least
         kept = counts.any(axis=0)
-        return _Seen(self.row, self.onsets[kept], self.times_s[kept], counts[:, kept])
+        return _NearbyTemplates(self.row, self.onsets[kept], self.times_s[kept], counts[:, kept])
 
 
-def _near(survey: Survey, reaches: Sequence[_Reach]) -> tuple[Search, int]:
-    """Return a search of the frames that templates reach to, and the first of these frames."""
+def _search_near(survey: Survey, reaches: Sequence[_Reach]) -> tuple[Search, int]:
+    """Return a search of the frames that templates cover, and the first of these frames."""
     stare = survey.stare
     if stare.n_frames <= WHOLE:
         return survey.search, 0
@@ -147,8 +147,8 @@ def _near(survey: Survey, reaches: Sequence[_Reach]) -> tuple[Search, int]:
     return Search(bank, select_frames(stare, part), curves, survey.variance[part]), part.start
 
 
-def _filters(search: Search, seen: Sequence[_Seen]) -> dict[int, tuple[NDArray[np.int64], Single]]:
-    """Return the onsets that any flare needs of each row, ascending, and their filters."""
+def _filters(search: Search, seen: Sequence[_NearbyTemplates]) -> dict[int, tuple[NDArray[np.int64], Single]]:
+    """Return for each row the onsets of templates near any flare, ascending, and their filters."""
     filters = {}
     for number in sorted({one.row for one in seen}):
         onsets = np.unique(np.concatenate([one.onsets for one in seen if one.row == number]))
@@ -157,8 +157,8 @@ def _filters(search: Search, seen: Sequence[_Seen]) -> dict[int, tuple[NDArray[n
     return filters
 
 
-def _place(
-    search: Search, first: int, width_s: float, peak_s: float, mean: Float, seen: Sequence[_Seen],
+def _site(
+    search: Search, first: int, width_s: float, peak_s: float, mean: Float, seen: Sequence[_NearbyTemplates],
     filters: dict[int, tuple[NDArray[np.int64], Single]],
 ) -> InjectionSite:  # fmt: skip
     none = np.zeros((0, mean.size), np.float32)

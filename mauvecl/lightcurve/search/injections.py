@@ -124,7 +124,7 @@ class Injections:
         window = slice(first, max((part.stop for part in reached), default=1))
         start = (1 + position) * NUMBERS
         stare = select_frames(survey.stare, window)
-        injecting = Injecting(
+        injecting = CriticalAmplitudes(
             tuple(site.within(first) for site in sites),
             self.threshold,
             survey.bank.directions,
@@ -153,7 +153,7 @@ class Injections:
 
 
 @dataclass(frozen=True, eq=False)
-class Injecting:
+class CriticalAmplitudes:
     """Reduction of stares to the critical amplitudes of flares at one peak time."""
 
     adds: ClassVar[bool] = False
@@ -263,7 +263,7 @@ class Injecting:
             if not alarm.any():
                 continue
             here, which = site.frames, template[alarm]
-            recovered = refit.fit.recover(
+            recovered = refit.fit.run(
                 self.sums(site, drawn, row[alarm])[:, 0],
                 self.start_s[here],
                 peak_s=site.peaks_s[which],

@@ -75,7 +75,7 @@ class Search:
     def __init__(self, bank: Bank, stare: Stare, curves: Float | None = None, variance: Float | None = None) -> None:
         if abs(stare.frame_s - bank.frame_s) > 1e-9 * bank.frame_s:
             raise InputError.of("frame_s", stare.frame_s, f"{bank.frame_s:g} s, as in the bank", unit="s")
-        if bank.level.cycle != (curves is not None and len(curves) > 0):
+        if bank.baseline.cycle != (curves is not None and len(curves) > 0):
             raise InputError("only one of curves and level.cycle is given", "both or neither", key="curves")
         self.bank, self.stare = bank, stare
         self._first = int(stare.numbers[0])
@@ -90,7 +90,7 @@ class Search:
                 raise InputError("a baseline curve is constant over the stare", "one that varies", key="curves")
             series.append((curve - np.mean(curve)) / scale)
         # Terms of the baseline: a power of time in the window, and the index of a series in the stare.
-        self._terms = [(power, 0) for power in bank.level.powers] + [(0, 1 + k) for k in range(len(series) - 1)]
+        self._terms = [(power, 0) for power in bank.baseline.powers] + [(0, 1 + k) for k in range(len(series) - 1)]
         self._series = np.zeros((len(series), self.n_grid))
         self._series[:, self._at] = series
         reach = max(t.shapes.shape[1] for t in bank.templates)
@@ -128,16 +128,16 @@ class Search:
         yield from self._values(self._checked(sums))
 
     def correlations(self, sums: NDArray[Any]) -> Iterator[tuple[Row, NDArray[Any]]]:
-        """Yield each row with the value of every sum for itself, shape (n_stare, n_sum, n_onset): zero where none is.
+        """Yield each row with the values of all sums, shape (n_stare, n_sum, n_onset); zero if not searched.
 
-        The values of rho are these, weighed with the bank's directions. There may be any number of sums.
+        The bank's directions times these values are the values of rho. There may be any number of sums.
         """
         spectra = self._spectra(sums)
         real = _precision(sums)
         window, level = (0, 0), []
         for template in self.bank.templates:
             onsets = self._onsets(template)
-            # Templates of one window share the level's part.
+            # Templates with the same window share the correlations of the baseline.
             if window != (template.first, template.time.size):
                 window = template.first, template.time.size
                 level = [
@@ -161,7 +161,7 @@ class Search:
         return np.asarray(self.in_time(row, np.array([onset]))[0][:, None] * self.bank.directions[direction])
 
     def in_time(self, row: Row, onsets: NDArray[np.int64]) -> Float:
-        """Return what templates of a row weigh frames with, without their direction, shape (n_onset, n_frame)."""
+        """Return the weights of frames in templates of a row, without their direction, shape (n_onset, n_frame)."""
         size, first = row.template.time.size, row.peaks[onsets] + row.template.first
         templates = np.zeros((onsets.size, self.stare.n_frames))
         if not onsets.size:
@@ -301,7 +301,7 @@ class Search:
     def _without_gaps(self, template: Template, phase: int) -> float:
         """Return a template's power without gaps, marginalised over powers of time only."""
         shape = template.shapes[phase]
-        columns = np.array([template.time**power for power in self.bank.level.powers])
+        columns = np.array([template.time**power for power in self.bank.baseline.powers])
         if columns.size:
             level, *_ = np.linalg.lstsq(columns.T, shape, rcond=None)
             shape = shape - level @ columns
@@ -309,5 +309,5 @@ class Search:
 
 
 def _precision(sums: NDArray[Any]) -> type[np.floating[Any]]:
-    """Return the precision of the sums: double where they have it, single otherwise."""
+    """Return the type of computations: double precision for sums in double precision, else single."""
     return np.float64 if sums.dtype == np.float64 else np.float32

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mauvecl.lightcurve.search.importance_sampling import SampledRate, sample_rate
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.search.trend import Trend
-from mauvecl.lightcurve.search.unknown_shifts import Scatter
+from mauvecl.lightcurve.search.unknown_shifts import UnknownShifts
 from mauvecl.lightcurve.stares.stare_requests import StaresRequest
 from mauvecl.lightcurve.stares.sum_cumulants import method_for
 from mauvecl.noise.processes import NONE, Processes
@@ -73,7 +73,7 @@ class Survey:
     @cached_property
     def curves(self) -> Float | None:
         """Curves of the stare's unknowns that are not straight lines, shape (n_curve, n_frame)."""
-        if not self.bank.level.cycle:
+        if not self.bank.baseline.cycle:
             return None
         every = [unknown.curve for unknown in self.stare.unknowns]
         # Residual of each curve after a fit of a straight line and the previous curves.
@@ -103,9 +103,9 @@ class Survey:
     @property
     def trend(self) -> Trend | None:
         """Effect of the stare's unknowns if it is significant beyond first order, else None."""
-        return self.unknowns if self.unknowns is not None and self.unknowns.bends else None
+        return self.unknowns if self.unknowns is not None and self.unknowns.is_nonlinear else None
 
-    def left(self, amplitudes: Float) -> Float:
+    def unsubtracted(self, amplitudes: Float) -> Float:
         """Return the effect of unknowns on the sums that is not subtracted before the search.
 
         The shape is (n_stare, n_frame, n_sum).
@@ -117,14 +117,14 @@ class Survey:
         """
         if self.unknowns is None:
             return np.zeros((len(amplitudes), self.stare.n_frames, self.components.n_statistics))
-        moved = self.unknowns.moved(amplitudes)
+        moved = self.unknowns.effect(amplitudes)
         return moved if self.trend is None else self.trend.subtracted(moved)
 
     def net(self, sums: NDArray[Any]) -> NDArray[np.float32]:
         """Subtract from simulated sums their known mean and the fitted trend, shape (n_stare, n_frame, n_sum)."""
         return subtract_known(sums, self.known, self.trend)
 
-    def null(self, count: int, seed: int, processes: Processes = NONE) -> StaresRequest:
+    def largest_value_request(self, count: int, seed: int, processes: Processes = NONE) -> StaresRequest:
         """Return the request for the largest values of stares without a flare."""
         largest = Largest(self.bank, self.stare, self.curves, self.variance, self.known, self.trend)
         method = method_for(self.components, self.stare, processes)
@@ -132,10 +132,10 @@ class Survey:
             self.components, self.stare, count, seed, method=method, processes=processes, reduction=largest
         )
 
-    def tail(self, seed: int) -> SampledRate:
+    def sampled_rate(self, seed: int) -> SampledRate:
         """Estimate the false-alarm rate by importance sampling, including the stare's unknowns."""
         part = self.of_days(SAMPLED_DAYS)
-        return sample_rate(part.search, seed=seed).under(Scatter.of(self, seed, part))
+        return sample_rate(part.search, seed=seed).under(UnknownShifts.of(self, seed, part))
 
     def of_days(self, days: float) -> Survey:
         """Return the survey of at most the first `days` star-days of the stare."""

@@ -163,7 +163,7 @@ def frame_nuisances(
         One frame.
     stare : Stare
     more : mapping of str to float, or Nuisances, optional
-        Standard deviations by name (infinite: projected out), which replace jitters of the same kind.
+        Standard deviations by name, which replace jitters of the same kind; an infinite one is projected out.
     """
     names = {"light": "light", "sky": "sky", "temperature": "dark"}
     jitters = {names[of]: sd for of, sd in stare.jitters.items() if sd > 0}

@@ -72,18 +72,18 @@ class Trend:
         return cls(frames, frame_s, variance, of, curves, directions["star"], sky, dark, slope_per_c)
 
     @cached_property
-    def far(self) -> Float:
+    def extremes(self) -> Float:
         """Amplitudes of `REACH` standard deviations, together and each alone, with both signs, (n, n_unknown)."""
         rows = np.vstack([np.eye(len(self.of)), np.ones(len(self.of))])
         return np.asarray(REACH * np.vstack([rows, -rows]))
 
     @cached_property
-    def bends(self) -> bool:
+    def is_nonlinear(self) -> bool:
         """True if the effect of unknowns beyond first order is significant."""
-        beyond = self.beyond(self.far)
-        return bool((np.sum(beyond**2 / self.variance[:, None], axis=(1, 2)) > LEAST**2).any())
+        nonlinear = self.nonlinear_effect(self.extremes)
+        return bool((np.sum(nonlinear**2 / self.variance[:, None], axis=(1, 2)) > LEAST**2).any())
 
-    def moved(self, amplitudes: Float) -> Float:
+    def effect(self, amplitudes: Float) -> Float:
         """Return the effect of unknowns on the sums, (n_stare, n_frame, n_sum).
 
         Parameters
@@ -109,10 +109,10 @@ class Trend:
         left = np.array(sums, np.float64)
         # One stare at a time, since the rounding of matrix products may depend on the number of stares.
         for one in left:
-            one -= self.beyond(self.fitted(one[None]))[0]
+            one -= self.nonlinear_effect(self.fitted(one[None]))[0]
         return left
 
-    def beyond(self, amplitudes: Float) -> Float:
+    def nonlinear_effect(self, amplitudes: Float) -> Float:
         """Return the effect of unknowns less its linear part, (n_stare, n_frame, n_sum).
 
         Parameters
@@ -122,7 +122,7 @@ class Trend:
         """
         linear = np.array([self._linear[of] for of in self.of])
         first = np.einsum("nu,ut,uk->ntk", amplitudes, self.curves, linear, optimize=True)
-        return np.asarray(self.moved(amplitudes) - first)
+        return np.asarray(self.effect(amplitudes) - first)
 
     def fitted(self, sums: Float) -> Float:
         """Return the most likely amplitudes, shape (n_stare, n_unknown), in standard deviations."""

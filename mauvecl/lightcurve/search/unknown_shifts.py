@@ -40,7 +40,7 @@ MAX_SHIFT = 60.0
 
 
 @dataclass(frozen=True, eq=False)
-class Scatter:
+class UnknownShifts:
     """Scatter and shift of templates' values for drawn conditions."""
 
     scales: Float  # standard deviations of values at some times and all temperatures, nominally 1, shape (n_draw, n)
@@ -49,7 +49,7 @@ class Scatter:
     shares: Float  # shares of templates with each mean, shape (n_draw, n_shift)
 
     @classmethod
-    def of(cls, survey: Survey, seed: int, part: Survey | None = None) -> Scatter:
+    def of(cls, survey: Survey, seed: int, part: Survey | None = None) -> UnknownShifts:
         """Draw the unknowns of a stare and compute scatter and shift of templates' values.
 
         Parameters
@@ -90,11 +90,11 @@ class Scatter:
         return cls(scales[some], weights / weights.sum(), *_shifts(searched, z[some]))
 
     @property
-    def known(self) -> bool:
+    def is_nominal(self) -> bool:
         """True if scatter and shift are as the search assumes."""
         return bool(np.abs(self.scales - 1).max() < NEGLIGIBLE and not self.shifts.any())
 
-    def alarmed(self, threshold: float, days: float, rate: Callable[[Float], Float]) -> Float:
+    def alarm_probability(self, threshold: float, days: float, rate: Callable[[Float], Float]) -> Float:
         """Return the probability of an alarm in each draw, shape (n_draw,).
 
         Parameters
@@ -120,7 +120,7 @@ def _shifted(survey: Survey) -> bool:
     """Return whether unknowns of several standard deviations shift a template's value."""
     if survey.unknowns is None:
         return False
-    return bool(survey.search.largest(survey.left(survey.unknowns.far)).maximum.max() > MIN_SHIFT)
+    return bool(survey.search.largest(survey.unsubtracted(survey.unknowns.extremes)).maximum.max() > MIN_SHIFT)
 
 
 def _shifts(survey: Survey, amplitudes: Float) -> tuple[Float, Float]:
@@ -129,7 +129,7 @@ def _shifts(survey: Survey, amplitudes: Float) -> tuple[Float, Float]:
     shares = np.zeros((len(amplitudes), bins.size))
     weights = TemplateGrid.from_bank(survey.bank).peak_probabilities(WEIGHTING_THRESHOLD)
     for draw, amplitude in enumerate(amplitudes):
-        for (row, rho), weight in zip(survey.search.values(survey.left(amplitude[None])), weights, strict=True):
+        for (row, rho), weight in zip(survey.search.values(survey.unsubtracted(amplitude[None])), weights, strict=True):
             means = rho[0][:, row.per_amplitude > 0]
             place = np.clip(np.rint((means + MAX_SHIFT) / SHIFT_STEP), 0, bins.size - 1).astype(np.int64)
             each = np.broadcast_to(weight[:, None], means.shape)

@@ -46,10 +46,10 @@ class Yield:
     def of(cls, rates: Rates, completeness: Completeness, days: float) -> Yield:
         """Compute the yield from flare rates, completeness and observed days; energies must be in the same band."""
         expected = recovered_per_day(rates, completeness) * _checked(days)
-        return cls.about(expected, rates.scatter_dex)
+        return cls.of_expected(expected, rates.scatter_dex)
 
     @classmethod
-    def about(cls, expected: float, scatter_dex: float) -> Yield:
+    def of_expected(cls, expected: float, scatter_dex: float) -> Yield:
         """Compute the yield from the expected number and the scatter of its logarithm."""
         # Many quantiles are needed, since the Poisson distribution may be narrower than the scatter.
         nodes = stats.norm.ppf((np.arange(NODES) + 0.5) / NODES) if scatter_dex > 0 else np.zeros(1)
@@ -91,7 +91,7 @@ def _checked(days: float) -> float:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedPowerLaw:
     """Power law fitted to recovered flares."""
 
     alpha: float
@@ -113,7 +113,7 @@ def fit_power_law(
     *,
     error_dex: float = 0.0,
     bias_dex: float = 0.0,
-) -> Fitted:
+) -> FittedPowerLaw:
     """Estimate exponent and rate of flares from recovered energies by maximum likelihood.
 
     Recovered energies are a Poisson process of density days * dN/dlogE * completeness, blurred by the error of a
@@ -164,7 +164,7 @@ def fit_power_law(
     alpha = float(optimize.minimize_scalar(cost, bounds=EXPONENTS, method="bounded", options={"xatol": 1e-7}).x)
     log10_rate = float(np.log10(logs.size / (days * step * seen(alpha).sum())))
     covariance = np.linalg.inv(_curvature(lambda one: cost(one[0], one[1]), np.array([alpha, log10_rate])))
-    return Fitted(
+    return FittedPowerLaw(
         alpha=alpha,
         alpha_sd=float(np.sqrt(covariance[0, 0])),
         log10_rate=log10_rate,

@@ -1,1 +1,1 @@
-"""Hours at one star, frame by frame: what is known of each frame, what is drawn of it, what adds up."""
+"""Stares, continuous observations of one star: conditions of frames, simulated sums, and measurements."""

@@ -1,8 +1,9 @@
 """Joint fit of a flare's shape and spectrum along a stare, with a temperature that falls.
 
-The frames are reduced to the weighted sums that hold the spectra of all temperatures (`results.measurements`). Their
-means are those of one `Event` with `Cooling`; their covariances are those of the fitted flare, so that fits are
-repeated with the covariances of the one before. Unknown levels that last through the stare are marginalised over.
+Frames are reduced to weighted sums that are sufficient for spectra of all temperatures (`results.measurements`). The
+model of their means is one `Event` with `Cooling`. Their covariances depend on the fitted flare, so that each fit is
+repeated with the covariances of the previous one. Unknown levels that are constant over the stare are marginalised
+over.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ Float = NDArray[np.float64]
 
 #: Parameters, all but the first as logarithms; the temperature at the end is relative to that at the peak.
 PARAMETERS = ("peak time", "half width", "amplitude", "temperature", "end temperature", "cooling time")
-#: Fits after the first one, each with the covariances of the one before.
+#: Number of fits after the first, each with the covariances of the previous fit.
 REFITS = 3
 #: Reach of the search for the end of an interval, in standard errors.
 REACH = 12.0
@@ -49,7 +50,7 @@ DIFFERENCE = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class _Data:
-    """Sums of frames less what is known, and what they are compared with."""
+    """Sums of frames less their known means, and their covariances."""
 
     sums: Float  # shape (n_frame, n_sum)
     edges: Float  # starts and ends of frames, s, shape (n_frame, 2)
@@ -90,7 +91,7 @@ class _Data:
         if not len(self.unknown):
             return inverse, np.zeros((0, self.sums.size))
         spectra = np.einsum("tij,uj->tiu", inverse, self.unknown).reshape(self.sums.size, -1)
-        # A prior is another datum; it stays outside of the residuals because its mean is zero.
+        # The prior acts as one more datum, which is not among the residuals because its mean is zero.
         scale = np.linalg.cholesky(spectra.T @ spectra + np.diag(self.prior**-2.0))
         return inverse, np.linalg.solve(scale, spectra.T)
 
@@ -133,28 +134,28 @@ def fit_cooling(
     model : FlareModel
         A blackbody, of one frame.
     nuisances : Nuisances, optional
-        Unknown amplitudes of known spectra, of one frame; they last through the stare.
+        Unknown amplitudes of known spectra, for one frame; they are constant over the stare.
     peak_s, half_width_s : float
-        Where the fit starts, such as what a search found.
+        Starting point of the fit, such as the result of a search.
     shape : str
     cooling : bool
-        Whether the temperature falls from the peak on, as that of `Cooling`; constant otherwise.
+        Whether the temperature falls after the peak, as in `Cooling`; constant otherwise.
     stare : Stare, optional
-        Times of the frames and what is known of their conditions; frames without gaps and changes by default.
+        Times and known conditions of the frames; frames without gaps and changes by default.
     levels : sequence of float
         Nominal coverage of the intervals, by profile likelihood.
 
     Returns
     -------
     Measurement
-        Of one row: peak time, half width, amplitude, temperature at the peak, and with `cooling` temperature at the
-        end and cooling time; fluences, and with the model's distance energies, within the frames. Chi-squared is that
-        of the frames' sums.
+        One row with peak time, half-width, amplitude, and temperature at the peak; with `cooling`, also the final
+        temperature and the cooling time; fluences within the frames, and energies if the model has a distance.
+        Chi-squared is that of the frames' sums.
 
     Raises
     ------
     InputError
-        For frames of another shape, a model with a jump or lines, or a stare without light of the flare.
+        If the frames have another shape, the model has a jump or lines, or the stare contains no light of the flare.
     """
     if len(model.linear) > 1:
         raise InputError(f"a model of {', '.join(model.linear)}", "a blackbody alone", key="model", value=model.linear)
@@ -205,7 +206,7 @@ def fit_cooling(
 def _data(
     raw: Float, quiet: Expectation, model: FlareModel, nuisances: Nuisances | None, stare: Stare, shape: Shape
 ) -> _Data:
-    # The unknowns are parameters of the stare, so that the weights of a frame do not remove them.
+    # The unknowns are parameters of the stare, so the weights of single frames do not remove them.
     reduction = Reduction.of(model, quiet)
     weights, strengths = reduction.weights, known_strengths(stare, quiet)
     means = np.vstack([quiet.net_source_dn, quiet.sky_dn, quiet.dark_dn, quiet.bias_dn])
@@ -220,7 +221,7 @@ def _data(
 
 
 def _start(data: _Data, peak_s: float, half_width_s: float, cooling: bool) -> Float:
-    """Return a start with the amplitude and temperature that fit best at the given peak and half width."""
+    """Return starting parameters: the best amplitude and temperature at the given peak and half-width."""
     rise = data.light * data.shape.mean_over(data.edges, peak_s, half_width_s)
     power = float(np.sqrt(np.sum(rise**2)))
     if not power > 0.0:
@@ -246,7 +247,7 @@ def _limits(model: FlareModel, stare: Stare) -> tuple[Float, Float]:
 def _solve(
     data: _Data, whitening: tuple[Float, Float], theta: Float, free: NDArray[np.intp], low: Float, high: Float
 ) -> Float:
-    """Return the parameters of least squares, those that are not free as they are."""
+    """Return the least-squares parameters; fixed ones are unchanged."""
     scale = np.where(free == 0, np.exp(theta[1]), 1.0)
 
     def residuals(values: Float) -> Float:
@@ -264,7 +265,7 @@ def _solve(
 
 
 def _derivative(function: Callable[[Float], Float], theta: Float, free: NDArray[np.intp]) -> Float:
-    """Return the derivatives of a function by the free parameters, shape (n, n_free)."""
+    """Return the derivatives of a function with respect to the free parameters, shape (n, n_free)."""
     columns = []
     for k in free:
         step = np.zeros(theta.size)
@@ -274,7 +275,7 @@ def _derivative(function: Callable[[Float], Float], theta: Float, free: NDArray[
 
 
 def _quantities(data: _Data, stare: Stare, cooling: bool) -> list[tuple[str, str, Callable[[Float], float], int]]:
-    """Return names, units, functions of the parameters, and the parameter that sets each."""
+    """Return for each quantity its name, unit, function of the parameters, and the parameter that sets it."""
     found: list[tuple[str, str, Callable[[Float], float], int]] = [
         ("peak time", "s", lambda x: float(x[0]), 0),
         ("half width", "s", lambda x: float(np.exp(x[1])), 1),
@@ -315,13 +316,13 @@ def _end(
 ) -> float:
     """Return the end of a profile interval on one side; infinite if chi-squared does not rise that far.
 
-    The quantity is held by the parameter `place`: itself, or the amplitude that gives a quantity linear in it.
+    The parameter `place` holds the quantity fixed: it is the quantity, or the amplitude if that is proportional to it.
     """
     rest = free[free != place]
     centre, there = value(theta), theta
 
     def held(log_factor: float, theta: Float) -> Float:
-        """Return parameters with the quantity moved: by a difference for the peak, by a factor otherwise."""
+        """Return parameters with a changed quantity: by a difference for the peak, otherwise by a factor."""
         target = centre + log_factor if place == 0 else centre * np.exp(log_factor)
         moved = theta.copy()
         if place == 0:

@@ -152,12 +152,14 @@ class LightCurves:
     element_nm: Float
 
 
-def draw_light_curves(staring: StareExpectation, bands_nm: Sequence[tuple[float, float]], draw: Draw) -> LightCurves:
+def draw_light_curves(
+    expectation: StareExpectation, bands_nm: Sequence[tuple[float, float]], draw: Draw
+) -> LightCurves:
     """Draw a stare in bands and resolution elements, all from the same pixels.
 
     Parameters
     ----------
-    staring : StareExpectation
+    expectation : StareExpectation
     bands_nm : sequence of (float, float)
         Wavelengths, nm; the upper limit is excluded, and saturated pixels are not used.
     draw : callable
@@ -168,7 +170,7 @@ def draw_light_curves(staring: StareExpectation, bands_nm: Sequence[tuple[float,
     InputError
         If a band contains no pixel.
     """
-    quiet, used = staring.quiet, staring.used.astype(np.float64)
+    quiet, used = expectation.quiet, expectation.used.astype(np.float64)
     rows = []
     for low, high in bands_nm:
         row = used * ((quiet.wavelength_nm >= low) & (quiet.wavelength_nm < high))
@@ -177,10 +179,12 @@ def draw_light_curves(staring: StareExpectation, bands_nm: Sequence[tuple[float,
         rows.append(row)
     elements = used * (quiet.element == np.arange(quiet.element_wavelength_nm.size)[:, None])
     filled = np.flatnonzero(elements.any(axis=1))
-    spectrum, spectrum_sd, spectrum_mean = staring.net(elements[filled], draw, np.float32)
+    spectrum, spectrum_sd, spectrum_mean = expectation.net(elements[filled], draw, np.float32)
     # Each pixel belongs to one element, so their sum is the whole range.
-    whole = spectrum.sum(axis=1, dtype=np.float64), *staring.expected(used[None])
-    parts = staring.net(np.array(rows).reshape(len(rows), used.size), draw) if rows else np.zeros((3, len(whole[0]), 0))
+    whole = spectrum.sum(axis=1, dtype=np.float64), *expectation.expected(used[None])
+    parts = (
+        expectation.net(np.array(rows).reshape(len(rows), used.size), draw) if rows else np.zeros((3, len(whole[0]), 0))
+    )
     flux, sd, mean = (np.column_stack(both) for both in zip(whole, parts, strict=True))
     low, high = quiet.wavelength_nm[[0, -1]]
     return LightCurves(

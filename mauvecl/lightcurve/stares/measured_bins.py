@@ -30,13 +30,13 @@ Float = NDArray[np.float64]
 
 #: Bins span at most this many frames, which bounds the time that the search for them takes.
 MOST_FRAMES_PER_BIN = 4096
-#: Temperatures tried for the filter that chooses the bins: one in this many of the model's.
+#: Every n-th temperature of the model is tried for the filter that chooses the bins.
 EVERY = 8
 #: Bins whose known conditions agree to this many digits are fitted together.
 DIGITS = 6
 
 
-#: Heading, format and heading of the error of the quantities that people read.
+#: Heading, format and heading of the error of quantities in printed tables.
 SHOWN = {
     "temperature": ("temperature (K)", ".0f", "error"),
     "flux_bolometric": ("bolometric flux (erg/s/cm2)", ".3g", ""),
@@ -78,7 +78,7 @@ class MeasuredBins:
             *(column for q in range(len(found.names)) for column in self._quantity(q)),
             Column("chi2", "found.chi2", "", f"chi-squared of the fit, of {found.dof} degrees of freedom"),
             Column("p_value", "found.p_value", "",
-                   "probability of a chi-squared at least as large where the model is right", "p-value", ".2g"),
+                   "probability of a chi-squared at least as large if the model is correct", "p-value", ".2g"),
         ]  # fmt: skip
 
     def _quantity(self, q: int) -> list[Column]:
@@ -118,11 +118,11 @@ def measure_along(
 ) -> MeasuredBins:
     """Measure a flare against time, in bins of consecutive frames in which it reaches an S/N.
 
-    Each bin is the shortest run of frames, after the bin before, in which a matched filter reaches `snr_per_bin`; its
-    frames are added up and fitted as one exposure (`fit`). Frames without enough light, before, between and after
-    flares, are in no bin. The filter has the temperature that fits the brightest part of the stare. Since the noise,
-    too, decides where a bin ends, amplitudes are too large by about one error over `snr_per_bin`; below an S/N of 8,
-    noise alone makes bins now and then.
+    Each bin is the shortest run of frames after the previous bin in which a matched filter reaches `snr_per_bin`; its
+    frames are added up and fitted as one exposure (`fit`). Frames without enough light before, between and after
+    flares are not in any bin. The filter has the temperature that fits the brightest part of the stare. Since noise
+    also decides where a bin ends, amplitudes are biased high by about one standard error over `snr_per_bin`; below an
+    S/N of 8, noise alone occasionally produces bins.
 
     Parameters
     ----------
@@ -131,27 +131,27 @@ def measure_along(
     quiet : Expectation
         One frame of the quiescent star.
     model : FlareModel
-        Of one frame.
+        Model of one frame.
     nuisances : Nuisances, optional
-        Unknown amplitudes of known spectra, of one frame. They are constant within a bin, and each bin has its own.
+        Unknown amplitudes of known spectra, for one frame; each bin has its own constant amplitudes.
     snr_per_bin : float
     stare : Stare, optional
-        Times of the frames and what is known of their conditions; frames without gaps and changes by default. No bin
-        extends over a gap.
+        Times and known conditions of the frames; frames without gaps and changes by default. Bins do not extend
+        over gaps.
     levels : sequence of float
         Nominal coverage of the intervals.
 
     Raises
     ------
     InputError
-        For frames of another shape, an expectation of several frames, or a stare in which no bin reaches the S/N.
+        If the frames have another shape, the expectation has several frames, or no bin reaches the S/N.
     """
     raw, stare = checked_frames(frames, quiet, stare)
     if not 0.0 < snr_per_bin < np.inf:
         raise InputError.of("snr_per_bin", snr_per_bin, "a number above 0")
     bins = _bins(raw, quiet, model, nuisances, known_strengths(stare, quiet), stare, snr_per_bin)
     if not bins:
-        raise InputError.of("snr_per_bin", snr_per_bin, "one that some bin of the stare reaches")
+        raise InputError.of("snr_per_bin", snr_per_bin, "an S/N that a bin of the stare reaches")
     first, end = np.array(bins).T
     return fit_bins(raw, quiet, model, nuisances, stare, first, end - first, levels)
 
@@ -235,7 +235,7 @@ def _bins(
     node = int(np.argmax(np.max(best, axis=0)))
     light = model.hot[::EVERY][node]
     weights = shapes[node] @ reduction.weights
-    # A frame's value has a variance of one, and in proportion to the flare's light that of its photons.
+    # The variance of a frame's value is one plus that of the flare's photons, which is proportional to its light.
     per_value = float(weights**2 @ (quiet.gain_dn_per_electron * light) / (weights @ light))
     value = total @ shapes[node]
     bins = []

@@ -41,8 +41,8 @@ class StareUnknown:
     curve: Float  # effect of unit amplitude on each frame, shape (n_frame,)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "curve", _kept(self.curve))
-        _check_of(self.name, self.of)
+        object.__setattr__(self, "curve", _read_only(self.curve))
+        _check_quantity(self.name, self.of)
         _check_spread(self.name, self.of, self.sd)
 
 
@@ -97,7 +97,7 @@ class Stare:
 
     def __post_init__(self) -> None:
         for name in ("start_s", "star", "light", "sky", "temperature_c"):
-            object.__setattr__(self, name, _kept(getattr(self, name)))
+            object.__setattr__(self, name, _read_only(getattr(self, name)))
         n = self.start_s.size
         if not 1 <= n <= MOST_FRAMES:
             raise InputError.of("n_frames", n, f"1 to {MOST_FRAMES}")
@@ -188,7 +188,7 @@ class Stare:
         if count > MOST_FRAMES:
             raise InputError.of("duration_s", duration_s, f"at most {MOST_FRAMES} frames", unit="s")
         start: Float = np.arange(max(1, int(count)), dtype=np.float64) * float(frame_s)
-        start = start[_outside(gaps, start, float(frame_s))]
+        start = start[_frames_outside_gaps(gaps, start, float(frame_s))]
         if not start.size:
             raise InputError.of("gaps", gaps, f"gaps that leave a frame of {duration_s:g} s")
 
@@ -264,7 +264,7 @@ class Stare:
         return np.asarray(np.exp(slope * (self.temperature_c - at)))
 
 
-def _outside(gaps: Sequence[tuple[float, float]], start: Float, frame_s: float) -> NDArray[np.bool_]:
+def _frames_outside_gaps(gaps: Sequence[tuple[float, float]], start: Float, frame_s: float) -> NDArray[np.bool_]:
     """Return which frames do not overlap a gap."""
     # The tolerance keeps a frame that starts at the end of a gap.
     kept, tolerance = np.ones(start.size, np.bool_), 1e-9 * frame_s
@@ -293,13 +293,13 @@ def _unknowns(
     return tuple(unknowns)
 
 
-def _kept(values: Float) -> Float:
+def _read_only(values: Float) -> Float:
     kept = np.array(values, np.float64)
     kept.setflags(write=False)
     return kept
 
 
-def _check_of(name: str, of: str) -> None:
+def _check_quantity(name: str, of: str) -> None:
     if of not in CHANGING:
         raise InputError.of("of", of, f"one of {', '.join(CHANGING)}")
 

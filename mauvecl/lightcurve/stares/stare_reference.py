@@ -39,10 +39,10 @@ def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int) -> dic
     dict of str to ndarray of float32, shape (n_stare,)
     """
     moved = {str(name): np.zeros(len(numbers), np.float32) for name in layout.MOVED}
-    if scene.staring["jittered"]:
+    if scene.stare_job["jittered"]:
         drawn = four_normals(reference.words_at(numbers, int(scene.numbers[frame]), "stare_frame", 0, seed))
         for name, z in zip(("light", "sky", "temperature"), drawn, strict=False):
-            moved[name] = z * scene.staring[f"{name}_jitter"]
+            moved[name] = z * scene.stare_job[f"{name}_jitter"]
     for u, kind in enumerate(scene.kinds):
         name = layout.MOVED[kind]
         z = four_normals(reference.words_at(numbers, 0, "stare_unknown", u // 4, seed))[u % 4]
@@ -52,7 +52,7 @@ def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int) -> dic
     return {
         "star": fma(star, combine_factors(light, moved["star"]), star_less_one),
         "sky": fma(sky, combine_factors(light, moved["sky"]), sky_less_one),
-        "dark": fma(dark, exponential_less_one(moved["temperature"] * scene.staring["dark_slope"]), dark_less_one),
+        "dark": fma(dark, exponential_less_one(moved["temperature"] * scene.stare_job["dark_slope"]), dark_less_one),
         "light": light,
     }
 
@@ -88,14 +88,14 @@ def pixels(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable
     """
     out = []
     for frame in frames:
-        met = strengths(scene, numbers, frame, seed)
+        conditions = strengths(scene, numbers, frame, seed)
         sums = np.zeros((len(flares.amplitudes), 4, len(scene.weights), len(numbers)), np.float32)
         for group in range(len(scene.mixtures) // 4):
             drawn = reference.draws(scene.scene, numbers, int(scene.numbers[frame]), group, seed)
             for i, p in enumerate(range(4 * group, 4 * group + 4)):
                 for k in range(len(flares.amplitudes)):
-                    flare = _coefficients(scene, flares, frame, k, met["light"])
-                    v = _count(scene, p, drawn.z[i], met, flare)
+                    flare = _coefficients(scene, flares, frame, k, conditions["light"])
+                    v = _count(scene, p, drawn.z[i], conditions, flare)
                     for electrons in drawn.added.values():
                         v = fma(electrons[i], scene.scene.pixels[p]["electron_gain"], v)
                     x = reference.digitise(v, scene.scene.edges[0, p], clip=scene.scene.clip)
@@ -106,10 +106,10 @@ def pixels(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable
     return np.moveaxis(np.array(out), (0, 1, 2, 3), (2, 0, 3, 1))
 
 
-def _count(scene: StareScene, p: int, z: Floats, met: dict[str, Floats], flare: list[Floats]) -> Floats:
+def _count(scene: StareScene, p: int, z: Floats, conditions: dict[str, Floats], flare: list[Floats]) -> Floats:
     """Return the count of a pixel above its base, before the ADC."""
     m, one = scene.mixtures[p], np.float32(1.0)
-    light, dark = fma(met["star"], m["star"], met["sky"] * m["sky"]), met["dark"]
+    light, dark = fma(conditions["star"], m["star"], conditions["sky"] * m["sky"]), conditions["dark"]
     for coefficient, spectrum in zip(flare, scene.spectra, strict=True):
         light = fma(coefficient, spectrum[p], light)
     variance = fma(light, m["photon_variance"], fma(dark, m["dark_variance"], m["variance"]))
@@ -144,14 +144,14 @@ def sums(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[i
     table = SumTable.of(scene.components)
     out = []
     for frame in frames:
-        met = strengths(scene, numbers, frame, seed)
+        conditions = strengths(scene, numbers, frame, seed)
         z: list[Floats] = []
         for group in range(-(-len(scene.weights) // 4)):
             z += four_normals(reference.words_at(numbers, int(scene.numbers[frame]), "stare_sums", group, seed))
         rows = []
         for k in range(len(flares.amplitudes)):
-            flare = _coefficients(scene, flares, frame, k, met["light"])
-            rows.append(_sums(scene, table, z, met, flare))
+            flare = _coefficients(scene, flares, frame, k, conditions["light"])
+            rows.append(_sums(scene, table, z, conditions, flare))
         out.append(rows)
     return np.moveaxis(np.array(out), (0, 1, 2, 3), (2, 0, 3, 1))
 
@@ -166,16 +166,16 @@ def _chain(terms: Iterable[tuple[Floats, Floats]]) -> Floats:
 
 
 def _sums(
-    scene: StareScene, table: SumTable, z: list[Floats], met: dict[str, Floats], flare: list[Floats]
+    scene: StareScene, table: SumTable, z: list[Floats], conditions: dict[str, Floats], flare: list[Floats]
 ) -> list[Floats]:
     n = len(scene.weights)
     pairs = unique(n, 2)
     place = {key: i for i, key in enumerate(key for order in (1, 2, 3, 4) for key in unique(n, order))}
-    lit = [(met["star"], 1), (met["sky"], 2), *((f, 4 + j) for j, f in enumerate(flare))]
+    lit = [(conditions["star"], 1), (conditions["sky"], 2), *((f, 4 + j) for j, f in enumerate(flare))]
 
     def cumulant(key: tuple[int, ...], light: bool = True) -> Floats:
         total = np.full_like(z[0], table.rows[0, place[key]])
-        for strength, row in [(met["dark"], len(STEADY)), *(lit if light else [])]:
+        for strength, row in [(conditions["dark"], len(STEADY)), *(lit if light else [])]:
             total = fma(strength, table.rows[row, place[key]], total)
         return total
 

@@ -104,7 +104,7 @@ class StareScene:
     known: Floats  # rows of `layout.KNOWN_OF_FRAMES`, shape (7, n_padded_frame)
     curves: Floats  # of the stare's unknowns, times their standard deviations, shape (n_unknown, n_padded_frame)
     kinds: NDArray[np.uint32]  # rows of `layout.MOVED`, shape (n_unknown,)
-    staring: NDArray[np.void]  # of `layout.STARING`, without the values of flares, shape ()
+    stare_job: NDArray[np.void]  # of `layout.STARE_JOB`, without the values of flares, shape ()
     mixtures: NDArray[np.void]  # of `layout.MIXTURE`, shape (n_padded,)
     spectra: Floats  # DN of flares of unit amplitude, shape (n_flare, n_padded)
     weights: Floats  # shape (n_statistic, n_padded)
@@ -127,7 +127,7 @@ class StareScene:
             raise InputError(f"{name} is a prior of exposures", "an unknown of the stare", key=name)
         scene = prepare([x], processes=processes)
         if not scene.joint:
-            raise _apart(x.name)
+            raise _not_joint_error(x.name)
         size = padded(n_pixel)
         mixtures = np.zeros(size, layout.MIXTURE)
         mixtures["variance"] = 1.0
@@ -148,12 +148,12 @@ class StareScene:
         weights = np.zeros((components.n_statistics, size), np.float32)
         weights[:, :n_pixel] = components.weights
         constants = weights[:, :n_pixel].astype(np.float64) @ (scene.base_dn[0] - x.mean_raw_dn)
-        staring = np.zeros((), layout.STARING)
-        staring["frame_count"], staring["padded_frames"] = stare.n_frames, padded_frames(stare.n_frames)
-        staring["unknown_count"], staring["jittered"] = len(stare.unknowns), any(stare.jitters.values())
-        staring["light_jitter"], staring["sky_jitter"] = stare.light_jitter, stare.sky_jitter
-        staring["temperature_jitter"] = stare.temperature_jitter_c
-        staring["dark_slope"] = x.conditions["dark_slope_per_c"]
+        stare_job = np.zeros((), layout.STARE_JOB)
+        stare_job["frame_count"], stare_job["padded_frames"] = stare.n_frames, padded_frames(stare.n_frames)
+        stare_job["unknown_count"], stare_job["jittered"] = len(stare.unknowns), any(stare.jitters.values())
+        stare_job["light_jitter"], stare_job["sky_jitter"] = stare.light_jitter, stare.sky_jitter
+        stare_job["temperature_jitter"] = stare.temperature_jitter_c
+        stare_job["dark_slope"] = x.conditions["dark_slope_per_c"]
         curves = np.reshape([u.sd * u.curve for u in stare.unknowns], (len(stare.unknowns), stare.n_frames))
         return cls(
             components,
@@ -163,7 +163,7 @@ class StareScene:
             _known(components, stare),
             _padded(curves, np.float32),
             np.array([layout.MOVED.index(u.of) for u in stare.unknowns], np.uint32),
-            staring,
+            stare_job,
             mixtures,
             spectra,
             weights,
@@ -176,11 +176,11 @@ class StareScene:
         return self.components.quiet.photon_noise == "poisson"
 
     def stare_struct(self, flares: Flares) -> NDArray[np.void]:
-        """Return the `layout.STARING` structure with the values of flares, shape (1,)."""
-        staring = self.staring.copy()
-        staring["scenario_count"], staring["amplitude_rows"] = flares.amplitudes.shape
-        staring["flare_rows"] = len(flares.given)
-        return staring.reshape(1)
+        """Return the `layout.STARE_JOB` structure with the values of flares, shape (1,)."""
+        stare_job = self.stare_job.copy()
+        stare_job["scenario_count"], stare_job["amplitude_rows"] = flares.amplitudes.shape
+        stare_job["flare_rows"] = len(flares.given)
+        return stare_job.reshape(1)
 
     def job(self, seed: int) -> NDArray[np.void]:
         """Return the job of a frame with a seed, shape (1,)."""
@@ -216,7 +216,7 @@ class StareScene:
         ends = []
         for sign, of in ((-1.0, np.min), (1.0, np.max)):
             light, star, sky = (1.0 + sign * REACH_SIGMA * spread[name] for name in ("light", "star", "sky"))
-            warm = np.exp(sign * REACH_SIGMA * abs(self.staring["dark_slope"]) * spread["temperature"])
+            warm = np.exp(sign * REACH_SIGMA * abs(self.stare_job["dark_slope"]) * spread["temperature"])
             known = (stare.light * stare.star * light * star, stare.light * stare.sky * light * sky)
             dark = stare.dark_factor(self.components.quiet) * warm
             ends.append(np.array([float(of(values)) for values in (*known, dark, stare.light * light)]))
@@ -237,7 +237,7 @@ class StareScene:
             if (REACH_SIGMA * spread[of] >= 1.0).any():
                 raise InputError(
                     f"the {of} of a frame scatters by {float(spread[of].max()):.3g}",
-                    f"less than {1 / REACH_SIGMA:.3g}, lest it be drawn below zero",
+                    f"less than {1 / REACH_SIGMA:.3g}, so that it is never drawn below zero",
                     key=of,
                     value=float(spread[of].max()),
                 )
@@ -258,9 +258,9 @@ class StareScene:
         for light, dark in self.extremes(flares):
             photons = light / x.gain_dn_per_electron
             other = x.read_noise_dn**2 + (0.0 if self.counts else x.gain_dn_per_electron * light)
-            met = replace(one, gaussian=other, photons=photons, dark_dn=dark * one.dark_dn)
-            if not joint_is_exact(met).all():
-                raise _apart(x.name)
+            changed = replace(one, gaussian=other, photons=photons, dark_dn=dark * one.dark_dn)
+            if not joint_is_exact(changed).all():
+                raise _not_joint_error(x.name)
 
 
 def padded_frames(n_frames: int) -> int:
@@ -290,10 +290,10 @@ def _known(components: Components, stare: Stare) -> Floats:
     return np.asarray(_padded(np.stack([*changes, stare.light]), np.float32))
 
 
-def _apart(name: str) -> InputError:
+def _not_joint_error(name: str) -> InputError:
     return InputError(
         f"the noise of a frame of {name} cannot be drawn jointly under all conditions of the stare",
-        "Gaussian noise of 1.5 Poisson counts and more in each pixel, more where counts are few",
+        "Gaussian noise with the variance of at least 1.5 Poisson counts in each pixel, and more where counts are few",
         key="recipe",
         value="joint",
     )
