@@ -219,7 +219,7 @@ def test_saturated_flare_is_reported(stares):
 def test_unused_settings_are_reported(stares):
     told = stare(SHORT.with_settings(["observation.exposure_s=20", "events=[{peak_s=310}, {peak_s=200}]"]), stares)
     assert "A stare is made of frames of 5 s: observation.exposure_s = 20 s is not used." in told.messages
-    (line,) = (message for message in told.messages if "outside of the frames" in message)
+    (line,) = (message for message in told.messages if "outside the frames" in message)
     assert line.startswith("Flare 1 peaks at 310 s")
     plain = stare(SHORT.with_settings(["observation.exposure_s=5"]), stares)
     assert not any("not used" in message or "outside" in message for message in plain.messages)
