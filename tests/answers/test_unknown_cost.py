@@ -201,25 +201,26 @@ def test_priors_are_drawn_jointly_on_both_instruments() -> None:
 
 
 #: Draws of each scene, the false-alarm probability asked for, and scenes.
-DRAWS, FAP, SCENES = 20_000, 0.01, 100
+DRAWS, FAP, SCENES = 20_000, 0.01, 40
 SEEDS = itertools.count(2026)
 
 
 @pytest.mark.long
 def test_false_alarms_with_drawn_unknowns_are_as_requested(engine: Engine) -> None:
-    """100 random scenes with the documented unknowns drawn, 2e4 draws each.
+    """40 random scenes with the documented unknowns drawn, 2e4 draws each.
 
     Marginalised: the simulated threshold on fresh draws, for which its own error counts as much as theirs, for every
-    statistic; and what the closed form, which integrates over what is drawn, says of that threshold. Of 100 comparisons
-    each, one may leave 4 standard errors, which by chance happens in 1 run of 30; two would in 1 of 40 000. And all 100
-    together within 4 standard errors. Plain: by its usual threshold, which fails.
+    statistic; and what the closed form, which integrates over what is drawn, says of that threshold. Of 40 comparisons
+    each, one may leave 4 standard errors, which by chance happens in 1 run of 66; two would in 1 of 50 000. And all 40
+    together within 4 standard errors, a bias of 6 % of the false alarms. Plain, in the first ten scenes: by its usual
+    threshold, which fails.
     """
     rng = np.random.default_rng(16)
     statistics = ("chi2", "chi2_element", "matched")
     error = np.sqrt(FAP * (1 - FAP) / DRAWS)
     off: dict[str, list[float]] = {name: [] for one in statistics for name in (one, f"closed form of {one}")}
     failed = 0
-    for _ in range(SCENES):
+    for number in range(SCENES):
         temperature, magnitude = rng.uniform(13, 21), rng.uniform(6, 10)
         payload = instrument(str(rng.choice(["mauve", "mauve-electrons"])), part=True, temperature_c=temperature)
         star = Source.from_library(str(rng.choice(["G2V", "K3V", "M3V", "F5V"]))).at_magnitude(magnitude)
@@ -231,7 +232,6 @@ def test_false_alarms_with_drawn_unknowns_are_as_requested(engine: Engine) -> No
         marginal = {"statistics": statistics, "nuisances": choice.marginalised(quiet)}
         asked = DetectRequest.of(quiet, [flare], DRAWS, next(SEEDS), **marginal, **how)
         first, fresh = twice(engine, asked)
-        plain = engine.detect(quiet, [flare], realisations=DRAWS, seed=next(SEEDS), statistics="matched", **how)
         for name in statistics:
             cut = first.threshold(FAP, name).value
             alarms, expected = (
@@ -240,12 +240,15 @@ def test_false_alarms_with_drawn_unknowns_are_as_requested(engine: Engine) -> No
             )
             off[name].append((alarms - FAP) / (np.sqrt(2) * error))
             off[f"closed form of {name}"].append((alarms - expected) / error)
+        if number >= 10:
+            continue
+        plain = engine.detect(quiet, [flare], realisations=DRAWS, seed=next(SEEDS), statistics="matched", **how)
         usual = plain.closed_form("matched").isf(FAP)
         failed += abs(plain.false_alarm_probability(usual, "matched").value - FAP) > 4 * error
     for name, deviations in off.items():
         assert sum(abs(d) > 4 for d in deviations) <= 1, name
         assert abs(np.sum(deviations)) < 4 * np.sqrt(SCENES), name
-    assert failed == SCENES
+    assert failed == 10
 
 
 def test_table_has_a_picture(tmp_path: Path) -> None:

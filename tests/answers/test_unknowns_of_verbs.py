@@ -43,6 +43,8 @@ UNKNOWNS: dict[str, dict[str, Any]] = (
     }
 )
 FEW = {"realisations": 2000, "fap": 0.1, "seed": 2, "statistics": ["matched"]}
+#: A bank of two half-widths, whose threshold is the closed form.
+SEARCH: dict[str, Any] = {"half_widths_s": [20.0, 60.0], "nulls": 0}
 #: Sections that each verb needs.
 NEEDS: dict[str, dict[str, Any]] = {
     "snr": {"run": FEW | {"realisations": 200}},
@@ -55,8 +57,13 @@ NEEDS: dict[str, dict[str, Any]] = {
     },
     "limit": {"limit": {"of": "magnitude", "power": 0.5}},
     "measure": {"measure": {"fits": 50}},
-    "stare": {"stare": {"duration_s": 1200.0, "bands_nm": [[305.0, 350.0]]}},
-    "inject": {"stare": {"duration_s": 1200.0}, "injections": {"count": 20, "sizes": 2, "widths": 2}},
+    "stare": {"stare": {"duration_s": 300.0, "bands_nm": [[305.0, 350.0]]}, "search": SEARCH},
+    "inject": {
+        "stare": {"duration_s": 600.0},
+        "injections": {"count": 20, "sizes": 2, "widths": 2, "fitted": 0},
+        "search": SEARCH,
+    },
+    "gaussian": {"sweep": {"axes": [{"quantity": "exposure", "values": [50.0]}]}},
     "visible": {"orbit": {"targets": ["eps Eri"], "days": 2.0}},
     "plan": {"plan": {"targets": [{"name": "eps Eri"}], "completeness": "closed form"}, "orbit": {"days": 10.0}},
 }
