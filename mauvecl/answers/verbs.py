@@ -228,7 +228,7 @@ VERBS: dict[str, Verb] = {
 
     mauvecl measure --star M3V --magnitude 9 --amplitude 0.5 --sweep exposure=50,300 --distance 5 --radius 0.4
 
-    mauvecl measure --star M3V --magnitude 9 --amplitude 2 --snr-per-bin 20 --duration 1800 --distance 5
+    mauvecl measure --star M3V --magnitude 9 --amplitude 2 --snr-per-bin 20 --joint-fit --duration 1800 --distance 5
     """,
             ("flare", "measure", *STARE, *NUISANCES, *SIZE, "run.fap", "run.seed", "sweep"),
             counts="flares",

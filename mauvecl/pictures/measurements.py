@@ -7,20 +7,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.answers.measurements.expected import forecast_model
 from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import COLOURS, NULL, headline, styled_picture
-from mauvecl.results.measurements.fit import forecast
+from mauvecl.results.measurements.flare_model import FlareModel
 from mauvecl.results.measurements.reduction import variance_of
 from mauvecl.study.parts import First, note_of
 
 if TYPE_CHECKING:
-    from mauvecl.answers.measurements.along import MeasuredStare
+    from mauvecl.answers.measurements.along import JointFit, MeasuredStare
     from mauvecl.answers.measurements.measure import MeasureAnswer, MeasuredFlare
 
 #: Increases of chi-squared that enclose 68.27 and 95 % in two dimensions.
 RISES = (2.30, 5.99)
 #: Factors on the amplitude over which errors are plotted.
 FACTORS = np.geomspace(0.1, 10.0, 25)
+#: Half-widths before and after the peak of a flare that are plotted.
+BEFORE, AFTER = 3.0, 15.0
 #: Largest number of flares in a picture.
 MOST_FLARES = 4
 
@@ -39,10 +42,11 @@ def fits(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
     for (upper, lower), one in zip(axes.T, flares, strict=True):
         quiet, found = one.quiet, one.found
         mean, unknown = one.fitted_dn()
+        kelvin = " and ".join(f"{x:.0f} K" for x in np.atleast_1d(np.exp(found.log_k[0])))
         sums = [quiet.per_element(values) for values in (one.frame - unknown, mean, variance_of(quiet, mean)[0])]
         nm, noise = quiet.element_wavelength_nm, np.sqrt(sums[2])
         upper.errorbar(nm, sums[0], noise, fmt=".", color=NULL, label="exposure less star and unknowns")
-        upper.plot(nm, sums[1], color=COLOURS[0], label=f"fit: {found.estimates[0, 0]:.0f} K")
+        upper.plot(nm, sums[1], color=COLOURS[0], label=f"fit: {kelvin}")
         good = noise > 0
         lower.plot(nm[good], (sums[0] - sums[1])[good] / noise[good], ".", color=COLOURS[0])
         lower.axhline(0.0, color=NULL, linewidth=0.8)
@@ -53,7 +57,12 @@ def fits(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
     return figure
 
 
-@picture_of("MeasureAnswer", "contours", given=_few)
+def _single(answer: MeasureAnswer) -> tuple[Any, ...]:
+    single = [one for one in answer.flares if isinstance(one.fitted, FlareModel)]
+    return (First(single, MOST_FLARES, "flares"),)
+
+
+@picture_of("MeasureAnswer", "contours", given=_single, when=lambda answer: bool(_single(answer)[0]))
 @styled_picture
 def contours(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
     """Plot expected confidence regions of temperature and amplitude, with unknowns marginalised."""
@@ -99,13 +108,19 @@ def errors(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
     """Plot forecast errors of temperature and amplitude against the amplitude, with and without unknowns."""
     figure, axes = plt.subplots(1, len(flares), figsize=(3.4 * len(flares), 3.0), squeeze=False)
     for axis, one in zip(axes[0], flares, strict=True):
-        kelvin, linear = float(np.exp(one.perfect.log_k[0])), one.perfect.amplitudes[0]
+        log_k, linear = one.perfect.log_k[0], one.perfect.amplitudes[0]
         for unknown, line in {None: "--", one.unknown: "-"}.items():
-            ahead = [forecast(one.quiet, one.fitted, kelvin, factor * linear, unknown) for factor in FACTORS]
+            ahead = [forecast_model(one.quiet, one.fitted, log_k, factor * linear, unknown) for factor in FACTORS]
             for colour, q in zip(COLOURS, range(2), strict=False):
                 whose = "all known" if unknown is None else "unknowns free"
                 relative = [f.errors[q] / f.values[q] for f in ahead]
-                axis.plot(FACTORS * linear[0], relative, line, color=colour, label=f"{one.fitted.names[q]}, {whose}")
+                axis.plot(
+                    FACTORS * one.perfect.estimates[0, 1],
+                    relative,
+                    line,
+                    color=colour,
+                    label=f"{one.fitted.names[q]}, {whose}",
+                )
         axis.set(xscale="log", yscale="log", xlabel="amplitude", ylabel="relative error", title=one.name)
         axis.legend(loc="best")
     headline(figure, note_of(flares))
@@ -120,6 +135,7 @@ def temperatures(plt: Any, one: MeasuredStare) -> Any:
     Lines are the fits to the same frames without noise.
     """
     drawn, perfect = one.drawn, one.perfect
+    assert drawn is not None
     assert not isinstance(drawn, str)
     assert perfect is not None
     found = drawn.found
@@ -139,5 +155,28 @@ def temperatures(plt: Any, one: MeasuredStare) -> Any:
         axis.set(ylabel=f"{name} ({found.units[q]})" if found.units[q] else name, yscale="log")
         axis.set_ylim(0.5 * shown[shown > 0].min(), 2 * shown[shown > 0].max())
     axes[-1].set_xlabel("time from the start of the stare (s)")
+    headline(figure, f"{one.title}: one simulated stare; nominal throughput")
+    return figure
+
+
+@picture_of("MeasureAnswer", "joint", each=lambda answer: [(one, one.joint) for one in answer.stares if one.joint])
+@styled_picture
+def joint(plt: Any, one: MeasuredStare, fit: JointFit) -> Any:
+    """Plot the light of a flare in each frame, the joint fit of its shape and spectrum, residuals and temperature."""
+    stare, (event,), (drawn, mean) = one.staring.stare, one.events, (fit.fitted.drawn_dn, fit.fitted.mean_dn)
+    time = stare.start_s + stare.frame_s / 2
+    near = (time > event.peak_s - BEFORE * event.half_width_s) & (time < event.peak_s + AFTER * event.half_width_s)
+    figure, axes = plt.subplots(3, 1, figsize=(7.2, 6.4), sharex=True, height_ratios=(2, 1, 1.5))
+    axes[0].plot(time[near], drawn[near], ".", color=NULL, label="frames less star, sky and dark")
+    axes[0].plot(time[near], mean[near], color=COLOURS[0], label="joint fit")
+    axes[0].set(ylabel="DN per frame")
+    axes[1].plot(time[near], (drawn - mean)[near], ".", color=COLOURS[0])
+    axes[1].axhline(0.0, color=NULL, linewidth=0.8)
+    axes[1].set(ylabel="residual (DN)")
+    axes[2].plot(time[near], fit.true.kelvin[near], "--", color=NULL, label="simulated flare")
+    axes[2].plot(time[near], fit.fitted.kelvin[near], color=COLOURS[0], label="joint fit")
+    axes[2].set(ylabel="temperature (K)", xlabel="time from the start of the stare (s)")
+    for axis in axes[::2]:
+        axis.legend(loc="best")
     headline(figure, f"{one.title}: one simulated stare; nominal throughput")
     return figure

@@ -15,7 +15,7 @@ from mauvecl.schema.section import Section
 if TYPE_CHECKING:
     from mauvecl.study.sections import Flare
 
-FittedModel = Literal["blackbody", "balmer", "lines"]
+FittedModel = Literal["blackbody", "balmer", "lines", "two-temperatures"]
 
 
 class MeasureQuestion(Section):
@@ -40,6 +40,18 @@ class MeasureQuestion(Section):
         Help("S/N of bins of frames in which the flares of the study's stare are measured against time"),
         Flag("--snr-per-bin"),
     ] = None
+    joint_fit: Annotated[
+        bool,
+        Help(
+            "Fit shape, temperature and, if it falls, cooling of the flare to all frames of the study's stare together"
+        ),
+        Flag("--joint-fit"),
+    ] = False
+
+    @property
+    def along_stare(self) -> bool:
+        """True if flares are measured along a stare."""
+        return self.snr_per_bin is not None or self.joint_fit
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
@@ -54,15 +66,21 @@ class MeasureQuestion(Section):
         return self
 
 
-def fitted_models(asked: MeasureQuestion, flare: Flare) -> list[tuple[str, bool, tuple[str, ...]]]:
+def fitted_models(asked: MeasureQuestion, flare: Flare) -> list[tuple[FittedModel, bool, tuple[str, ...]]]:
     """Return the name of each fitted model, whether it has a Balmer continuum, and its lines."""
     light = flare.spectrum
     lines = asked.lines or tuple(dict.fromkeys((*light.lines, *light.line_fluxes)))
     models = list(asked.models)
     if not models:
-        models = ["blackbody"] if flare.is_blackbody else ["blackbody", "balmer"]
-        models += ["lines"] if lines else []
-    return [(name, name != "blackbody", lines if name == "lines" else ()) for name in dict.fromkeys(models)]
+        models = ["blackbody"]
+        if light.second_area is not None:
+            models += ["two-temperatures"]
+        elif not flare.is_blackbody:
+            models += ["balmer", "lines"] if lines else ["balmer"]
+    # Next to two blackbodies, lines are fitted without a Balmer continuum.
+    with_lines = "two-temperatures" if light.second_area is not None else "lines"
+    return [(name, name in ("balmer", "lines"), lines if name in ("lines", with_lines) else ())
+            for name in dict.fromkeys(models)]  # fmt: skip
 
 
 def drop_default_measure(data: dict[str, Any], asked: MeasureQuestion) -> None:

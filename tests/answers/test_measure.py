@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import ended, run
+from refusals import refused
 from scipy import stats
 
 from mauvecl import Engine, Study, measure
@@ -95,9 +96,16 @@ def test_faint_and_bright_flares_have_tables_and_pictures(amplitude: float, engi
 
 
 def test_flares_are_measured_along_a_stare(engine: Engine, tmp_path: Path) -> None:
-    """A cooling flare. False failures: pulls of 20 or more bins beyond chi-squared's 1e-9 quantiles."""
+    """A cooling flare, in bins and by a joint fit. False failures: pulls beyond chi-squared's 1e-9 quantiles."""
     events = [{"peak_s": 100.0, "amplitude": 2.0, "half_width_s": 40.0, "cooling": {"end_k": 7000.0, "fold_s": 80.0}}]
-    settings = ("measure.fits=20", "measure.snr_per_bin=20", "stare.duration_s=400", "stare.number=3", "nuisances={}")
+    settings = (
+        "measure.fits=20",
+        "measure.snr_per_bin=20",
+        "measure.joint_fit=true",
+        "stare.duration_s=400",
+        "stare.number=3",
+        "nuisances={}",
+    )
     study = study_of(*settings, temperature_k=14_000.0)
     study = Study.build(study.model_dump() | {"events": events}, "test")
     answer = measure(study, engine)
@@ -111,15 +119,60 @@ def test_flares_are_measured_along_a_stare(engine: Engine, tmp_path: Path) -> No
     assert (np.array(table["p_value"]) > 1e-6).all()
     assert str(table["area"].unit) == "cm2"
     assert str(table["luminosity_bolometric"].unit) == "erg / s"
+    joint = answer.tables["joint"]
+    names = ["peak time", "half width", "amplitude", "temperature", "end temperature", "cooling time"]
+    assert list(joint["quantity"][:6]) == names
+    np.testing.assert_allclose(joint["truth"][:6], [100.0, 40.0, 2.0, 14_000.0, 7000.0, 80.0])
+    fit = answer.stares[0].joint
+    assert fit is not None
+    away = (fit.found.estimates[0] - fit.truth)[:6]
+    distance = away @ np.linalg.solve(fit.found.covariance[0, :6, :6], away)
+    assert stats.chi2.ppf(1e-9, 6) < distance < stats.chi2.isf(1e-9, 6)
+    residuals = fit.fitted.drawn_dn - fit.fitted.mean_dn
+    assert abs(residuals.mean()) < 6 * residuals.std() / np.sqrt(residuals.size)
+    assert ((joint["low_95"] < joint["estimate"]) & (joint["estimate"] < joint["high_95"])).all()
     answer.write(tmp_path)
-    assert (tmp_path / "temperatures.ecsv").exists()
-    assert len(answer.as_json()["temperatures"]) == len(table)
-    assert "temperatures-1" in answer.pictures
+    for name, rows in (("temperatures", table), ("joint", joint)):
+        assert (tmp_path / f"{name}.ecsv").exists()
+        assert len(answer.as_json()[name]) == len(rows)
+        assert f"{name}-1" in answer.pictures
+    study = study.with_settings(["measure.joint_fit=false"])
     # A pool draws the same stare; a flare that is too faint is reported.
     assert measure(study, Pool()).tables["temperatures"]["temperature"][5] == table["temperature"][5]
     faint = measure(study.with_settings(["measure.snr_per_bin=1e6"]), engine)
     assert len(faint.tables["temperatures"]) == 0
     assert any("snr_per_bin = 1000000.0" in text for text in faint.messages)
+
+
+def test_joint_fits_need_one_flare(engine: Engine) -> None:
+    study = study_of("measure.fits=1", "measure.joint_fit=true", "flare.amplitudes=[0.5, 1.0]")
+    with refused("measure.joint_fit"):
+        measure(study, engine)
+
+
+def test_two_temperatures_are_fitted_where_the_flare_has_two(engine: Engine, tmp_path: Path) -> None:
+    """The hotter blackbody is the second one, however the flare is given; pictures have a column per model."""
+    spectrum = {"second_temperature_k": 8000.0, "second_area": 20.0}
+    settings = "measure.fits=20", "flare.amplitudes=[3.0]", "nuisances={}"
+    answer = measure(study_of(*settings, temperature_k=30_000.0, spectrum=spectrum), engine)
+    assert [one.model for one in answer.flares] == ["blackbody", "two-temperatures"]
+    rows = {row["quantity"]: row for row in answer.flares[1].rows()}
+    for name, value in (("temperature", 8000.0), ("second temperature", 30_000.0), ("second area", 0.05)):
+        assert rows[name]["truth"] == pytest.approx(value)
+        # Second temperatures are tried 0.6 % apart.
+        assert rows[name]["perfect"] == pytest.approx(value, rel=0.02)
+    for name in ("amplitude", "area", "flux 200-320 nm", "energy bolometric"):
+        assert rows[name]["perfect"] == pytest.approx(rows[name]["truth"], rel=0.03)
+    assert rows["amplitude"]["truth"] == pytest.approx(3.0, rel=1e-3)
+    errors = answer.flares[1].found.errors
+    np.testing.assert_allclose(np.median(errors, axis=0), answer.flares[1].known.errors, rtol=0.1)
+    assert any("rejects it in 100 %" in text for text in answer.messages)
+    for name, draw in answer.pictures.items():
+        draw(tmp_path / f"{name}.png")
+        assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+    alone = measure(study_of(*settings, 'measure.models=["two-temperatures"]', spectrum=spectrum), engine)
+    assert [one.model for one in alone.flares] == ["two-temperatures"]
+    assert list(alone.pictures) == ["fit", "pulls", "errors"]
 
 
 def test_lines_and_absolute_fluxes_are_measured(engine: Engine) -> None:

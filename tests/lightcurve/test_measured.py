@@ -209,6 +209,15 @@ def test_intervals_of_a_joint_fit_agree_with_its_errors() -> None:
     np.testing.assert_allclose(high, 1.0, atol=0.15)
 
 
+def test_a_joint_fit_of_a_steady_flare_leaves_the_cooling_open() -> None:
+    lit, _ = lit_frames(STEADY, Stare.of(150.0))
+    found = fit_cooling(np.array([one.recorded_dn for one in lit]), quiet(), model(), levels=(0.95,), **START)
+    assert found.estimates[0, :4] == pytest.approx([52.0, 40.0, 1.5, 9000.0], rel=0.01)
+    place = found.column("cooling time")
+    assert np.isinf(found.high[0, 0, place])
+    assert found.low[0, 0, 3] < 9000.0 < found.high[0, 0, 3]
+
+
 def test_impossible_joint_fits_raise() -> None:
     frames = np.tile(quiet().recorded_dn, (60, 1))
     with_jump = FlareModel.of(star(), MAUVE, quiet(), jump=True)

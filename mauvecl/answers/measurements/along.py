@@ -1,4 +1,4 @@
-"""A study's flares measured against time along one simulated stare."""
+"""A study's flares measured along one simulated stare: in bins of its frames, and by a fit to all of them."""
 
 from __future__ import annotations
 
@@ -9,42 +9,75 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import InCell
-from mauvecl.answers.measurements.expected import models_of
+from mauvecl.answers.measurements.expected import last_of_one_temperature, model_of, models_of
+from mauvecl.lightcurve.flares.events import Cooling
+from mauvecl.lightcurve.stares.cooling_fit import CoolingCourse, cooling_course, cooling_event, fit_cooling
 from mauvecl.lightcurve.stares.measured_bins import MeasuredBins, fit_bins, measure_along
 from mauvecl.lightcurve.stares.stare_requests import Arrays, StaresRequest
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import Column
 
 if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
     from mauvecl.lightcurve.flares.events import Event
     from mauvecl.lightcurve.stares.frame_components import Components
     from mauvecl.lightcurve.stares.light_curves import StareExpectation
+    from mauvecl.results.measurements.fit import Measurement
+    from mauvecl.statistics.nuisances import Nuisances
     from mauvecl.study.cases import Case
 
 Float = NDArray[np.float64]
 
+#: Columns of the table of joint fits, for a `JointFit`.
+JOINT_COLUMNS = (
+    Column("quantity", "found.names", "", "what is measured", "quantity"),
+    Column("unit", "found.units", "", "of truth, estimate and intervals", "unit"),
+    Column("truth", "truth", "", "true value; undefined where the flare has none", "truth", ".4g"),
+    Column("estimate", lambda one: one.found.estimates[0], "", "of maximum likelihood", "estimate", ".4g"),
+    Column("error", lambda one: one.found.errors[0], "", "its standard error", "error", ".2g"),
+    Column("low_68", lambda one: one.found.low[0, 0], "", "lower end of its 68 % interval; infinite if there is none"),
+    Column("high_68", lambda one: one.found.high[0, 0], "", "higher end"),
+    Column("low_95", lambda one: one.found.low[1, 0], "", "lower end of its 95 % interval", "95 % from", ".4g"),
+    Column("high_95", lambda one: one.found.high[1, 0], "", "higher end", "to", ".4g"),
+    Column("p_value", lambda one: np.full(len(one.truth), one.found.p_value[0]), "",
+           "probability of a chi-squared of the fit at least as large where the model is right"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """A fit of shape and spectrum to all frames, next to the flare that was drawn."""
+
+    found: Measurement
+    truth: Float  # shape (n_derived,)
+    true: CoolingCourse
+    fitted: CoolingCourse
+
 
 @dataclass(frozen=True, eq=False)
 class MeasuredStare(InCell):
-    """The flares of one simulated stare, measured in bins of its frames by one model."""
+    """The flares of one simulated stare, measured in bins of its frames by one model, and by a joint fit."""
 
     model: str
     staring: StareExpectation
     events: tuple[Event, ...]
-    drawn: MeasuredBins | str  # a sentence if no bin reaches the S/N
+    drawn: MeasuredBins | str | None  # a sentence if no bin reaches the S/N
     perfect: MeasuredBins | None  # the same bins without noise
+    joint: JointFit | None
 
 
-def measured_stare(case: Case, engine: Engine | Pool, snr_per_bin: float) -> MeasuredStare:
-    """Draw the stare of a case, and measure its flares with the model of the flare's spectrum."""
-    study = case.study
+def measured_stare(case: Case, engine: Engine | Pool) -> MeasuredStare:
+    """Draw the stare of a case, and measure its flares as its study asks for."""
+    study, asked = case.study, case.study.measure
     staring, events = case.stare_expectation, case.events
+    if asked.joint_fit and len(events) != 1:
+        raise InputError(f"a stare with {len(events)} flares", "one, which a joint fit is of", key="measure.joint_fit")
     quiet, stare, seed = staring.quiet, staring.stare, study.run.seed
-    processes = study.processes.additive_only
-    name, model = list(models_of(case.one_frame).items())[-1]
+    name, model = last_of_one_temperature(models_of(case.one_frame))
     unknown = case.unknowns(quiet)
+    processes = study.processes.additive_only
 
     def draw(components: Components) -> Float:
         request = StaresRequest(components, stare, 1, seed, staring.flare, start=study.stare.number, method="pixels",
@@ -62,8 +95,31 @@ def measured_stare(case: Case, engine: Engine | Pool, snr_per_bin: float) -> Mea
     depends_on = ("pixels", quiet, staring.flare_electrons, stare, staring.flare, study.stare.number, seed, processes)
     raw = kept(checkpoint, depends_on, drawn)["frames"]
     where = case.label, case.at, name, staring, tuple(events)
+    joint = _joint_fit(case, raw, unknown) if asked.joint_fit else None
+    if asked.snr_per_bin is None:
+        return MeasuredStare(*where, None, None, joint)
     try:
-        bins = measure_along(raw, quiet, model, unknown, snr_per_bin=snr_per_bin, stare=stare)
+        bins = measure_along(raw, quiet, model, unknown, snr_per_bin=asked.snr_per_bin, stare=stare)
     except InputError as error:
-        return MeasuredStare(*where, f"No flare of {case.label} is measured along the stare: {error}.", None)
-    return MeasuredStare(*where, bins, fit_bins(staring.mean_raw, quiet, model, unknown, stare, bins.first, bins.count))
+        sentence = f"No flare of {case.label} is measured along the stare: {error}."
+        return MeasuredStare(*where, sentence, None, joint)
+    perfect = fit_bins(staring.mean_raw, quiet, model, unknown, stare, bins.first, bins.count)
+    return MeasuredStare(*where, bins, perfect, joint)
+
+
+def _joint_fit(case: Case, raw: Float, unknown: Nuisances | None) -> JointFit:
+    """Fit a blackbody to the one flare of a stare; the search for the best fit starts from the true flare."""
+    staring, (event,), model = case.stare_expectation, case.events, model_of(case.one_frame)
+    quiet, stare = staring.quiet, staring.stare
+    found = fit_cooling(
+        raw, quiet, model, unknown, peak_s=event.peak_s, half_width_s=event.half_width_s, shape=event.form,
+        cooling=isinstance(event.temperature, Cooling), stare=stare,
+    )  # fmt: skip
+    true, fitted = (
+        cooling_course(one, found, raw, quiet, model, stare) for one in (event, cooling_event(found, event.form))
+    )
+    truth = true.values
+    if not case.study.flare.is_blackbody:
+        # Only the shape is that of the model.
+        truth = np.where(np.arange(truth.size) < 2, truth, np.nan)
+    return JointFit(found, truth, true, fitted)

@@ -10,9 +10,14 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import InCell
 from mauvecl.answers.measurements.truth import Truth
-from mauvecl.results.measurements.fit import LEVELS, Forecast, Measurement, fit, forecast
+from mauvecl.results.measurements.fit import Forecast, Measurement, fit, forecast
 from mauvecl.results.measurements.flare_model import FlareModel
 from mauvecl.results.measurements.reduction import Reduction, variance_of
+from mauvecl.results.measurements.two_temperatures import (
+    TwoTemperatures,
+    fit_two_temperatures,
+    forecast_two_temperatures,
+)
 from mauvecl.study.measurements import fitted_models
 
 if TYPE_CHECKING:
@@ -34,7 +39,7 @@ class ExpectedMeasurement(InCell):
     known: Forecast  # everything known
     ahead: Forecast  # unknowns of the study marginalised
     perfect: Measurement  # the fit to the mean exposure: estimates without noise
-    fitted: FlareModel
+    fitted: FlareModel | TwoTemperatures
     quiet: Expectation
     unknown: Nuisances | None
 
@@ -45,6 +50,8 @@ class ExpectedMeasurement(InCell):
 
     def region(self, rise: float, n: int = 161) -> tuple[Float, Float, Float]:
         """Return the expected confidence region of temperature and amplitude, with everything else profiled.
+
+        For models of one temperature.
 
         Parameters
         ----------
@@ -57,6 +64,7 @@ class ExpectedMeasurement(InCell):
         kelvin, low, high : ndarray, shape (n,)
             Smallest and largest amplitude at each temperature.
         """
+        assert isinstance(self.fitted, FlareModel)
         best, linear = self.perfect.log_k[0], self.perfect.amplitudes[0]
         reduction = Reduction.of(self.fitted, self.quiet, self.fitted.counts(np.exp(best), linear), self.unknown)
         basis, _ = reduction.basis
@@ -80,29 +88,60 @@ class ExpectedMeasurement(InCell):
         return np.exp(log_k), np.maximum(amplitude - reach, 0.0), amplitude + reach
 
 
-def models_of(case: Case) -> dict[str, FlareModel]:
-    """Return the models that are fitted to exposures of a case, the simplest first."""
+def fit_model(
+    frames: Float, quiet: Expectation, model: FlareModel | TwoTemperatures, unknown: Nuisances | None
+) -> Measurement:
+    """Fit a model of one or two temperatures to exposures."""
+    if isinstance(model, TwoTemperatures):
+        return fit_two_temperatures(frames, quiet, model.single, unknown)
+    return fit(frames, quiet, model, unknown)
+
+
+def forecast_model(
+    quiet: Expectation, model: FlareModel | TwoTemperatures, log_k: Float, linear: Float, unknown: Nuisances | None
+) -> Forecast:
+    """Return the errors of a model of one or two temperatures, for parameters of a `Measurement`."""
+    if isinstance(model, TwoTemperatures):
+        return forecast_two_temperatures(quiet, model.single, np.exp(log_k), linear, unknown)
+    return forecast(quiet, model, float(np.exp(log_k)), linear, unknown)
+
+
+def model_of(case: Case, *, jump: bool = False, lines: tuple[str, ...] = ()) -> FlareModel:
+    """Return the model of a blackbody at the star of a case, with a Balmer continuum and lines if they are fitted."""
     study = case.study
-    return {
-        name: FlareModel.of(
-            case.source,
-            case.instrument,
-            case.quiet,
-            jump=jump,
-            lines=lines,
-            band=study.flare.band,
-            electron_temperature_k=study.flare.spectrum.electron_temperature_k,
-            distance_pc=case.star.distance_pc,
-            radius_rsun=case.star.radius_rsun,
-            bands_nm=study.measure.bands_nm,
-            order=study.observation.order,
-        )
-        for name, jump, lines in fitted_models(study.measure, study.flare)
-    }
+    return FlareModel.of(
+        case.source,
+        case.instrument,
+        case.quiet,
+        jump=jump,
+        lines=lines,
+        band=study.flare.band,
+        electron_temperature_k=study.flare.spectrum.electron_temperature_k,
+        distance_pc=case.star.distance_pc,
+        radius_rsun=case.star.radius_rsun,
+        bands_nm=study.measure.bands_nm,
+        order=study.observation.order,
+    )
+
+
+def models_of(case: Case) -> dict[str, FlareModel | TwoTemperatures]:
+    """Return the models that are fitted to exposures of a case, the simplest first."""
+    asked = fitted_models(case.study.measure, case.study.flare)
+    models = {name: model_of(case, jump=jump, lines=lines) for name, jump, lines in asked}
+    return {name: TwoTemperatures(one) if name == "two-temperatures" else one for name, one in models.items()}
+
+
+def last_of_one_temperature(models: dict[str, FlareModel | TwoTemperatures]) -> tuple[str, FlareModel]:
+    """Return the name and the model of the last one with a single temperature, or that of a blackbody."""
+    found = [(name, one) for name, one in models.items() if isinstance(one, FlareModel)]
+    if found:
+        return found[-1]
+    (two,) = (one for one in models.values() if isinstance(one, TwoTemperatures))
+    return "blackbody", two.single
 
 
 def expected_measurements(
-    case: Case, amplitude: float, flare: Expectation, models: dict[str, FlareModel] | None = None
+    case: Case, amplitude: float, flare: Expectation, models: dict[str, FlareModel | TwoTemperatures] | None = None
 ) -> list[ExpectedMeasurement]:
     """Forecast the measurement of a flare with each model, by default those of `models_of`."""
     quiet, light, unknown = case.quiet, case.study.flare.light(), case.unknowns()
@@ -112,9 +151,10 @@ def expected_measurements(
     snr = matched_filter(quiet, flare, None, lit)[1], matched_filter(quiet, flare, unknown, lit)[1]
     expected = []
     for name, model in (models or models_of(case)).items():
-        perfect = fit(flare.recorded_dn, quiet, model, unknown, levels=LEVELS)
-        kelvin, linear = float(np.exp(perfect.log_k[0])), perfect.amplitudes[0]
-        known, ahead = (forecast(quiet, model, kelvin, linear, u) for u in (None, unknown))
+        perfect = fit_model(flare.recorded_dn, quiet, model, unknown)
+        known, ahead = (
+            forecast_model(quiet, model, perfect.log_k[0], perfect.amplitudes[0], u) for u in (None, unknown)
+        )
         true = np.array([truth.value(quantity) for quantity in model.names])
         expected.append(
             ExpectedMeasurement(

@@ -15,10 +15,10 @@ from astropy.table import QTable
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
-from mauvecl.answers.measurements.along import MeasuredStare, measured_stare
-from mauvecl.answers.measurements.expected import ExpectedMeasurement, expected_measurements, matched_filter
+from mauvecl.answers.measurements.along import JOINT_COLUMNS, MeasuredStare, measured_stare
+from mauvecl.answers.measurements.expected import ExpectedMeasurement, expected_measurements, fit_model, matched_filter
 from mauvecl.lightcurve.stares.measured_bins import MeasuredBins
-from mauvecl.results.measurements.fit import LEVELS, Measurement, fit
+from mauvecl.results.measurements.fit import LEVELS, Measurement
 from mauvecl.results.measurements.reduction import variance_of
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
@@ -60,7 +60,7 @@ class MeasuredFlare(ExpectedMeasurement):
 
     def fitted_dn(self) -> tuple[Float, Float]:
         """Return the mean of the fitted flare in the first exposure, and the best values of what is unknown, DN."""
-        mean = self.fitted.counts(float(np.exp(self.found.log_k[0])), self.found.amplitudes[0])
+        mean = self.fitted.counts(np.exp(self.found.log_k[0]), self.found.amplitudes[0])
         if self.unknown is None:
             return mean, np.zeros_like(mean)
         variance, used = variance_of(self.quiet, mean)
@@ -166,7 +166,7 @@ class MeasureAnswer(Answer):
         Every model of every flare of every star in every cell of the sweep.
     messages : list of str
     stares : list of MeasuredStare
-        One stare of every star in every cell, if the study asks for bins of a stare.
+        One stare of every star in every cell, if the study asks for bins of a stare or a joint fit.
     """
 
     USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "processes", "nuisances", "seed")
@@ -199,8 +199,20 @@ class MeasureAnswer(Answer):
     @property
     def tables(self) -> dict[str, Table]:
         """Measured quantities, fits, and measurements along stares."""
-        along = {"temperatures": self.temperatures} if self.stares else {}
-        return {"measure": self.table, "fits": self.fits} | along
+        return {"measure": self.table, "fits": self.fits} | self._along
+
+    @cached_property
+    def _along(self) -> dict[str, QTable]:
+        """Tables of measurements along stares, those that the study asks for."""
+        asked = self.study.measure
+        binned = {"temperatures": self.temperatures} if asked.snr_per_bin is not None else {}
+        return binned | ({"joint": self.joint} if asked.joint_fit else {})
+
+    @cached_property
+    def joint(self) -> QTable:
+        """Joint fits of shape and spectrum; one row per star, cell and quantity."""
+        parts = [(one, table_of(JOINT_COLUMNS, [one.joint])) for one in self.stares if one.joint is not None]
+        return stacked(place_columns(self.study), parts, study=self.study.text())
 
     @cached_property
     def temperatures(self) -> QTable:
@@ -223,6 +235,10 @@ class MeasureAnswer(Answer):
             columns = (*place_columns(self.study), *_bin_columns(drawn[0]))
             title = f"Measured along the stare, in bins of S/N {self.study.measure.snr_per_bin:g}"
             views.append(View(title, columns, self.temperatures))
+        if self.study.measure.joint_fit:
+            title = "One stare: shape and spectrum of the flare, fitted to all frames together"
+            shown = self.joint[self.joint["unit"] != "erg / cm2"]
+            views.append(View(title, (*place_columns(self.study), *JOINT_COLUMNS), shown))
         return [*views, View("Goodness of fit", (*self._first, *FIT_COLUMNS), self.fits)]
 
     @property
@@ -230,8 +246,7 @@ class MeasureAnswer(Answer):
         return list({id(one.quiet): one.quiet for one in self.flares}.values())
 
     def as_json(self) -> dict[str, Any]:
-        along = {"temperatures": records(self.temperatures)} if self.stares else {}
-        return super().as_json() | along
+        return super().as_json() | {name: records(table) for name, table in self._along.items()}
 
 
 def _bin_columns(bins: MeasuredBins) -> list[Column]:
@@ -259,7 +274,7 @@ def measure(
     """
     if study.flare.geometry != "added":
         raise InputError.of("flare.geometry", "replaces", "'added': fits take light for added")
-    if study.measure.snr_per_bin is not None:
+    if study.measure.along_stare:
         check_sweep(study)
     prepared = cases(study)
     if any(not amplitude > 0.0 for case in prepared for amplitude in case.amplitudes):
@@ -275,8 +290,7 @@ def measure(
         flares += some
         if progress is not None:
             progress(done, len(asked))
-    snr = study.measure.snr_per_bin
-    stares = [measured_stare(case, engine, snr) for case in prepared if snr is not None]
+    stares = [measured_stare(case, engine) for case in prepared if study.measure.along_stare]
     messages = collect_messages(expectations)
     messages += [one.drawn for one in stares if isinstance(one.drawn, str)]
     return MeasureAnswer(study, flares, [*messages, *_faint(flares), *_wrong(flares)], stares)
@@ -294,7 +308,7 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
         excess = raw - quiet.recorded_dn
         arrays: Arrays = {"first": excess[0], "detected": excess @ weights >= scipy.stats.norm.isf(study.run.fap)}
         for k, model in enumerate(models):
-            arrays |= {f"{k} {key}": value for key, value in fit(raw, quiet, model, unknown).arrays().items()}
+            arrays |= {f"{k} {key}": value for key, value in fit_model(raw, quiet, model, unknown).arrays().items()}
         return arrays
 
     checkpoint = engine.checkpoint if isinstance(engine, Pool) else None

@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mauvecl.host.stars.bands import photons
-from mauvecl.host.stars.flare_spectra import PARSEC_CM, SUN_CM, BalmerFlare, EmissionLine, FlareWithLines
+from mauvecl.host.stars.flare_spectra import (
+    PARSEC_CM,
+    SUN_CM,
+    BalmerFlare,
+    Blackbody,
+    EmissionLine,
+    FlareWithLines,
+    TwoBlackbodies,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,12 +38,13 @@ class Truth:
         # Flux at the telescope over that of the flare's spectrum.
         self._scale = float(np.trapezoid(added, nm) / np.trapezoid(light.flux(nm), nm))
         self._continuum = light.continuum if isinstance(light, FlareWithLines) else light
+        self._two = self._continuum if isinstance(self._continuum, TwoBlackbodies) else None
         self._amplitude = np.nan
         if self._continuum.temperature_k is not None:
-            from mauvecl.host.stars.flare import blackbody
-
             at = quiet.wavelength_nm
-            body = photons(at, blackbody(at, self._continuum.temperature_k), band)
+            # Of the blackbodies, without recombination.
+            light = self._continuum if self._two else Blackbody(self._continuum.temperature_k)
+            body = photons(at, light.flux(at), band)
             self._amplitude = self._scale * body / photons(at, quiet.flux_flam, band)
 
     def value(self, name: str) -> float:
@@ -47,9 +56,8 @@ class Truth:
             return factor[first] * self._flux(rest)
         if first == "line":
             return self._line(rest)
-        if name == "temperature":
-            kelvin = self._continuum.temperature_k
-            return np.nan if kelvin is None else kelvin
+        if name in ("temperature", "second temperature", "second area"):
+            return self._temperatures().get(name, np.nan)
         if name == "amplitude":
             return self._amplitude
         if name == "jump":
@@ -57,10 +65,21 @@ class Truth:
                 return np.nan
             return self._continuum.jump if isinstance(self._continuum, BalmerFlare) else 1.0
         area = np.pi * far**2 * self._scale if self._continuum.surface else np.nan
+        area *= 1.0 if self._two is None else 1.0 + self._two.second_area
         if name == "area":
             return area
         radius = np.nan if self._star.radius_rsun is None else self._star.radius_rsun * SUN_CM
         return float(area / (np.pi * radius**2))
+
+    def _temperatures(self) -> dict[str, float]:
+        """Return temperatures, and the area of the hotter blackbody over that of the cooler one."""
+        kelvin, two = self._continuum.temperature_k, self._two
+        if kelvin is None:
+            return {}
+        if two is None:
+            return {"temperature": kelvin}
+        (low, area), (high, hot_area) = sorted([(kelvin, 1.0), (two.second_temperature_k, two.second_area)])
+        return {"temperature": low, "second temperature": high, "second area": hot_area / area}
 
     def _flux(self, where: str) -> float:
         if where == "bolometric":

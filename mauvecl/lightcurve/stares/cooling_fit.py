@@ -10,17 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from functools import cache, cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.lightcurve.flares.events import Cooling
+from mauvecl.lightcurve.flares.events import Cooling, Event
 from mauvecl.lightcurve.flares.shapes import Shape, shape_of
 from mauvecl.lightcurve.stares.frame_components import Components
-from mauvecl.lightcurve.stares.measured_bins import checked_frames, known_strengths
+from mauvecl.lightcurve.stares.measured_bins import checked_frames, known_strengths, less_known
 from mauvecl.results.measurements.fit import LEVELS, Measurement
 from mauvecl.results.measurements.profile import Profile
 from mauvecl.results.measurements.reduction import Reduction
@@ -44,6 +44,8 @@ PARAMETERS = ("peak time", "half width", "amplitude", "temperature", "end temper
 REFITS = 3
 #: Reach of the search for the end of an interval, in standard errors.
 REACH = 12.0
+#: Smallest standard error, relative or in s, of a parameter that the frames constrain.
+NO_STEP = 1e-9
 #: Relative step of numerical derivatives.
 DIFFERENCE = 1e-5
 
@@ -74,7 +76,10 @@ class _Data:
         """Return the amplitude and log temperature of each frame."""
         peak, (width, amplitude, kelvin, end, fold) = theta[0], np.exp(theta[1:])
         rise = amplitude * self.light * self.shape.mean_over(self.edges, peak, width)
-        return rise, np.log(Cooling(kelvin, kelvin * min(end, 1.0), fold).at(self.edges.mean(axis=1) - peak))
+        # As that of `Cooling`, within the temperatures of the model.
+        end = min(end, 1.0)
+        cooled = end + (1.0 - end) * np.exp(-np.maximum(self.edges.mean(axis=1) - peak, 0.0) / fold)
+        return rise, np.clip(np.log(kelvin * cooled), self.model.log_k[0], self.model.log_k[-1])
 
     def mean(self, theta: Float) -> Float:
         """Return the mean sums of the flare, shape (n_frame, n_sum)."""
@@ -109,6 +114,15 @@ class _Data:
         return np.asarray(left - (shrink * (directions @ left)) @ directions)
 
 
+class CoolingCourse(NamedTuple):
+    """A flare in the quantities of a fit, and frame by frame, added up over the pixels that are used."""
+
+    values: Float  # shape (n_derived,)
+    drawn_dn: Float  # of the frames less their known mean without a flare, shape (n_frame,)
+    mean_dn: Float  # of the flare
+    kelvin: Float
+
+
 @validated
 def fit_cooling(
     frames: ArrayLike,
@@ -118,7 +132,7 @@ def fit_cooling(
     *,
     peak_s: Moment,
     half_width_s: Duration,
-    shape: str = "davenport2014",
+    shape: Shape | str = "davenport2014",
     cooling: bool = True,
     stare: Stare | None = None,
     levels: Sequence[Probability] = LEVELS,
@@ -137,7 +151,7 @@ def fit_cooling(
         Unknown amplitudes of known spectra, for one frame; they are constant over the stare.
     peak_s, half_width_s : float
         Starting point of the fit, such as the result of a search.
-    shape : str
+    shape : Shape or str
     cooling : bool
         Whether the temperature falls after the peak, as in `Cooling`; constant otherwise.
     stare : Stare, optional
@@ -203,14 +217,43 @@ def fit_cooling(
     )  # fmt: skip
 
 
+def cooling_course(
+    event: Event, found: Measurement, frames: Float, quiet: Expectation, model: FlareModel, stare: Stare
+) -> CoolingCourse:
+    """Return what a flare is in the quantities of a fit, and in each frame; parameters as for `fit_cooling`."""
+    data = _data(frames, quiet, model, None, stare, event.form)
+    cooling = event.temperature
+    if not isinstance(cooling, Cooling):
+        cooling = Cooling(cooling, cooling, stare.frame_s)
+    logs = np.log([event.half_width_s, event.amplitude, cooling.peak_k, cooling.end_k / cooling.peak_k, cooling.fold_s])
+    theta = np.array([event.peak_s, *logs])
+    values = {name: value(theta) for name, _, value, _ in _quantities(data, stare, cooling=True)}
+    rise, log_k = data.strengths(theta)
+    used = (data.reduction.variance > 0).astype(np.float64)
+    return CoolingCourse(
+        np.array([values[name] for name in found.names]),
+        less_known(frames, quiet, known_strengths(stare, quiet), used[None])[:, 0],
+        rise * (model.hot_spline(log_k) @ used),
+        np.exp(log_k),
+    )
+
+
+def cooling_event(found: Measurement, shape: Shape) -> Event:
+    """Return the flare that `fit_cooling` found."""
+    best = dict(zip(found.names, found.estimates[0].tolist(), strict=True))
+    kelvin: float | Cooling = best["temperature"]
+    if "cooling time" in best:
+        kelvin = Cooling(best["temperature"], min(best["end temperature"], best["temperature"]), best["cooling time"])
+    return Event(best["peak time"], best["half width"], best["amplitude"], kelvin, shape)
+
+
 def _data(
     raw: Float, quiet: Expectation, model: FlareModel, nuisances: Nuisances | None, stare: Stare, shape: Shape
 ) -> _Data:
     # The unknowns are parameters of the stare, so the weights of single frames do not remove them.
     reduction = Reduction.of(model, quiet)
     weights, strengths = reduction.weights, known_strengths(stare, quiet)
-    means = np.vstack([quiet.net_source_dn, quiet.sky_dn, quiet.dark_dn, quiet.bias_dn])
-    sums = raw @ weights.T - np.column_stack([strengths[:, :3], np.ones(len(raw))]) @ (means @ weights.T)
+    sums = less_known(raw, quiet, strengths, weights)
     constant, each = Components(quiet, np.zeros((0, weights.shape[1])), weights).sum_cumulants(2)
     covariance = constant + np.tensordot(strengths[:, :3], each, 1)
     edges = np.column_stack([stare.start_s, stare.start_s + stare.frame_s])
@@ -253,14 +296,12 @@ def _solve(
     def residuals(values: Float) -> Float:
         there = theta.copy()
         there[free] = values
-        there[4] = max(there[4], data.model.log_k[0] - there[3])
         return data.residuals(there, whitening)
 
     start = np.clip(theta[free], low[free] + 1e-9, high[free] - 1e-9)
     found = scipy.optimize.least_squares(residuals, start, bounds=(low[free], high[free]), x_scale=scale)
     best = theta.copy()
     best[free] = found.x
-    best[4] = max(best[4], data.model.log_k[0] - best[3])
     return best
 
 
@@ -333,6 +374,7 @@ def _end(
             moved[place] += np.log(target / value(moved))
         return moved
 
+    @cache  # a root is between values that have different signs, though refits start elsewhere
     def rise(log_factor: float) -> float:
         nonlocal there
 
@@ -340,7 +382,7 @@ def _end(
             trial = there.copy()
             trial[rest] = values
             trial = held(log_factor, trial)
-            trial[4] = np.clip(trial[4], data.model.log_k[0] - trial[3], 0.0)
+            trial[4] = min(trial[4], 0.0)
             return data.residuals(trial, whitening)
 
         low, high = limits[0][rest], limits[1][rest]
@@ -352,6 +394,8 @@ def _end(
         return float(2 * found.cost - allowed)
 
     inner, outer = 0.0, step
+    if abs(step) < NO_STEP:
+        return float(np.copysign(np.inf, step))
     while rise(outer) < 0.0:
         inner, outer = outer, 1.7 * outer
         if abs(outer) > REACH * abs(step) or not limits[0][place] <= held(outer, theta)[place] <= limits[1][place]:

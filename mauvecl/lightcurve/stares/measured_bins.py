@@ -214,6 +214,13 @@ def known_strengths(stare: Stare, quiet: Expectation) -> Float:
     return np.column_stack([stare.light * stare.star, stare.light * stare.sky, stare.dark_factor(quiet), stare.light])
 
 
+def less_known(raw: Float, quiet: Expectation, known: Float, weights: Float) -> Float:
+    """Return weighted sums, (n_frame, n_sum), of frames less their means without a flare for `known_strengths`."""
+    means = np.vstack([quiet.net_source_dn, quiet.sky_dn, quiet.dark_dn, quiet.bias_dn])
+    strengths = np.column_stack([known[:, :3], np.ones(len(known))])
+    return np.asarray(raw @ weights.T - strengths @ (means @ weights.T))
+
+
 def _bins(
     raw: Float,
     quiet: Expectation,
@@ -225,9 +232,7 @@ def _bins(
 ) -> list[tuple[int, int]]:
     """Return first frames and ends of the shortest runs of frames in which a matched filter reaches an S/N."""
     reduction = Reduction.of(model, quiet, None, nuisances)
-    means = np.vstack([quiet.net_source_dn, quiet.sky_dn, quiet.dark_dn, quiet.bias_dn])
-    strengths = np.column_stack([known[:, :3], np.ones(len(known))])
-    sums = raw @ reduction.weights.T - strengths @ (means @ reduction.weights.T)
+    sums = less_known(raw, quiet, known, reduction.weights)
     total = np.vstack([np.zeros(sums.shape[1]), np.cumsum(sums, axis=0)])
     shapes = reduction.hot[::EVERY] / np.linalg.norm(reduction.hot[::EVERY], axis=1)[:, None]
     widths = 2 ** np.arange(int(np.log2(len(raw))) + 1)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
     from mauvecl.host.expectation import Expectation
+    from mauvecl.results.measurements.two_temperatures import TwoTemperatures
 
 Float = NDArray[np.float64]
 
@@ -60,7 +61,7 @@ class Measurement:
     dof : int
     snr : ndarray, shape (n,)
         Root of what the flare lowers chi-squared by.
-    log_k : ndarray, shape (n,)
+    log_k : ndarray, shape (n,), or (n, 2) of two temperatures
     amplitudes : ndarray, shape (n, n_linear)
         Parameters of the model's `counts`.
     """
@@ -106,7 +107,9 @@ class Measurement:
         return {name: value for name, value in values.items() if name not in ("names", "units", "bounds", "levels")}
 
     @classmethod
-    def of_arrays(cls, model: FlareModel, levels: Sequence[float], arrays: Mapping[str, NDArray[Any]]) -> Self:
+    def of_arrays(
+        cls, model: FlareModel | TwoTemperatures, levels: Sequence[float], arrays: Mapping[str, NDArray[Any]]
+    ) -> Self:
         """Return the measurement of a model's flares that `arrays` gave."""
         given: dict[str, Any] = {**arrays, "dof": int(arrays["dof"])}
         return cls(model.names, model.units, model.bounds, levels=tuple(levels), **given)

@@ -7,14 +7,14 @@ so that everything else is a fit of `results.measurements.nonnegative`. The seco
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.results.measurements.fit import LEVELS, Measurement, checked_excess, fit, variance_groups
+from mauvecl.results.measurements.fit import LEVELS, Forecast, Measurement, checked_excess, fit, variance_groups
 from mauvecl.results.measurements.flare_model import Derived, FlareModel, derived_values
 from mauvecl.results.measurements.nonnegative import BoundedProfile, bounded_intervals
 from mauvecl.results.measurements.profile import Best
@@ -35,6 +35,39 @@ PER_NODE = 3
 COARSE, TRIES = 36, 20
 #: Nodes between the temperatures, at least: closer ones are one.
 APART = 4
+
+
+@dataclass(frozen=True, eq=False)
+class TwoTemperatures:
+    """The mean counts of a flare of two blackbodies, both temperatures free.
+
+    Attributes
+    ----------
+    single : FlareModel
+        Of one blackbody, with lines if they are fitted.
+    """
+
+    single: FlareModel
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of what fits report."""
+        return (*self.single.names, "second temperature", "second area")
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Their units."""
+        return (*self.single.units, "K", "")
+
+    @property
+    def bounds(self) -> tuple[float, ...]:
+        """Smallest possible values."""
+        return (*self.single.bounds, -np.inf, 0.0)
+
+    def counts(self, temperatures_k: Float, amplitudes: Sequence[float] | Float) -> Float:
+        """Return the mean DN that a flare adds to each pixel, of the lower and the second temperature, (n_pixel,)."""
+        lower, second = np.asarray(temperatures_k, np.float64)
+        return with_second(self.single, float(np.log(second))).counts(float(lower), amplitudes)
 
 
 @validated
@@ -77,7 +110,7 @@ def fit_two_temperatures(
         return Reduction.of(model, expectation, added_dn, nuisances, left_out)
 
     allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
-    parts, order = [], []
+    parts, order, whole = [], [], TwoTemperatures(model)
     for rows, reduction in variance_groups(expectation, model, single.log_k, single.amplitudes, reduction_of):
         sums, rest = reduction.sums(excess[rows])
         found = _Search(model, reduction, sums, allowed).measured()
@@ -87,13 +120,35 @@ def fit_two_temperatures(
         covariance = _covariance(model, reduction, best, second, estimates)
         parts.append(
             Measurement(
-                (*model.names, "second temperature", "second area"), (*model.units, "K", ""),
-                (*model.bounds, -np.inf, 0.0), estimates, covariance, tuple(levels), low, high, chi2,
-                np.asarray(scipy.stats.chi2.sf(chi2, dof)), dof, np.sqrt(best.gain), best.log_k, best.linear,
+                whole.names, whole.units, whole.bounds, estimates, covariance, tuple(levels), low, high, chi2,
+                np.asarray(scipy.stats.chi2.sf(chi2, dof)), dof, np.sqrt(best.gain),
+                np.column_stack([best.log_k, second]), best.linear,
             )
         )  # fmt: skip
         order.append(rows)
     return Measurement.joined(parts).rows(np.argsort(np.concatenate(order)))
+
+
+def forecast_two_temperatures(
+    expectation: Expectation,
+    model: FlareModel,
+    temperatures_k: Float,
+    amplitudes: Float,
+    nuisances: Nuisances | None = None,
+) -> Forecast:
+    """Return the errors with which a flare of two temperatures will be measured, as `forecast`.
+
+    Undefined where one of the blackbodies adds no light.
+    """
+    whole, log_k, linear = TwoTemperatures(model), np.log(temperatures_k), np.asarray(amplitudes, np.float64)[None]
+    reduction = Reduction.of(model, expectation, whole.counts(temperatures_k, linear[0]), nuisances)
+    values = derived_values(with_second(model, float(log_k[1])), log_k[:1], linear)
+    values = np.insert(values, -1, temperatures_k[1], axis=1)
+    sums = linear[0] @ np.vstack([reduction.spline(log_k), reduction.fixed])
+    best = Best(log_k[:1], linear, np.array([sums @ sums]))
+    spread = _covariance(model, reduction, best, log_k[1:], values)[0]
+    errors = np.sqrt(np.diag(spread))
+    return Forecast(whole.names, whole.units, values[0], errors, spread, float(np.linalg.norm(sums)))
 
 
 def with_second(model: FlareModel, log_k: float) -> FlareModel:

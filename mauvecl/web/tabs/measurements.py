@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.measurements.expected import expected_measurements, models_of
-from mauvecl.results.measurements.fit import forecast
+from mauvecl.answers.measurements.expected import expected_measurements, forecast_model, models_of
+from mauvecl.results.measurements.flare_model import FlareModel
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.web.closed_forms import percent, short
 from mauvecl.web.figures import Canvas
@@ -73,8 +73,8 @@ class Errors(Picture):
         own = 100 * closed.study.flare.amplitudes[0]
         sources: dict[str, Any] = {}
         for name, one in zip(("known", "usual", "free"), expected(closed).values(), strict=True):
-            kelvin, linear = float(np.exp(one.perfect.log_k[0])), one.perfect.amplitudes[0]
-            ahead = [forecast(one.quiet, one.fitted, kelvin, factor * linear, one.unknown) for factor in FACTORS]
+            log_k, linear = one.perfect.log_k[0], one.perfect.amplitudes[0]
+            ahead = [forecast_model(one.quiet, one.fitted, log_k, factor * linear, one.unknown) for factor in FACTORS]
             sources[name] = {"x": own * FACTORS, "y": [100 * f.errors[0] / f.values[0] for f in ahead]}
         known, *_, free = expected(closed).values()
         sources["own"] = {"x": [own], "y": [100 * known.ahead.errors[0] / known.ahead.values[0]]}
@@ -111,7 +111,10 @@ class Region(Picture):
 
     def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         all_known, *_, free = expected(closed).values()
-        sources: dict[str, Any] = {"fits": {"x": [], "y": []}}
+        sources: dict[str, Any] = {name: {"x": [], "y": []} for name in ("fits", "own")}
+        if not isinstance(all_known.fitted, FlareModel):
+            sources |= {name: {"x": [], "low": [], "high": []} for name in ("free", "known")}
+            return PictureData("The region is that of models of one temperature.", sources)
         for name, one in (("known", all_known), ("free", free)):
             kelvin, low, high = one.region(RISE_95)
             sources[name] = {"x": kelvin, "low": 100 * low, "high": 100 * high}
