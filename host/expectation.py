@@ -34,6 +34,7 @@ from .spectra.wavelength_range import SPAN_NM
 if TYPE_CHECKING:
     from astropy.table import QTable
 
+    from .stars.neighbours import Neighbours
     from .stars.source import Source
 
 Float = NDArray[np.float64]
@@ -54,6 +55,8 @@ BUDGET_COLUMNS = (
            format=".2f"),
     Column("zodiacal_photon", unit="DN", description="photon noise of the zodiacal light, rms",
            heading="zodiacal photons", format=".2f"),
+    Column("neighbour_photon", unit="DN", description="photon noise of neighbours in the fibre, rms",
+           heading="neighbours' photons", format=".2f"),
     Column("dark", unit="DN", description="noise of the dark current, rms", heading="dark", format=".2f"),
     Column("read", unit="DN", description="read noise, rms", heading="read", format=".2f"),
     Column("total", unit="DN", description="all of them in quadrature, without the ADC's rounding", heading="total",
@@ -102,6 +105,9 @@ class Expectation(Drawable, ContentEquality):
         Definition of the signal. With ``net`` it is the star alone: the sky is subtracted like bias and dark, and only
         its noise remains. With ``paper`` it includes the zodiacal light, as in the MauveSim paper. The noise is the
         same.
+    neighbour_electrons : ndarray, shape (n_pixel,)
+        Mean electrons per frame of other stars in the fibre, zero by default. They are no signal: their mean is
+        subtracted like that of the sky.
     """
 
     wavelength_nm: Annotated[Float, Unit("nm")]
@@ -125,6 +131,7 @@ class Expectation(Drawable, ContentEquality):
     conditions: Mapping[str, float] = field(default_factory=dict)
     messages: tuple[str, ...] = ()
     signal: Signal = "net"
+    neighbour_electrons: Float = field(default_factory=lambda: np.zeros(0))
 
     def to_specutils(self) -> Any:
         """Convert the mean signal of the exposure, DN, and its standard deviation to a specutils Spectrum.
@@ -161,6 +168,8 @@ class Expectation(Drawable, ContentEquality):
     def __post_init__(self) -> None:
         if self.signal not in SIGNALS:
             raise InputError.of("signal", self.signal, "'net' or 'paper'")
+        if not self.neighbour_electrons.size:
+            object.__setattr__(self, "neighbour_electrons", np.zeros(self.wavelength_nm.shape))
         for each in fields(self):
             value = getattr(self, each.name)
             if isinstance(value, np.ndarray):
@@ -209,10 +218,26 @@ class Expectation(Drawable, ContentEquality):
         """Mean signal of the source alone in the exposure, DN, shape (n_pixel,)."""
         return self.n_frames * self.gain_dn_per_electron * self.source_electrons
 
+    @property
+    def light_electrons(self) -> Float:
+        """Mean electrons per frame of all light: source, neighbours and sky, shape (n_pixel,)."""
+        return self.source_electrons + self.sky_electrons + self.neighbour_electrons
+
+    @property
+    def target_share(self) -> float:
+        """Share of the source in the electrons of all stars in the fibre, 1 without neighbours."""
+        source, neighbours = float(self.source_electrons.sum()), float(self.neighbour_electrons.sum())
+        return source / (source + neighbours) if neighbours else 1.0
+
     @cached_property
     def light_dn(self) -> Float:
-        """Mean signal of the exposure before saturation, source and sky, DN, shape (n_pixel,)."""
-        return self.n_frames * self.gain_dn_per_electron * (self.source_electrons + self.sky_electrons)
+        """Mean signal of the exposure before saturation, source, neighbours and sky, DN, shape (n_pixel,)."""
+        return self.n_frames * self.gain_dn_per_electron * self.light_electrons
+
+    @cached_property
+    def neighbour_dn(self) -> Float:
+        """Mean signal of neighbours in the exposure, DN, shape (n_pixel,)."""
+        return self.n_frames * self.gain_dn_per_electron * self.neighbour_electrons
 
     @cached_property
     def sky_dn(self) -> Float:
@@ -221,16 +246,16 @@ class Expectation(Drawable, ContentEquality):
 
     @cached_property
     def recorded_light_dn(self) -> Float:
-        """Mean recorded light of the exposure, source and sky, DN: `light_dn` minus the loss by saturation."""
+        """Mean recorded light of the exposure, DN: `light_dn` minus the loss by saturation."""
         return self.light_dn - self._cut[0]
 
     @cached_property
     def subtracted_dn(self) -> Float:
         """Mean that an observer subtracts in addition to bias and dark, DN, shape (n_pixel,).
 
-        This is the mean of the sky, or zero if the sky counts as signal.
+        This is the mean of neighbours and, unless it counts as signal, of the sky.
         """
-        return self.sky_dn if self.signal == "net" else np.zeros_like(self.sky_dn)
+        return self.neighbour_dn + self.sky_dn if self.signal == "net" else self.neighbour_dn
 
     @cached_property
     def signal_dn(self) -> Float:
@@ -315,7 +340,8 @@ class Expectation(Drawable, ContentEquality):
         """Return the signal-to-noise ratio per pixel, shape (n_pixel,).
 
         The ratio is S / sqrt(sigma_L^2 + sigma_R^2 + sigma_D^2), all in DN, where S is `signal_dn` and sigma_L is the
-        gain times the root of all electrons of light, including the sky's. The ADC's rounding is not included.
+        gain times the root of all electrons of light, of neighbours and sky as well. The ADC's rounding is not
+        included.
         """
         return _ratio(self.signal_dn, self._noise_dn2)
 
@@ -340,9 +366,9 @@ class Expectation(Drawable, ContentEquality):
         Returns
         -------
         QTable
-            Columns `wavelength`, `source_photon`, `zodiacal_photon`, `dark`, `read` and `total`. The total is the
-            quadratic sum of the four, so `snr` is signal_dn / total. The ADC's rounding, 0.29 DN per frame, is not
-            included.
+            Columns `wavelength`, `source_photon`, `zodiacal_photon`, with neighbours `neighbour_photon`, `dark`, `read`
+            and `total`. The total is their quadratic sum, so `snr` is signal_dn / total. The ADC's rounding, 0.29 DN
+            per frame, is not included.
         """
         n, gain = self.n_frames, self.gain_dn_per_electron
         # Fraction of the light that saturation leaves.
@@ -350,13 +376,15 @@ class Expectation(Drawable, ContentEquality):
         variances = {
             "source_photon": n * gain**2 * self.source_electrons * kept,
             "zodiacal_photon": n * gain**2 * self.sky_electrons * kept,
+            "neighbour_photon": n * gain**2 * self.neighbour_electrons * kept,
             "dark": n * self.dark_variance_dn2,
             "read": n * self.read_noise_dn**2,
             "total": self._noise_dn2,
         }
         noise = {name: np.sqrt(variance) for name, variance in variances.items()}
         about = {"exposure_s": self.exposure_s, "name": self.name}
-        return table_of(BUDGET_COLUMNS, [{"wavelength": self.wavelength_nm} | noise], **about)
+        columns = [one for one in BUDGET_COLUMNS if one.name != "neighbour_photon" or self.neighbour_electrons.any()]
+        return table_of(columns, [{"wavelength": self.wavelength_nm} | noise], **about)
 
     @property
     def ceiling_dn(self) -> float:
@@ -387,6 +415,7 @@ MAX_PER_FRAME = 1e12
 PER_PIXEL = (
     "source_electrons",
     "sky_electrons",
+    "neighbour_electrons",
     "dark_dn",
     "bias_dn",
     "read_noise_dn",
@@ -408,6 +437,7 @@ def expect(
     sky: Sky | SkyBrightness | None = None,
     order: Order = "paper",
     signal: Signal = "net",
+    neighbours: Neighbours | None = None,
 ) -> Expectation:
     """Compute the expectation of an exposure: means and noise per pixel, without drawing anything.
 
@@ -426,6 +456,8 @@ def expect(
         Whether efficiencies act after or before the line spread function; see `response_matrix`.
     signal : {"net", "paper"}
         Whether the signal in an S/N is the star alone, or includes the zodiacal light as in the MauveSim paper.
+    neighbours : Neighbours, optional
+        Other stars in the fibre; none by default.
 
     Raises
     ------
@@ -470,6 +502,9 @@ def expect(
     n_pixel = instrument.wavelength_nm.size
     element, element_wavelength = _elements(instrument)
     electrons = per_frame(source)
+    beside = np.zeros(n_pixel)
+    if neighbours is not None:
+        beside = _faint_enough(instrument.frame_s * neighbours.electrons_per_second(instrument, order), "a neighbour")
     plain = Expectation(
         wavelength_nm=instrument.wavelength_nm,
         source_electrons=_faint_enough(np.maximum(electrons, 0.0), source.name),
@@ -487,6 +522,7 @@ def expect(
         signal=signal,
         adc_max_dn=instrument.adc_max_dn,
         saturation_dn=instrument.saturation_dn,
+        neighbour_electrons=beside,
         conditions={
             name: getattr(instrument, name)
             for name in ("temperature_c", "dark_slope_per_c", "light_loss", "pointing_loss")
@@ -509,9 +545,12 @@ def expect(
             "signal": signal,
             "requested exposure": f"{exposure:g} s",
             "exposure": f"{n_frames} x {instrument.frame_s:g} s",
-        },
+        }
+        | ({} if neighbours is None else neighbours.provenance(instrument)),
     )
     messages = [*_saturation(plain), *(f"{source.name}: {text}." for text in source.messages)]
+    if neighbours is not None:
+        messages += neighbours.messages(source.name, instrument)
     drawn = np.sqrt(plain.variance_dn2) / (n_frames * plain.gain_dn_per_electron)
     messages += negative_means_message(source, instrument, electrons, drawn, order)
     if signal == "paper" and plain.sky_electrons.any():

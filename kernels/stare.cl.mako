@@ -12,8 +12,8 @@
 #define OF_FRAME(array) ((floatv)((array)[frame]))
 % endif
 
-/* Coefficients of star, sky and dark, and the factor on all light, each minus one. */
-typedef struct { floatv star, sky, dark, light; } Strengths;
+/* Coefficients of star, sky, dark and neighbours, and the factor on all light, each minus one. */
+typedef struct { floatv star, sky, dark, neighbours, light; } Strengths;
 
 /* exp(x) - 1, for |x| < 80 */
 INLINE floatv exponential_less_one(floatv x)
@@ -58,5 +58,6 @@ INLINE Strengths strengths_of(STARE_GIVEN, uint frame, const floatv *jitter, con
     s.star = FMA(OF_FRAME(known), TOGETHER(moved[1], moved[0]), OF_FRAME(known + stride));
     s.sky = FMA(OF_FRAME(known + 2u * stride), TOGETHER(moved[1], moved[2]), OF_FRAME(known + 3u * stride));
     s.dark = FMA(OF_FRAME(known + 4u * stride), exponential_less_one(moved[3] * stare_job->dark_slope), OF_FRAME(known + 5u * stride));
+    s.neighbours = FMA(OF_FRAME(known + 6u * stride), moved[1], OF_FRAME(known + 7u * stride));
     return s;
 }

@@ -33,7 +33,7 @@ void stare_pixels(SCENE, STARE, const uint first_low, const uint first_high, con
         for (uint k = 0; k < scenario_count; k++)
             for (uint j = 0; j < ${spectra}u; j++)
                 ((float *)flare[k])[j * ${width}u + i] = from[j * stare_job->padded_frames]
-                    * (known[6u * stare_job->padded_frames + frame] * amplitudes[k * amplitude_rows + (amplitude_rows > 1u ? row : 0u)]);
+                    * (known[8u * stare_job->padded_frames + frame] * amplitudes[k * amplitude_rows + (amplitude_rows > 1u ? row : 0u)]);
     }
     for (uint k = 0; k < scenario_count; k++)
         for (uint j = 0; j < ${spectra}u; j++) flare[k][j] = FMA(strengths.light, flare[k][j], flare[k][j]);
@@ -52,6 +52,9 @@ void stare_pixels(SCENE, STARE, const uint first_low, const uint first_high, con
                 __global const Mixture *m = mixtures + start + i;
                 const floatv z = drawn.z[i], zz = z * z;
                 floatv light = FMA(strengths.star, (floatv)m->star, strengths.sky * m->sky);
+% if neighbours:
+                light = FMA(strengths.neighbours, (floatv)m->neighbours, light);
+% endif
 % for j in range(spectra):
                 light = FMA(flare[k][${j}], (floatv)spectra[${j}u * padded + start + i], light);
 % endfor

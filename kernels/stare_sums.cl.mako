@@ -7,7 +7,8 @@
     fours = [(a, b, c, d) for a, b, c in threes for d in range(c + 1)] if fourths else []
     row = sums + len(pairs) + len(threes) + len(fours)
     at = {key: sums + i for i, key in enumerate(pairs + threes + fours)}
-    lights = ["strengths.star", "strengths.sky"] + [f"flare[{j}]" for j in range(spectra)]
+    lights = [("strengths.star", 1), ("strengths.sky", 2)] + [("strengths.neighbours", 4)] * neighbours
+    lights += [(f"flare[{j}]", 5 + j) for j in range(spectra)]
     words = [("stare_frame", 0)] * jittered + [("stare_sums", group) for group in range(-(-sums // 4))]
     n_words = len(words)
     def name(*key):
@@ -28,7 +29,7 @@
     def cumulant(offset, lit=True):
         """Return a cumulant at the given strengths."""
         text = f"(floatv)table[{offset}]"
-        rows = [("strengths.dark", 3)] + ([(s, r) for s, r in zip(lights, [1, 2, *range(4, 4 + spectra)])] if lit else [])
+        rows = [("strengths.dark", 3)] + (lights if lit else [])
         for strength, r in rows:
             text = f"FMA({strength}, (floatv)table[{r * row + offset}], {text})"
         return text
@@ -45,7 +46,7 @@ void stare_sums(__global const Job *restrict job, STARE, const uint first_low, c
 % if unknown_groups:
     unknowns_of(*stare_job, realisation, first_high, job->seed_low, job->seed_high, unknown);
 % endif
-    __global const float *whole = table + ${row * (4 + spectra)}u;
+    __global const float *whole = table + ${row * (5 + spectra)}u;
     for (uint frame = begin; frame < end; frame += ${width}u) {
         const uintv number = LOAD(numbers + frame);
         /* Normals for the jitters and the sums. */
@@ -70,7 +71,7 @@ void stare_sums(__global const Job *restrict job, STARE, const uint first_low, c
         for (uint k = 0; k < scenario_count; k++) {
 % if spectra:
             floatv flare[${spectra}];
-            const floatv amplitude = OF_FRAME(known + 6u * stride) * amplitudes[k * stare_job->amplitude_rows + (stare_job->amplitude_rows > 1u ? stare : 0u)];
+            const floatv amplitude = OF_FRAME(known + 8u * stride) * amplitudes[k * stare_job->amplitude_rows + (stare_job->amplitude_rows > 1u ? stare : 0u)];
             __global const float *from = flares + (size_t)(stare_job->flare_rows > 1u ? stare : 0u) * ${spectra}u * stride;
             for (uint j = 0; j < ${spectra}u; j++) {
                 flare[j] = OF_FRAME(from + j * stride) * amplitude;

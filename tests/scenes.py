@@ -9,6 +9,7 @@ import numpy as np
 from mauvecl.host.expectation import Expectation, expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.sky.zodiacal import Sky
+from mauvecl.host.stars.neighbours import Neighbour, Neighbours
 from mauvecl.host.stars.source import Source
 from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.stare import Stare
@@ -16,6 +17,9 @@ from mauvecl.lightcurve.stares.stare_requests import StaresRequest
 
 #: Of `flaring_stares`: around the boundary of the counter's first word.
 N_STARES, FIRST_STARE = 200, 2**32 - 70
+
+#: Half of a hotter star 0.6 magnitudes fainter than `star`.
+NEAR = Neighbours((Neighbour("B", 10.0, 8.0, "V", "F5V"),), 0.5)
 
 
 def instrument(name: str = "mauve", *, part: bool = False, **changes: Any) -> Instrument:
@@ -33,12 +37,13 @@ def star(
     amplitudes: tuple[float, ...] = (),
     exposure: float = 50.0,
     payload: Instrument | None = None,
+    neighbours: Neighbours | None = None,
 ) -> list[Expectation]:
     """Return the expectations of the quiescent star and its flares."""
     payload = payload or instrument()
     quiet = Source.from_library(name).at_magnitude(magnitude)
     sources = [quiet, *(quiet.flaring(a) for a in amplitudes)]
-    return [expect(s, payload, exposure=exposure, sky=Sky.of_brightness(22.1)) for s in sources]
+    return [expect(s, payload, exposure=exposure, sky=Sky.of_brightness(22.1), neighbours=neighbours) for s in sources]
 
 
 def flaring_stares(method: Any = "cumulants", **more: Any) -> StaresRequest:

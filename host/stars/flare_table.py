@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,9 +10,8 @@ import numpy as np
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened, shown
 
-from ..files.parsing import LARGEST, SMALLEST, as_text, parsing
-from ..files.size_limits import read_bytes, unpacked
-from ..files.text_table import text_table
+from ..files.parsing import LARGEST, SMALLEST
+from ..files.tables import read_table
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
@@ -24,7 +22,6 @@ AMPLITUDES = ("ampl_rec", "amplitude", "ampl", "amp", "peak_amplitude", "relativ
 STARTS, STOPS = ("tstart", "start", "t_start", "time_start"), ("tstop", "stop", "t_stop", "time_stop", "end")
 #: Largest number of flares; results for more would be too many to read.
 MAX_FLARES = 500
-FORMATS = "CSV, ECSV or FITS"
 
 
 def read_flares(path: str | Path) -> QTable:
@@ -40,35 +37,7 @@ def read_flares(path: str | Path) -> QTable:
     QTable
         ``amplitude``, and ``start`` and ``stop`` in days of the table's own time system.
     """
-    path = Path(path)
-    named = f"flare table {shortened(str(path))}"
-    content = unpacked(read_bytes(path, "flare table"), named)
-    if content.startswith(b"SIMPLE  ="):
-        table = _fits_table(content, named)
-    else:
-        table = text_table(as_text(content, named), named, path.suffix.lower() == ".csv", FORMATS)
-    return flares_of(table, shortened(path.name))
-
-
-def _fits_table(content: bytes, named: str) -> Table:
-    """Read the first table of a FITS file; raises InputError if it claims to be larger than the file."""
-    import io
-
-    from astropy.io import fits
-    from astropy.table import Table
-
-    with parsing(named, FORMATS), warnings.catch_warnings(), fits.open(io.BytesIO(content), memmap=False) as hdus:
-        # Astropy warns of headers that it can read nevertheless.
-        warnings.simplefilter("ignore")
-        for hdu in hdus:
-            claimed = hdu.size
-            if claimed > len(content):
-                raise InputError(
-                    f"{named} says that it has {claimed} bytes of data", "at most the file's", key="file", value=claimed
-                )
-            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU):
-                return Table.read(hdu)
-        raise InputError(f"{named} has no table", FORMATS, key="file")
+    return flares_of(read_table(path, "flare table"), shortened(Path(path).name))
 
 
 def flares_of(table: Table | Any, name: str = "flare table") -> QTable:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -16,10 +17,11 @@ from mauvecl.study.labels import full_label
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from astropy.table import Table
+    from astropy.table import QTable, Table
 
     from mauvecl.host.expectation import Expectation
     from mauvecl.study.assumptions import Use
+    from mauvecl.study.cases import Case
     from mauvecl.study.study import Study
 
 
@@ -84,6 +86,33 @@ class Answer(Drawable, ContentEquality, ABC):
         """Tables as people read them, in the terminal and on the page."""
         return []
 
+    @cached_property
+    def neighbours(self) -> QTable | None:
+        """Neighbours of the stars that the answer observes, or None."""
+        from mauvecl.answers.neighbour_list import neighbour_table
+
+        return (
+            neighbour_table(self.observed, study=self.study.text())
+            if self.study.has_neighbours and "instrument" in self.uses
+            else None
+        )
+
+    @property
+    def observed(self) -> Sequence[Case]:
+        """Cases of the stars that the answer observes, at the study's own values; those of its study by default."""
+        from mauvecl.study.cases import cases
+
+        return cases(self.study, swept=False)
+
+    @property
+    def all_views(self) -> list[View]:
+        """The views and, if there are any, the neighbours."""
+        if self.neighbours is None:
+            return self.views
+        from mauvecl.answers.neighbour_list import COLUMNS
+
+        return [*self.views, View("Neighbours; what enters is an assumption", COLUMNS, self.neighbours)]
+
     @property
     def remarks(self) -> list[str]:
         """Remarks below the tables."""
@@ -99,7 +128,8 @@ class Answer(Drawable, ContentEquality, ABC):
         """Return what `--json` prints."""
         tables = {key: getattr(self, name) for key, name in self.JSON.items()}
         found = tables or {"rows": next(iter(self.tables.values()))}
-        return {"messages": list(self.messages)} | {key: records(table) for key, table in found.items()}
+        near = {} if self.neighbours is None else {"neighbours": self.neighbours}
+        return {"messages": list(self.messages)} | {key: records(table) for key, table in (found | near).items()}
 
     def write(self, folder: str | Path) -> list[Path]:
         """Write every table and the study, and return their paths.
@@ -123,4 +153,5 @@ class Answer(Drawable, ContentEquality, ABC):
     @property
     def files(self) -> dict[str, Table]:
         """The tables by the full names of their files."""
-        return {f"{name}.{ending}": table for name, table in self.tables.items() for ending in self.ENDINGS}
+        near = {} if self.neighbours is None else {"neighbours": self.neighbours}
+        return {f"{name}.{ending}": table for name, table in (self.tables | near).items() for ending in self.ENDINGS}

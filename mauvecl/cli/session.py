@@ -253,7 +253,7 @@ class Session:
             return
         from mauvecl.cli.console import show_view
 
-        for view in answer.views:
+        for view in answer.all_views:
             show_view(view)
         self.say(answer.remarks)
         self.finish()

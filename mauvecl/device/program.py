@@ -78,6 +78,7 @@ class Variant:
     jittered: bool = False
     counts: bool = False
     fourths: bool = False
+    neighbours: bool = False
     in_time: bool = False
 
     @property

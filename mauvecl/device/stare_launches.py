@@ -40,6 +40,7 @@ class StareLaunches(Launches):
             spectra=stare.components.n_flares,
             unknown_groups=-(-len(stare.kinds) // 4),
             counts=stare.counts,
+            neighbours=bool(stare.components.quiet.neighbour_electrons.any()),
             fourths=table is not None and table.fourths,
             jittered=any(stare.stare.jitters.values()),
             in_time=self._by_sums,

@@ -42,10 +42,10 @@ def components(
     Returns
     -------
     QTable
-        One row per pixel, in DN summed over the exposure: ``raw``, as drawn by the engine; the mean signals ``source``
-        and ``sky``; ``photon_noise`` and ``read_noise``; ``dark``; the charge of each enabled additive
-        process by its name; ``bias``; and ``digitisation``, the effect of rounding and clipping. ``raw`` is the sum of
-        the others.
+        One row per pixel, in DN summed over the exposure: ``raw``, as drawn by the engine; the mean signals ``source``,
+        ``sky`` and, if there are any, ``neighbours``; ``photon_noise`` and ``read_noise``; ``dark``; the charge of each
+        enabled additive process by its name; ``bias``; and ``digitisation``, the effect of rounding and clipping.
+        ``raw`` is the sum of the others.
 
     Notes
     -----
@@ -58,7 +58,10 @@ def components(
     n = scene.n_pixel
     each = x.n_frames // scene.n_draws  # frames in one draw
     gain = x.gain_dn_per_electron
-    parts = {name: np.zeros(n) for name in ("source", "sky", "photon_noise", "dark", "read_noise", *scene.additive)}
+    parts = {
+        name: np.zeros(n)
+        for name in ("source", "sky", "neighbours", "photon_noise", "dark", "read_noise", *scene.additive)
+    }
     raw = np.zeros(n)
     for frame in range(scene.n_draws):
         factors = reference.factors(scene, index, frame, seed)
@@ -86,32 +89,35 @@ def components(
                     electrons = reference.poisson_draw(drawn.photon, i, source, scene.tables, pairs)[0]
                     photon_dn[p] = source["gain"] * electrons
         source, sky = each * light * gain * x.source_electrons, each * light * glow * gain * x.sky_electrons
-        photon_variance = gain * (source + sky)
+        neighbours = each * light * gain * x.neighbour_electrons
+        photon_variance = gain * (source + sky + neighbours)
         read_variance = each * x.read_noise_dn**2 + (each - 1) / 12
         mean_dark = each * warm * x.dark_dn
         # All random parts of this draw: photon noise + read noise + dark counts, DN.
         total = scene.base_dn[0] + analogue[:n]
         for charge in added.values():
             total = total - charge[:n]
-        total = total - source - sky - each * x.bias_dn
+        total = total - source - sky - neighbours - each * x.bias_dn
         if scene.joint:
             dark = _dark_given_total(total, mean_dark, x.dark_step_dn, photon_variance + read_variance, u_dark[:n])
         else:
             dark = x.dark_step_dn * np.rint(mean_dark / x.dark_step_dn) + dark_dn[:n]
         rest = total - dark
         if scene.photons:
-            photon = gain * np.rint(each * (x.source_electrons + x.sky_electrons)) + photon_dn[:n] - source - sky
+            photon = gain * np.rint(each * x.light_electrons) + photon_dn[:n] - source - sky - neighbours
         else:
             both = photon_variance + read_variance
             share = np.divide(photon_variance, both, out=np.zeros(n), where=both > 0)
             photon = rest * share + np.sqrt(read_variance * share) * z_split[:n]
         charges = (charge[:n] for charge in added.values())
-        for name, part in zip(parts, (source, sky, photon, dark, rest - photon, *charges), strict=True):
+        for name, part in zip(parts, (source, sky, neighbours, photon, dark, rest - photon, *charges), strict=True):
             parts[name] += part
         raw += scene.base_dn[0] + dn[:n]
     parts["bias"] = np.asarray(x.n_frames * x.bias_dn)
     values = {"wavelength": x.wavelength_nm, "raw": raw} | parts
     values["digitisation"] = raw - sum(parts.values())
+    if not x.neighbour_electrons.any():
+        del values["neighbours"]
     values["net"] = raw - x.n_frames * (x.bias_dn + x.dark_dn) - x.subtracted_dn
     columns = [column for column in COLUMNS if column.name in values]
     about = {"signal": x.signal, "name": x.name, "exposure_s": x.exposure_s, "frames": x.n_frames, "seed": seed}
@@ -145,6 +151,7 @@ COLUMNS = (
             "raw": "simulated raw spectrum, summed over the frames (DN)",
             "source": "mean signal of the star",
             "sky": "mean signal of the zodiacal light",
+            "neighbours": "mean signal of neighbours in the fibre, which net does not contain",
             "photon_noise": "drawn photon noise of star and sky",
             "dark": "drawn dark counts",
             "read_noise": "drawn read noise",

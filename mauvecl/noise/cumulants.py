@@ -65,7 +65,7 @@ class Cumulants:
     def of(x: Expectation, each: int) -> Cumulants:
         """Compute the cumulants of a draw of `each` frames."""
         gain = x.gain_dn_per_electron
-        photons = each * (x.source_electrons + x.sky_electrons)
+        photons = each * x.light_electrons
         poisson = x.photon_noise == "poisson"
         # A stack of n rounded frames has a rounding variance of n/12; the rounding of the draw adds the last 1/12.
         other = each * x.read_noise_dn**2 + (each - 1) / 12

@@ -134,15 +134,16 @@ ELEMENT = np.dtype([("first", "u4"), ("end", "u4"), ("sky", "f4"), ("centre", "f
 #: A histogram: channel of its values, centre, and fine steps per unit of the statistic.
 GRID = np.dtype([("channel", "u4"), ("centre", "f4"), ("steps_per_unit", "f4")])
 
-#: A pixel of a stare's frames: the mean at unit coefficients minus the whole DN that kernels omit; star, sky and dark
-#: at unit coefficients, DN; second to fifth cumulants of the photons divided by their mean, of the total at unit
-#: coefficients, and of the dark.
+#: A pixel of a stare's frames: the mean at unit coefficients minus the whole DN that kernels omit; star, sky, dark and
+#: neighbours at unit coefficients, DN; second to fifth cumulants of the photons divided by their mean, of the total at
+#: unit coefficients, and of the dark.
 MIXTURE = np.dtype(
     [
         ("rest", "f4"),
         ("star", "f4"),
         ("sky", "f4"),
         ("dark", "f4"),
+        ("neighbours", "f4"),
         ("photon_variance", "f4"),
         ("photon_third", "f4"),
         ("photon_fourth", "f4"),
@@ -177,7 +178,10 @@ STARE_JOB = np.dtype(
 )
 
 #: Rows of the known properties of frames: coefficients, the same minus one, and the factor on all light.
-KNOWN_OF_FRAMES = ("star", "star_less_one", "sky", "sky_less_one", "dark", "dark_less_one", "light")
+KNOWN_OF_FRAMES = (
+    *("star", "star_less_one", "sky", "sky_less_one", "dark", "dark_less_one", "neighbours", "neighbours_less_one"),
+    "light",
+)
 #: Parts of the signal that unknowns of a stare change, in the order of their numbers.
 MOVED = CHANGING
 #: Frames are padded to a multiple of this.

@@ -49,7 +49,7 @@ def detector_pixels(quiet: Expectation, used: NDArray[np.bool_]) -> NDArray[np.v
 
 def sky_share(x: Expectation) -> Float:
     """Return the sky's share of each pixel's light, shape (n_pixel,); zero without light."""
-    light = x.source_electrons + x.sky_electrons
+    light = x.light_electrons
     return np.divide(x.sky_electrons, light, out=np.zeros_like(light), where=light > 0)
 
 

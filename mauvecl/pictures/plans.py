@@ -128,6 +128,7 @@ ORIGINS = {
     "dark": ("dark current", "#CC79A7"),
     "read": ("read noise", "#E69F00"),
     "zodiacal_photon": ("zodiacal photons", "#0072B2"),
+    "neighbour_photon": ("neighbours' photons", "#D55E00"),
     "total": ("total", "#000000"),
 }
 
@@ -151,6 +152,8 @@ def noise_budget(plt: Any, observed: Sequence[tuple[str, Expectation]], *, each:
     for k, (title, x) in enumerate(observed):
         axis, budget = axes[k % stars][k // stars], x.noise_budget()
         for name, (text, colour) in ORIGINS.items():
+            if name not in budget.colnames:
+                continue
             axis.plot(budget["wavelength"].value, budget[name].value, color=colour, label=text, linewidth=1.0)
         axis.set_title(title)
         axis.set_yscale("log")

@@ -61,6 +61,7 @@ def describe(store: Store, folder: Path) -> None:
                 for name, values in (
                     ("source", gain * x.source_electrons),
                     ("sky", gain * x.sky_electrons),
+                    *([("neighbours", gain * x.neighbour_electrons)] if x.neighbour_electrons.any() else []),
                     ("noise", np.sqrt(x.variance_dn2 * n / x.n_frames)),
                 ):
                     _values(group, f"{scene.name}-{name}", values, "DN", ["pixel"])

@@ -118,5 +118,8 @@ def unused_unknowns(study: Study, uses: Collection[Use]) -> list[str]:
         + [f"stare.{course}" for course in COURSES if getattr(s, course)],
         "values": ["unknowns.draws"] if study.unknowns.draws else [],
     }
+    # Verbs of an orbit look at targets, not at the study's star.
+    observes = "instrument" in uses and "orbit" not in uses
+    near = [] if observes or all(star.neighbours is None for star in study.star) else ["star.neighbours"]
     usual = ["nuisances.usual"] if n.usual and not {"processes", "stare"} & {*uses} else []
-    return [key for use, keys in given.items() if use not in uses for key in keys] + usual
+    return [key for use, keys in given.items() if use not in uses for key in keys] + usual + near

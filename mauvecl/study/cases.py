@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.sky.zodiacal import Sky
+    from mauvecl.host.stars.neighbours import Neighbours
     from mauvecl.host.stars.source import Source
     from mauvecl.lightcurve.flares.events import Event
     from mauvecl.lightcurve.stares.light_curves import StareExpectation
@@ -41,7 +42,12 @@ class Loader:
     def __init__(self, source: Callable[[Star], Source] | None = None) -> None:
         self.source: Callable[[Star], Source] = lru_cache(MAX_SOURCES)(source or (lambda star: star.source()))
         self.sky: Callable[[SkyLight], Sky] = lru_cache(MAX_SOURCES)(lambda light: light.sky())
+        self._near: Callable[[Star], Neighbours | None] = lru_cache(MAX_SOURCES)(lambda star: star.near())
         self._instruments: dict[str, Instrument] = {}
+
+    def neighbours(self, star: Star) -> Neighbours | None:
+        """Return the neighbours of a star, whatever its magnitude."""
+        return None if star.neighbours is None else self._near(star.model_copy(update={"magnitude": None}))
 
     def instrument(self, observation: Observation) -> Instrument:
         """Return the instrument of an observation."""
@@ -91,6 +97,11 @@ class Case:
     def source(self) -> Source:
         """Spectrum of the star without a flare."""
         return self.loader.source(self.star)
+
+    @property
+    def neighbours(self) -> Neighbours | None:
+        """Neighbours of the star, or None."""
+        return self.loader.neighbours(self.star)
 
     @property
     def instrument(self) -> Instrument:
@@ -148,6 +159,7 @@ class Case:
 
         o = self.study.observation
         how: dict[str, Any] = {"exposure": o.exposure_s, "sky": self.sky, "order": o.order, "signal": o.signal}
+        how["neighbours"] = self.neighbours
         return [expect(source, self.instrument, **how) for source in sources]
 
     def unknowns(self, quiet: Expectation | None = None) -> Nuisances | None:

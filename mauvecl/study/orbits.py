@@ -133,6 +133,10 @@ class OrbitQuestion(Section):
         return TimeGrid(self.start, self.days, self.step_s)
 
 
+#: Keys of a target that hold paths, relative to its table or the study file.
+PATH_KEYS = ("rates_file", "neighbours")
+
+
 class PlanTarget(Section):
     """Position, spectrum and flare rates of a star in a plan.
 
@@ -164,6 +168,13 @@ class PlanTarget(Section):
     at_erg: Annotated[Energy | None, Help("That energy")] = None
     rates_file: Annotated[Path | None, Help("File with a cumulative distribution of energies")] = None
     rates_band: Annotated[str, Help("Band of the energies in that file")] = "bolometric"
+    neighbours: Annotated[Path | None, Help("Table of other stars near the target, as for a star")] = None
+    neighbours_of: Annotated[str | None, Help("The target's own row in that table, or its coordinates")] = None
+    neighbour_share: Annotated[
+        float,
+        Range(0, 1),
+        Help("Share of the light of neighbours within the fibre's radius that enters it", "an assumption"),
+    ] = 1.0
 
     @model_validator(mode="after")
     def _one_distribution(self) -> Self:
@@ -350,9 +361,9 @@ def read_targets(path: Path) -> list[dict[str, Any]]:
             one["coordinates"] = f"{one.pop('ra')} {one.pop('dec')}"
         if "name" in one:
             one["name"] = str(one["name"])
-        file = one.get("rates_file")
-        if isinstance(file, str):
-            one["rates_file"] = path.parent / file
+        for key in PATH_KEYS:
+            if isinstance(one.get(key), str):
+                one[key] = path.parent / one[key]
         try:
             PlanTarget.model_validate(one)
         except ValidationError as error:
@@ -376,8 +387,9 @@ def resolve_plan_paths(data: dict[str, Any], folder: Path) -> None:
         orbit["tle"] = str(folder / orbit["tle"])
     targets = plan.get("targets") if isinstance(plan, dict) else None
     for one in targets if isinstance(targets, list) else ():
-        if isinstance(one, dict) and isinstance(one.get("rates_file"), str):
-            one["rates_file"] = str(folder / one["rates_file"])
+        for key in PATH_KEYS:
+            if isinstance(one, dict) and isinstance(one.get(key), str):
+                one[key] = str(folder / one[key])
 
 
 def drop_default_plan(data: dict[str, Any], study: Study) -> None:

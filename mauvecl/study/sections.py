@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.sky.zodiacal import Sky
     from mauvecl.host.stars.flare_spectra import FlareSpectrum
+    from mauvecl.host.stars.neighbours import Neighbours
     from mauvecl.host.stars.source import Source
     from mauvecl.noise.comparison import Comparison
 
@@ -50,7 +51,9 @@ def amplitudes_in(path: Path, _: str) -> list[float]:
 #: Keys that only apply to a star from a file.
 FILE_KEYS = ("file", "wavelength_unit", "flux_unit", "extend")
 #: Keys that describe one star and are dropped when another star replaces it.
-STAR_KEYS = (*FILE_KEYS, "distance_pc", "radius_rsun", "effective_temperature_k")
+STAR_KEYS = (
+    *FILE_KEYS, "distance_pc", "radius_rsun", "effective_temperature_k", "neighbours", "neighbours_of"
+)  # fmt: skip
 
 
 class Star(Section):
@@ -117,6 +120,22 @@ class Star(Section):
     effective_temperature_k: Annotated[
         Temperature | None, Help("Effective temperature of the star", "for energies"), Flag("--star-temperature")
     ] = None
+    neighbours: Annotated[
+        Path | None,
+        Help("Table of other stars near the star", "with separation, magnitude and spectral type, or of a Gaia query"),
+        Flag("--neighbours"),
+    ] = None
+    neighbours_of: Annotated[
+        str | None,
+        Help("The star's own row in that table, by name, or its coordinates"),
+        Flag("--neighbours-of"),
+    ] = None
+    neighbour_share: Annotated[
+        float,
+        Range(0, 1),
+        Help("Share of the light of neighbours within the fibre's radius that enters it", "an assumption"),
+        Flag("--neighbour-share"),
+    ] = 1.0
 
     @model_validator(mode="after")
     def _one_spectrum(self) -> Self:
@@ -132,12 +151,29 @@ class Star(Section):
                 key=given[0],
                 value=getattr(self, given[0]),
             )
+        if self.neighbours is None and self.neighbours_of is not None:
+            raise InputError(
+                "a star has neighbours_of without neighbours",
+                "the table of its neighbours as well",
+                key="neighbours_of",
+                value=self.neighbours_of,
+            )
         return self
 
     def with_value(self, path: Sequence[str], value: Any) -> Self:
         """Return a copy with another value; another star of the library drops all that describes this one."""
         changed = super().with_value(path, value)
         return changed.model_copy(update=dict.fromkeys(STAR_KEYS)) if path[0] == "library" else changed
+
+    def near(self) -> Neighbours | None:
+        """Read the star's neighbours, or return None if it has none."""
+        if self.neighbours is None:
+            return None
+        from mauvecl.host.stars.neighbour_table import read_neighbours
+        from mauvecl.host.stars.neighbours import Neighbours
+
+        stars, notes = read_neighbours(self.neighbours, self.neighbours_of)
+        return Neighbours(stars, self.neighbour_share, notes)
 
     def source(self) -> Source:
         """Load the spectrum and scale it to the magnitude, if one is given."""

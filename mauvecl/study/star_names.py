@@ -31,7 +31,7 @@ def check_spectrum(name: str) -> None:
     if row is None:
         catalogue.find(name)
         return
-    from mauvecl.study.spectral_types import nearest_spectrum
+    from mauvecl.host.stars.spectral_types import nearest_spectrum
 
     raise InputError(
         f"star {name!r} has no spectrum of its own in the library",

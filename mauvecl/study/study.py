@@ -110,8 +110,9 @@ class Study(Section):
             locate_files(data, path)
         for star in data.get("star", []) if isinstance(data.get("star"), list) else []:
             # Paths are relative to the study file.
-            if isinstance(star, dict) and isinstance(star.get("file"), str):
-                star["file"] = str(path.parent / star["file"])
+            for key in ("file", "neighbours"):
+                if isinstance(star, dict) and isinstance(star.get(key), str):
+                    star[key] = str(path.parent / star[key])
         run = data.get("run")
         if isinstance(run, dict) and isinstance(run.get("weights"), dict):
             run["weights"] = {k: str(path.parent / v) if isinstance(v, str) else v for k, v in run["weights"].items()}
@@ -199,8 +200,10 @@ class Study(Section):
         if not data["run"]["weights"]:
             del data["run"]["weights"]
         for star in data["star"]:
-            if "file" in star:
-                star["file"] = str(Path(star["file"]).resolve())
+            for key in {"file", "neighbours"} & star.keys():
+                star[key] = str(Path(star[key]).resolve())
+            if "neighbours" not in star:
+                del star["neighbour_share"]
         return tomli_w.dumps(data)
 
     def __repr__(self) -> str:
@@ -246,6 +249,11 @@ class Study(Section):
             )
         one = QUANTITIES[quantity]
         return self.with_value(one.path, one.checked(value))
+
+    @property
+    def has_neighbours(self) -> bool:
+        """True if a star or a target of a plan has a table of neighbours."""
+        return any(one.neighbours is not None for one in (*self.star, *self.plan.targets))
 
     def expectations(self, star: Star) -> list[Expectation]:
         """Return the expectations of a star without a flare and with each flare."""

@@ -25,7 +25,7 @@ def read_embedded_study(path: Path) -> str:
 
 
 def with_file_digests(text: str) -> str:
-    """Replace the paths of spectra in a study's text by names and digests, since answers do not depend on paths."""
+    """Replace the paths of spectra and neighbours in a study's text by names and digests, not by paths."""
     import tomli_w
 
     data = tomllib.loads(text)
@@ -42,16 +42,16 @@ def with_file_digests(text: str) -> str:
 
 
 def _named_files(data: dict[str, Any]) -> list[tuple[dict[str, Any], str]]:
-    """List the sections of stars and flare that name a spectrum file, with the key."""
+    """List the sections of stars and flare that name a file, with the key."""
     stars, flare = data.get("star"), data.get("flare")
-    sections = [(star, "file") for star in (stars if isinstance(stars, list) else [])]
+    sections = [(star, key) for star in (stars if isinstance(stars, list) else []) for key in ("file", "neighbours")]
     light = flare.get("spectrum") if isinstance(flare, dict) else None
     sections += [(light, "file"), (light, "quiescent")]
     return [(one, key) for one, key in sections if isinstance(one, dict) and isinstance(one.get(key), str)]
 
 
 def locate_files(data: dict[str, Any], table: Path) -> None:
-    """Locate the spectrum files that the study of an answer's table gives by name and digest, in place.
+    """Locate the files that the study of an answer's table gives by name and digest, in place.
 
     Searches the table's folder, its parent, the current folder, and the paths in a ``study.toml`` next to the table.
     Raises InputError if no file with the name and digest is found.

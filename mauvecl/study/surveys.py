@@ -13,7 +13,7 @@ from mauvecl.lightcurve.search.bank import Bank
 from mauvecl.lightcurve.search.flare_fit import SingleFlareFit
 from mauvecl.lightcurve.search.survey import Survey
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates, frame_nuisances
-from mauvecl.lightcurve.stares.frame_components import Components
+from mauvecl.lightcurve.stares.frame_components import STEADY, Components
 from mauvecl.schema.errors import InputError
 from mauvecl.study.flare_light import FlareLight
 from mauvecl.study.stare_expectation import energy_scale
@@ -44,8 +44,8 @@ class StarSurvey:
     def unit_snr(self) -> float:
         """S/N of one frame for the study's flare at constant unit amplitude and known baseline."""
         x = self.survey.components
-        unit = np.zeros(3 + x.n_flares)
-        unit[:3], unit[3] = 1.0, 1.0
+        unit = np.zeros(len(STEADY) + x.n_flares)
+        unit[: len(STEADY) + 1] = 1.0
         return float(np.linalg.norm(x.means(unit)))
 
 

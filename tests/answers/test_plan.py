@@ -15,6 +15,7 @@ from mauvecl.answers.campaigns.plan_text import target_lines
 from mauvecl.answers.campaigns.planned import TargetObservation
 from mauvecl.answers.campaigns.planned_injections import injection_case
 from mauvecl.answers.files import write_study, write_table
+from mauvecl.host.stars.spectral_types import nearest_spectrum, subtype
 from mauvecl.lightcurve.flares.energies import EnergyScale, quiescent_luminosity
 from mauvecl.lightcurve.flares.rates import davenport2019
 from mauvecl.lightcurve.search.completeness import Completeness
@@ -22,7 +23,6 @@ from mauvecl.lightcurve.stares.orbit_stare import stare_along
 from mauvecl.schema.tables import records
 from mauvecl.study.cases import Case
 from mauvecl.study.orbits import read_targets
-from mauvecl.study.spectral_types import nearest_spectrum, subtype
 
 #: Injections take ten seconds a target.
 QUICK = {"completeness": "closed form"}

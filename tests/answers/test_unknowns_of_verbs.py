@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -131,6 +132,40 @@ def test_no_unknown_is_ignored_silently(verb: str, name: str) -> None:
         assert name.split(".")[1] in f"{reason.key} {reason}", reason
     else:
         assert differ(found, base, messages=verb == "plan"), f"{name} changes nothing that {verb} answers"
+
+
+NEAR = "name,separation,magnitude,spectral_type\nB,10,6.5,F5V\nC,48,1,A0V\n"
+
+
+@pytest.mark.parametrize(
+    "verb", [verb if verb in FAST else pytest.param(verb, marks=pytest.mark.long) for verb in ASKED]
+)
+def test_neighbours_change_every_verb(verb: str, tmp_path: Path) -> None:
+    """Answers change and list the neighbours; a verb that observes no star names them as not used."""
+    (tmp_path / "near.csv").write_text(NEAR)
+    study = asked(verb, {})
+    near = {"neighbours": tmp_path / "near.csv", "neighbour_share": 0.5}
+    if verb == "plan":
+        (target,) = study.plan.targets
+        plan = study.plan.model_copy(update={"targets": (target.model_copy(update=near),)})
+        study = study.model_copy(update={"plan": plan})
+    else:
+        study = study.model_copy(update={"star": (study.star[0].model_copy(update=near),)})
+    found = VERBS[verb].ask(study, engine_of(verb))
+    if verb == "visible":
+        assert found.assumed.endswith("not used: star.neighbours.")
+        assert found.neighbours is None
+        return
+    assert differ(found, plain(verb), messages=False)
+    table = found.neighbours
+    assert table["enters"].tolist() == [True, False]
+    assert table.meta["assumed_share"] == 0.5
+    assert table["share"][0] > 0.05
+    assert table["share"][1] == 0
+    assert any("assumption: 50 % of it enters" in text for text in found.messages)
+    if verb in ("detect", "limit", "inject", "plan"):
+        shares = next(iter(found.tables.values()))["target_share"]
+        assert ((shares > 0) & (shares < 0.9)).all()
 
 
 def test_answers_report_unused_unknowns() -> None:

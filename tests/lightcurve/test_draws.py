@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import instrument, star
+from scenes import NEAR, instrument, star
 from scipy import special
 
 from mauvecl.device.engine import Engine
@@ -167,18 +167,20 @@ def mixture_cumulants(components: Components, coefficients: Any, mixture: Any, s
 
 def test_components_equal_the_expectations(stares: Stares) -> None:
     """Means and variances of any mixture of star, sky, dark and flares are those of an expectation made for it."""
-    quiet, *flares = star(amplitudes=(0.5, 2.0), exposure=5.0, payload=instrument(part=True))
+    quiet, *flares = star(amplitudes=(0.5, 2.0), exposure=5.0, payload=instrument(part=True), neighbours=NEAR)
+    assert quiet.target_share < 0.7
     rng = np.random.default_rng(2)
     weights = rng.standard_normal((3, quiet.wavelength_nm.size))
     components = Components.of(quiet, flares, weights)
-    for wanted, coefficients in ((quiet, [1, 1, 1, 0, 0]), (flares[0], [1, 1, 1, 1, 0]), (flares[1], [1, 1, 1, 0, 1])):
+    for wanted, rise in ((quiet, [0, 0]), (flares[0], [1, 0]), (flares[1], [0, 1])):
+        coefficients = [1, 1, 1, 1, *rise]
         means = components.means(np.array(coefficients, float))
         np.testing.assert_allclose(means, weights @ (wanted.mean_raw_dn - quiet.mean_raw_dn), rtol=1e-9, atol=1e-9)
         covariance = components.covariance(np.array(coefficients, float))
         np.testing.assert_allclose(covariance, weights * wanted.unsaturated_variance_dn2 @ weights.T, rtol=1e-9)
     # What small changes of the conditions move.
-    at, little = np.array([[0.9, 1.2, 1.5, 0.3, 0.1]]), 1e-6
-    changes = {"star": [0], "light": [0, 1, 3, 4], "sky": [1], "temperature": [2]}
+    at, little = np.array([[0.9, 1.2, 1.5, 1.1, 0.3, 0.1]]), 1e-6
+    changes = {"star": [0], "light": [0, 1, 3, 4, 5], "sky": [1], "temperature": [2]}
     for of, direction in components.directions(at).items():
         there = at.copy()
         there[:, changes[of]] *= np.exp(little * (0.0684 if of == "temperature" else 1.0))
@@ -187,5 +189,5 @@ def test_components_equal_the_expectations(stares: Stares) -> None:
     # A month of 5 s frames stays a few numbers to a frame.
     month = Stare.of(30 * 86_400.0, thermal=0.5)
     known = components.coefficients(month)
-    assert known.shape == (518_400, 5)
+    assert known.shape == (518_400, 6)
     assert components.means(known).shape == (518_400, 3)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from marks import long_but
 from refusals import refused
-from scenes import instrument, star
+from scenes import NEAR, instrument, star
 
 from mauvecl.device.engine import Engine
 from mauvecl.device.stare_engine import Stares
@@ -41,6 +41,7 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any], int, int, int, dict[str, 
     "electrons": ({"name": "mauve-electrons"}, WOBBLE, 2, 1, 3, {}),
     "cold, fourth cumulants": ({"temperature_c": -20.0, "output_max_nm": 303.0}, WOBBLE, 2, 1, 0, {}),
     "Poisson photons": ({"photon_noise": "poisson"}, WOBBLE, 3, 1, 0, {}),
+    "neighbours": ({}, WOBBLE, 3, 2, 0, {}),
     "cosmic rays": ({}, WOBBLE, 2, 1, 2, {"processes": Processes(cosmic_rays=CosmicRays(rate_per_cm2_s=200.0))}),
 }
 
@@ -50,7 +51,8 @@ def case(name: str) -> tuple[Components, Stare, Any, Any, dict[str, Any]]:
     payload, wobble, n_sums, n_flares, n_scenarios, more = CASES[name]
     options = {"output_min_nm": 300.0, "output_max_nm": 312.0} | payload
     used = instrument(options.pop("name", "mauve"), **options)
-    quiet, *flares = star(amplitudes=(0.5, 2.0)[:n_flares], exposure=5.0, payload=used)
+    near = NEAR if name == "neighbours" else None
+    quiet, *flares = star(amplitudes=(0.5, 2.0)[:n_flares], exposure=5.0, payload=used, neighbours=near)
     wavelength = quiet.wavelength_nm - quiet.wavelength_nm.mean()
     weights = np.array([np.cos(k * wavelength / wavelength.max()) + 0.2 for k in range(n_sums)])
     stare = Stare.of(110.0, temperature_c=used.temperature_c, **wobble)
@@ -66,7 +68,7 @@ def stares(request: pytest.FixtureRequest, engine: Engine) -> Stares:
     return Stares(engine.open_device) if request.param == "vectors" else Stares(width=1)
 
 
-@pytest.mark.parametrize("name", long_but(CASES, "plain", "all that wobbles"))
+@pytest.mark.parametrize("name", long_but(CASES, "plain", "all that wobbles", "neighbours"))
 @pytest.mark.parametrize("method", ["pixels", "cumulants"])
 def test_stares_equal_the_reference(stares: Stares, name: str, method: Any) -> None:
     components, stare, flare, amplitudes, more = case(name)

@@ -143,8 +143,7 @@ def test_flares_equal_those_without_a_drift(drifting, size):
     peak, width = 3000.0, 60.0
     edges = np.column_stack([one.stare.start_s, one.stare.start_s + 5.0])
     shape = DAVENPORT.mean_over(edges, peak, width)
-    unit = np.zeros(4)
-    unit[:] = 1.0
+    unit = np.ones(5)
     response = one.components.means(unit)
     amplitude = size / np.linalg.norm(shape) / np.linalg.norm(response)
     flare = amplitude * shape[:, None] * response

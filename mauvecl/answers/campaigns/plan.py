@@ -23,6 +23,7 @@ from mauvecl.answers.campaigns.planned import (
     star_of,
 )
 from mauvecl.answers.campaigns.visible import VisibleAnswer, assumption_columns, visible
+from mauvecl.answers.neighbour_list import share_columns
 from mauvecl.host.orbit.conditions import PARTICLES_SOURCE, THERMAL_SOURCE
 from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
 from mauvecl.runs.pool import map_in_order
@@ -131,7 +132,8 @@ class PlanAnswer(Answer):
         """Columns of the table of targets."""
         alarms = Column("false_alarms", lambda one: self.study.search.rate * one.hours / 24, "", "expected of noise",
                         "false alarms", two_digits)  # fmt: skip
-        return (*COLUMNS[:-1], alarms, COLUMNS[-1])
+        share = share_columns(self.study.has_neighbours, "observation.quiet.target_share")
+        return (*COLUMNS[:-1], alarms, *share, COLUMNS[-1])
 
     @property
     def table(self) -> QTable:
@@ -235,6 +237,11 @@ class PlanAnswer(Answer):
             "assumptions": self.assumptions,
         }
 
+    @property
+    def observed(self) -> list[Case]:
+        """One frame of each target."""
+        return [one.observation.case for one in self.planned]
+
     @cached_property
     def inputs(self) -> list[Expectation]:
         """One frame of each star."""
@@ -244,6 +251,9 @@ class PlanAnswer(Answer):
     def messages(self) -> list[str]:
         """What saturates, which targets have no answer and why, what is extrapolated, what is said of visibility."""
         lines = [text for text in collect_messages(self.inputs) if text.startswith(SATURATED)]
+        for case in self.observed:
+            if case.neighbours is not None:
+                lines += case.neighbours.messages(case.label, case.instrument)
         typical = [one.name for one in self.planned if one.rates is not None and "typical" in one.rates.source]
         if typical:
             lines.append(

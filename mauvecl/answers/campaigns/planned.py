@@ -11,6 +11,7 @@ import numpy as np
 
 from mauvecl.answers.campaigns.conditions import Conditions, OrbitConditions
 from mauvecl.host.orbit.targets import Target
+from mauvecl.host.stars.spectral_types import nearest_spectrum
 from mauvecl.lightcurve.flares.energies import EnergyScale, quiescent_luminosity
 from mauvecl.lightcurve.flares.rates import BOLOMETRIC, Rates
 from mauvecl.lightcurve.search.completeness import Completeness, frame_signal
@@ -19,7 +20,6 @@ from mauvecl.schema.errors import InputError
 from mauvecl.study.cases import Case
 from mauvecl.study.orbits import PlanTarget
 from mauvecl.study.sections import SkyLight, Star
-from mauvecl.study.spectral_types import nearest_spectrum
 from mauvecl.study.stare_expectation import energy_scale
 
 if TYPE_CHECKING:
@@ -160,6 +160,7 @@ def star_of(text: PlanTarget, simbad: bool) -> Star:
             value=text.name,
         )
     library = nearest_spectrum(given.pop("spectral_type"))
+    given |= {name: getattr(text, name) for name in ("neighbours", "neighbours_of", "neighbour_share")}
     return Star(library=library, **given)
 
 

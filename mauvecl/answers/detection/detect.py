@@ -13,6 +13,7 @@ import numpy as np
 
 from mauvecl.answers.answer import Answer, InCell
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
+from mauvecl.answers.neighbour_list import share_columns
 from mauvecl.results.detection import departures
 from mauvecl.results.detection.campaign import campaign, per_test
 from mauvecl.results.detection.departures import departure_table
@@ -92,7 +93,8 @@ class DetectAnswer(Answer):
             lambda star: np.repeat(star.amplitudes, len(star.detection.statistics)),
             f"relative rise of the photons in the band {self.study.flare.band}",
         )
-        return (*place_columns(self.study, "amplitude"), amplitude, *FOUND)
+        share = share_columns(self.study.has_neighbours, "detection.quiet.target_share")
+        return (*place_columns(self.study, "amplitude"), *share, amplitude, *FOUND)
 
     @cached_property
     def table(self) -> QTable:

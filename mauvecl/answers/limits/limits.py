@@ -12,6 +12,7 @@ from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import Cost, cost_lines, marginal_lines, unknown_cost
 from mauvecl.answers.limits.assumptions import assumption_columns
 from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle, single_flares
+from mauvecl.answers.neighbour_list import share_columns
 from mauvecl.results.requests.fap_checks import check_fap
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -135,6 +136,7 @@ class LimitAnswer(Answer):
         check = "detection probability there, with a fresh seed"
         columns = (
             *self._place,
+            *share_columns(self.study.has_neighbours, "quiet.target_share"),
             Column(of, "value.value", unit, "where the flare is detected with the wanted probability",
                    "exposure (s)" if of == "exposure" else of, digits),
             Column("low", "value.low", unit, "its 95 % interval, lower end, with the threshold's own", INTERVAL,

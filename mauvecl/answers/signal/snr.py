@@ -101,9 +101,11 @@ class SnrAnswer(Answer):
 
         parts = [(star, star.result.element[at(star, "element")]) for star in self.stars]
         budgets = [(star, star.result.expectation.noise_budget()[at(star, "pixel")]) for star in self.stars]
+        noise = stacked(place, budgets)
+        sources = [one for one in BUDGET_COLUMNS if one.name in noise.colnames]
         return [
             View("S/N per 10.5 nm element; all of them in the files", (*place, *COLUMNS), stacked(place, parts)),
-            View("Noise of a pixel by origin, DN rms", (*place, *BUDGET_COLUMNS), stacked(place, budgets)),
+            View("Noise of a pixel by origin, DN rms", (*place, *sources), noise),
         ]
 
     def together(self, table_of: Callable[[SnrResult], QTable]) -> QTable:

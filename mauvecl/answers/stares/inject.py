@@ -12,6 +12,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, InCell
+from mauvecl.answers.neighbour_list import share_columns
 from mauvecl.lightcurve.search.counted_rate import CountedRate, consecutive_alarm_rate
 from mauvecl.lightcurve.search.fit_accuracy import FitAccuracy, Refit
 from mauvecl.lightcurve.search.injected_completeness import InjectedCompleteness
@@ -207,17 +208,23 @@ class InjectAnswer(Answer):
     @cached_property
     def table(self) -> QTable:
         """One row per star, cell of the sweep, and what is found of all half-widths and of each: sizes E50 and E90."""
-        return stacked(place_columns(self.study), ((one, one.limits) for one in self.stars), **self._about)
+        return stacked(self._place, ((one, one.limits) for one in self.stars), **self._about)
 
     @cached_property
     def completeness(self) -> QTable:
         """One row per star, cell of the sweep, half-width and size."""
-        return stacked(place_columns(self.study), ((one, one.cells) for one in self.stars), **self._about)
+        return stacked(self._place, ((one, one.cells) for one in self.stars), **self._about)
 
     @cached_property
     def search(self) -> QTable:
         """One row per star and cell of the sweep: thresholds, false alarms."""
-        return table_of((*place_columns(self.study), *SEARCH_COLUMNS), self.stars, **self._about)
+        return table_of((*self._place, *SEARCH_COLUMNS), self.stars, **self._about)
+
+    @property
+    def _place(self) -> tuple[Column, ...]:
+        """Columns of the star, the sweep and the dilution."""
+        share = share_columns(self.study.has_neighbours, "surveyed.quiet.target_share")
+        return (*place_columns(self.study), *share)
 
     @property
     def views(self) -> list[View]:
@@ -229,7 +236,7 @@ class InjectAnswer(Answer):
             unit = f" ({SIZE_UNITS[one.sizes.of]})" if SIZE_UNITS[one.sizes.of] else ""
             found = f"{one.title}: {one.sizes.of}{unit} of which a half (E50) and nine tenths (E90) are found"
             limits.append(View(found, limit_columns(one.sizes.of), one.limits))
-        return [View(title, (*place_columns(self.study), *SEARCH_COLUMNS), self.search), *limits]
+        return [View(title, (*self._place, *SEARCH_COLUMNS), self.search), *limits]
 
     @property
     def _about(self) -> dict[str, object]:

@@ -78,7 +78,7 @@ class Injections:
     def response(self) -> Float:
         """Mean sums of a frame for a flare of unit amplitude, shape (n_sum,)."""
         unit = np.zeros(len(STEADY) + self.survey.components.n_flares)
-        unit[:3] = 1.0
+        unit[: len(STEADY)] = 1.0
         unit[len(STEADY) + self.flare] = 1.0
         return self.survey.components.means(unit)
 

@@ -42,7 +42,7 @@ class Survey:
 
     @cached_property
     def coefficients(self) -> Float:
-        """Known coefficients of each frame's components without a flare, shape (n_frame, 3 + n_flare)."""
+        """Known coefficients of each frame's components without a flare, shape (n_frame, 4 + n_flare)."""
         return self.components.coefficients(self.stare)
 
     @cached_property

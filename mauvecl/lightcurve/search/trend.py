@@ -49,6 +49,7 @@ class Trend:
     curves: Float  # change per standard deviation of each unknown, shape (n_unknown, n_frame)
     star: Float  # known mean, shape (n_frame, n_sum)
     sky: Float  # known mean, shape (n_frame, n_sum)
+    neighbours: Float  # known mean, shape (n_frame, n_sum)
     dark: Float  # known mean, shape (n_frame, n_sum)
     slope_per_c: float  # relative change of the dark current per deg C
 
@@ -65,11 +66,12 @@ class Trend:
         """Return the trend of a stare's unknowns, or None without unknowns; for `directions`, see `Survey`."""
         if not unknowns:
             return None
-        sky = directions["light"] - directions["star"]
+        star, sky = directions["star"], directions["sky"]
+        neighbours = directions["light"] - star - sky
         dark = directions["temperature"] / slope_per_c if slope_per_c else np.zeros_like(sky)
         curves = np.array([one.sd * one.curve for one in unknowns])
         of = tuple(one.of for one in unknowns)
-        return cls(frames, frame_s, variance, of, curves, directions["star"], sky, dark, slope_per_c)
+        return cls(frames, frame_s, variance, of, curves, star, sky, neighbours, dark, slope_per_c)
 
     @cached_property
     def extremes(self) -> Float:
@@ -95,7 +97,7 @@ class Trend:
 
     def part(self, part: slice) -> Trend:
         """Return the trend of some frames."""
-        names = ("frames", "variance", "star", "sky", "dark")
+        names = ("frames", "variance", "star", "sky", "neighbours", "dark")
         return replace(self, curves=self.curves[:, part], **{name: getattr(self, name)[part] for name in names})
 
     def subtracted(self, sums: NDArray[Any]) -> NDArray[np.float64]:
@@ -145,8 +147,8 @@ class Trend:
     @cached_property
     def _linear(self) -> dict[str, Float]:
         """Mean response of the sums to each kind of change, shape (n_sum,)."""
-        star, sky, dark = (x.mean(axis=0) for x in (self.star, self.sky, self.dark))
-        return {"star": star, "light": star + sky, "sky": sky, "temperature": self.slope_per_c * dark}
+        star, sky, near, dark = (x.mean(axis=0) for x in (self.star, self.sky, self.neighbours, self.dark))
+        return {"star": star, "light": star + sky + near, "sky": sky, "temperature": self.slope_per_c * dark}
 
     @cached_property
     def _blocks(self) -> tuple[NDArray[np.int64], Float, Trend]:
@@ -166,6 +168,7 @@ class Trend:
             curves=mean(self.curves, 1),
             star=mean(self.star),
             sky=mean(self.sky),
+            neighbours=mean(self.neighbours),
             dark=mean(self.dark),
         )
         return first, weight, means
@@ -183,7 +186,8 @@ class Trend:
         light = changes["light"] + 1
         star, sky = light * (1 + changes["star"]) - 1, light * (1 + changes["sky"]) - 1
         warm = np.expm1(self.slope_per_c * changes["temperature"])
-        return np.asarray(star[..., None] * self.star + sky[..., None] * self.sky + warm[..., None] * self.dark)
+        lit = star[..., None] * self.star + sky[..., None] * self.sky + changes["light"][..., None] * self.neighbours
+        return np.asarray(lit + warm[..., None] * self.dark)
 
     def _gradient(self, changes: Mapping[str, Float]) -> Float:
         """Return the derivatives of `_moved` by the amplitudes, (n_stare, n_unknown, n_frame, n_sum)."""
@@ -191,7 +195,7 @@ class Trend:
         warm = np.exp(self.slope_per_c * changes["temperature"])[..., None]
         each = {
             "star": light * self.star,
-            "light": star * self.star + sky * self.sky,
+            "light": star * self.star + sky * self.sky + self.neighbours,
             "sky": light * self.sky,
             "temperature": self.slope_per_c * warm * self.dark,
         }

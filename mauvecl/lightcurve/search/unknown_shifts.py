@@ -75,6 +75,7 @@ class UnknownShifts:
         coefficients[..., 0] *= (1 + moved["light"]) * (1 + moved["star"])
         coefficients[..., 1] *= (1 + moved["light"]) * (1 + moved["sky"])
         coefficients[..., 2] *= np.exp(slope * moved["temperature"])
+        coefficients[..., 3] *= 1 + moved["light"]
         covariance = components.covariance(coefficients)
         for of, direction in components.directions(coefficients).items():
             jitter = stare.jitters.get(of, 0.0)  # type: ignore[call-overload]

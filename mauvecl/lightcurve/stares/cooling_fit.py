@@ -255,7 +255,7 @@ def _data(
     weights, strengths = reduction.weights, known_strengths(stare, quiet)
     sums = less_known(raw, quiet, strengths, weights)
     constant, each = Components(quiet, np.zeros((0, weights.shape[1])), weights).sum_cumulants(2)
-    covariance = constant + np.tensordot(strengths[:, :3], each, 1)
+    covariance = constant + np.tensordot(strengths, each, 1)
     edges = np.column_stack([stare.start_s, stare.start_s + stare.frame_s])
     unknown = np.zeros((0, len(weights))) if nuisances is None else nuisances.spectra @ weights.T
     prior = np.zeros(0) if nuisances is None else np.asarray(nuisances.sd, np.float64)

@@ -1,8 +1,9 @@
 """Components of the frames of a stare: a few spectra, so that no frame needs its own expectation.
 
-Counts are sums of independent components: the star, the sky, the dark current, and flares of several temperatures. The
-spectrum of a component is the same in all frames, and only its strength, its coefficient, changes. The mean and all
-higher cumulants of a pixel, and of a weighted sum of pixels, are therefore linear in the coefficients of a frame.
+Counts are sums of independent components: the star, the sky, the dark current, neighbours of the star, and flares of
+several temperatures. The spectrum of a component is the same in all frames, and only its strength, its coefficient,
+changes. The mean and all higher cumulants of a pixel, and of a weighted sum of pixels, are therefore linear in the
+coefficients of a frame.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 
 #: Components of every frame; one flare component per temperature follows.
-STEADY = ("star", "sky", "dark")
+STEADY = ("star", "sky", "dark", "neighbours")
 #: Largest number of flare temperatures, and of weighted sums.
 MOST_FLARES, MOST_STATISTICS = 8, 8
 #: Fourth cumulant of the rounding error, DN^4; its variance is 1/12.
@@ -105,9 +106,10 @@ class Components:
 
     @cached_property
     def mean_dn(self) -> Float:
-        """Mean of each component at a coefficient of one, DN, shape (3 + n_flare, n_pixel); rows as `STEADY`."""
+        """Mean of each component at a coefficient of one, DN, shape (4 + n_flare, n_pixel); rows as `STEADY`."""
         x = self.quiet
-        light = np.vstack([x.source_electrons, x.sky_electrons, np.zeros_like(x.dark_dn), self.flare_electrons])
+        steady = [x.source_electrons, x.sky_electrons, np.zeros_like(x.dark_dn), x.neighbour_electrons]
+        light = np.vstack([*steady, self.flare_electrons])
         light *= x.gain_dn_per_electron
         light[2] = x.dark_dn
         return light
@@ -119,7 +121,7 @@ class Components:
         -------
         constant : ndarray, shape (n_pixel,)
             Read noise and rounding.
-        each : ndarray, shape (3 + n_flare, n_pixel)
+        each : ndarray, shape (4 + n_flare, n_pixel)
             Each component at a coefficient of one.
         """
         x = self.quiet
@@ -141,7 +143,7 @@ class Components:
         Returns
         -------
         constant : ndarray, shape (n_statistic,) * order
-        each : ndarray, shape (3 + n_flare,) + (n_statistic,) * order
+        each : ndarray, shape (4 + n_flare,) + (n_statistic,) * order
         """
         constant, each = self.pixel_cumulants(order)
         rows = np.vstack([constant, each])
@@ -166,12 +168,12 @@ class Components:
 
         Returns
         -------
-        ndarray, shape (n_frame, 3 + n_flare)
-            Coefficients of star, sky, dark and flares.
+        ndarray, shape (n_frame, 4 + n_flare)
+            Coefficients of star, sky, dark, neighbours and flares.
         """
         factors = np.zeros((stare.n_frames, len(STEADY) + self.n_flares))
         factors[:, 0], factors[:, 1] = stare.light * stare.star, stare.light * stare.sky
-        factors[:, 2] = stare.dark_factor(self.quiet)
+        factors[:, 2], factors[:, 3] = stare.dark_factor(self.quiet), stare.light
         if flare is not None:
             if np.shape(flare) != (stare.n_frames, self.n_flares):
                 raise InputError(
@@ -180,13 +182,13 @@ class Components:
                     key="flare",
                     value=np.shape(flare),
                 )
-            factors[:, 3:] = stare.light[:, None] * flare
+            factors[:, len(STEADY) :] = stare.light[:, None] * flare
         return factors
 
     def means(self, coefficients: Float) -> Float:
-        """Return the mean statistics, (..., n_statistic), for coefficients of shape (..., 3 + n_flare)."""
+        """Return the mean statistics, (..., n_statistic), for coefficients of shape (..., 4 + n_flare)."""
         reference = np.zeros(len(STEADY) + self.n_flares)
-        reference[:3] = 1.0
+        reference[: len(STEADY)] = 1.0
         return np.asarray((coefficients - reference) @ self._sums[1][1])
 
     def covariance(self, coefficients: Float) -> Float:
@@ -211,7 +213,7 @@ class Components:
         They are with respect to relative changes of the star, of all light and of the sky, and to the temperature.
         """
         mean = self._sums[1][1]
-        light = coefficients[..., [0, 1, *range(3, coefficients.shape[-1])]] @ np.delete(mean, 2, axis=0)
+        light = np.delete(coefficients, 2, axis=-1) @ np.delete(mean, 2, axis=0)
         slope = self.quiet.conditions["dark_slope_per_c"]
         return {
             "star": coefficients[..., :1] * mean[0],

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.stares.frame_components import MOST_STATISTICS, Components
+from mauvecl.lightcurve.stares.frame_components import MOST_STATISTICS, STEADY, Components
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class StareExpectation:
 
     @cached_property
     def coefficients(self) -> Float:
-        """Known coefficients of star, sky, dark and flares in each frame, shape (n_frame, 3 + n_flare)."""
+        """Known coefficients of star, sky, dark, neighbours and flares in each frame, shape (n_frame, 4 + n_flare)."""
         return self._bare.coefficients(self.stare, self.flare)
 
     @cached_property
@@ -70,14 +70,15 @@ class StareExpectation:
     def snr(self, flare: Float) -> float:
         """Return the matched-filter S/N of a flare with mean amplitudes of shape (n_frame, n_flare)."""
         constant, each = self._bare.pixel_cumulants(2)
-        variance = (constant + each[:3].sum(axis=0))[self.used]
-        spectra = self._bare.mean_dn[3:, self.used]
+        variance = (constant + each[: len(STEADY)].sum(axis=0))[self.used]
+        spectra = self._bare.mean_dn[len(STEADY) :, self.used]
         return float(np.sqrt(np.einsum("tk,kl,tl->", flare, spectra / variance @ spectra.T, flare, optimize=True)))
 
     def net(self, weights: Float, draw: Draw, kind: type[np.floating[Any]] = np.float64) -> tuple[Any, Any, Any]:
         """Draw the net light in weighted sums of pixels, and return it with its standard deviation and mean, DN/s.
 
-        Net light is the raw count minus bias and dark current at the known temperature; it includes the sky.
+        Net light is the raw count minus bias and dark current at the known temperature; it includes the sky and
+        neighbours.
 
         Parameters
         ----------
@@ -99,8 +100,8 @@ class StareExpectation:
             rows = weights[there]
             first = self._bare.mean_dn @ rows.T
             drawn = np.asarray(draw(self.components(rows)), np.float64)
-            # The sums are relative to the quiescent star at the temperature of its expectation.
-            net[:, there] = (drawn + first[0] + first[1] + (1.0 - coefficients[:, 2:3]) * first[2]) / frame_s
+            # The sums are relative to the quiescent light at the temperature of its expectation.
+            net[:, there] = (drawn + first[0] + first[1] + first[3] + (1.0 - coefficients[:, 2:3]) * first[2]) / frame_s
             sd[:, there], mean[:, there] = self.expected(rows)
         return net, sd, mean
 

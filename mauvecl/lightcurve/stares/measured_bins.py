@@ -200,6 +200,7 @@ def fit_bins(
         stacked = replace(
             quiet, n_frames=n, source_electrons=star * quiet.source_electrons,
             sky_electrons=sky * quiet.sky_electrons, dark_dn=dark * quiet.dark_dn,
+            neighbour_electrons=light * quiet.neighbour_electrons,
         )  # fmt: skip
         unknown = None if nuisances is None else replace(nuisances, spectra=n * nuisances.spectra)
         added = np.array([raw[first[k] : end[k]].sum(axis=0) for k in rows])
@@ -210,7 +211,7 @@ def fit_bins(
 
 
 def known_strengths(stare: Stare, quiet: Expectation) -> Float:
-    """Return known strengths of star, sky, dark and flare in each frame, shape (n_frame, 4)."""
+    """Return known strengths of star, sky, dark, and flare and neighbours in each frame, shape (n_frame, 4)."""
     return np.column_stack([stare.light * stare.star, stare.light * stare.sky, stare.dark_factor(quiet), stare.light])
 
 

@@ -8,7 +8,6 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.stares.frame_components import STEADY
 from mauvecl.lightcurve.stares.stare_scene import Flares, StareScene, unique
 from mauvecl.lightcurve.stares.sum_cumulants import SumTable
 from mauvecl.noise import layout, reference
@@ -32,7 +31,7 @@ def exponential_less_one(x: Floats) -> Floats:
 
 
 def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int) -> dict[str, Floats]:
-    """Draw the coefficients of star, sky and dark and the factor on all light, minus one, of a frame of some stares.
+    """Draw what some stares have in a frame: coefficients of the steady components and the factor on light, minus one.
 
     Returns
     -------
@@ -47,12 +46,13 @@ def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int) -> dic
         name = layout.MOVED[kind]
         z = four_normals(reference.words_at(numbers, 0, "stare_unknown", u // 4, seed))[u % 4]
         moved[name] = fma(z, scene.curves[u, frame], moved[name])
-    star, star_less_one, sky, sky_less_one, dark, dark_less_one = scene.known[:6, frame]
+    star, star_less_one, sky, sky_less_one, dark, dark_less_one, near, near_less_one, _ = scene.known[:, frame]
     light = moved["light"]
     return {
         "star": fma(star, combine_factors(light, moved["star"]), star_less_one),
         "sky": fma(sky, combine_factors(light, moved["sky"]), sky_less_one),
         "dark": fma(dark, exponential_less_one(moved["temperature"] * scene.stare_job["dark_slope"]), dark_less_one),
+        "neighbours": fma(near, light, near_less_one),
         "light": light,
     }
 
@@ -75,7 +75,7 @@ def glow(scene: StareScene, numbers: Numbers, frames: Iterable[int], seed: int) 
 
 def _coefficients(scene: StareScene, flares: Flares, frame: int, scenario: int, light: Floats) -> list[Floats]:
     """Return the coefficients of the flare spectra, shape (n_stare,) each."""
-    given = flares.rows[:, :, frame] * (scene.known[6, frame] * flares.amplitudes[scenario][:, None])
+    given = flares.rows[:, :, frame] * (scene.known[-1, frame] * flares.amplitudes[scenario][:, None])
     return [fma(light, f, f) for f in np.broadcast_to(given, (len(light), given.shape[1])).T]
 
 
@@ -110,6 +110,7 @@ def _count(scene: StareScene, p: int, z: Floats, conditions: dict[str, Floats], 
     """Return the count of a pixel above its base, before the ADC."""
     m, one = scene.mixtures[p], np.float32(1.0)
     light, dark = fma(conditions["star"], m["star"], conditions["sky"] * m["sky"]), conditions["dark"]
+    light = fma(conditions["neighbours"], m["neighbours"], light)
     for coefficient, spectrum in zip(flare, scene.spectra, strict=True):
         light = fma(coefficient, spectrum[p], light)
     variance = fma(light, m["photon_variance"], fma(dark, m["dark_variance"], m["variance"]))
@@ -171,11 +172,11 @@ def _sums(
     n = len(scene.weights)
     pairs = unique(n, 2)
     place = {key: i for i, key in enumerate(key for order in (1, 2, 3, 4) for key in unique(n, order))}
-    lit = [(conditions["star"], 1), (conditions["sky"], 2), *((f, 4 + j) for j, f in enumerate(flare))]
+    lit = [(conditions["star"], 1), (conditions["sky"], 2), (conditions["neighbours"], 4), *((f, 5 + j) for j, f in enumerate(flare))]
 
     def cumulant(key: tuple[int, ...], light: bool = True) -> Floats:
         total = np.full_like(z[0], table.rows[0, place[key]])
-        for strength, row in [(conditions["dark"], len(STEADY)), *(lit if light else [])]:
+        for strength, row in [(conditions["dark"], 3), *(lit if light else [])]:
             total = fma(strength, table.rows[row, place[key]], total)
         return total
 

@@ -101,7 +101,7 @@ class StareScene:
     stare: Stare
     scene: Scene  # of one quiescent frame, for addresses, clipping and additive processes
     numbers: NDArray[np.uint32]  # of frames, including gaps, shape (n_padded_frame,)
-    known: Floats  # rows of `layout.KNOWN_OF_FRAMES`, shape (7, n_padded_frame)
+    known: Floats  # rows of `layout.KNOWN_OF_FRAMES`, shape (9, n_padded_frame)
     curves: Floats  # of the stare's unknowns, times their standard deviations, shape (n_unknown, n_padded_frame)
     kinds: NDArray[np.uint32]  # rows of `layout.MOVED`, shape (n_unknown,)
     stare_job: NDArray[np.void]  # of `layout.STARE_JOB`, without the values of flares, shape ()
@@ -200,8 +200,8 @@ class StareScene:
         """
         low, high = self._ends
         mean = self.components.mean_dn
-        darkest = low[0] * mean[0] + low[1] * mean[1]
-        brightest = high[0] * mean[0] + high[1] * mean[1] + high[3] * (flares.most @ mean[len(STEADY) :])
+        darkest = low[0] * mean[0] + low[1] * mean[1] + low[3] * mean[3]
+        brightest = high[0] * mean[0] + high[1] * mean[1] + high[3] * (mean[3] + flares.most @ mean[len(STEADY) :])
         span = float(np.max(brightest / np.maximum(darkest, 1e-30), initial=1.0, where=brightest > 1e-9))
         steps = 1 + int(np.ceil(np.log2(min(span, 2.0**20))))
         for part in np.linspace(0.0, 1.0, steps + 1):
@@ -211,7 +211,7 @@ class StareScene:
 
     @property
     def _ends(self) -> tuple[Float, Float]:
-        """Smallest and largest factors on star, sky, dark and flares."""
+        """Smallest and largest factors on star, sky, dark, and neighbours and flares."""
         stare, spread = self.stare, self._spreads
         ends = []
         for sign, of in ((-1.0, np.min), (1.0, np.max)):
@@ -243,9 +243,8 @@ class StareScene:
                 )
         x, mean = self.components.quiet, self.components.mean_dn
         _, high = self._ends
-        reach = (
-            high[0] * mean[0] + high[1] * mean[1] + high[2] * mean[2] + high[3] * (flares.most @ mean[len(STEADY) :])
-        )
+        lit = mean[3] + flares.most @ mean[len(STEADY) :]
+        reach = high[0] * mean[0] + high[1] * mean[1] + high[2] * mean[2] + high[3] * lit
         if not (reach < REACH_DN).all():
             pixel = int(np.argmax(~(reach < REACH_DN)))
             raise InputError(

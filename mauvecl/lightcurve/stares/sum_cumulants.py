@@ -47,9 +47,9 @@ class SumTable:
     Attributes
     ----------
     rows : ndarray of float32, shape (4 + n_flare, n)
-        Total at coefficients of one, then star, sky, dark and each flare: means (0 for the total), then the unique
-        second, third and, if needed, fourth cumulants, in the order of `scene.unique`; fourth cumulants are multiplied
-        by their multiplicity.
+        Total at coefficients of one, then star, sky, dark, neighbours and each flare: means (0 for the total), then the
+        unique second, third and, if needed, fourth cumulants, in the order of `scene.unique`; fourth cumulants are
+        multiplied by their multiplicity.
     whole : ndarray of float32, shape (n_statistic * (n_statistic + 1) / 2,)
         Lower triangular matrix that converts whitened sums to the statistics.
     fourths : bool

@@ -43,7 +43,8 @@ class Recorded(Picture):
         x, y = closed.quiet, closed.flare
         w, gain = x.wavelength_nm, x.n_frames * x.gain_dn_per_electron
         sky, spread = gain * x.sky_electrons, 1.96 * np.sqrt(y.variance_dn2)
-        star, flare = gain * x.source_electrons + sky, gain * y.source_electrons + sky
+        behind = sky + gain * x.neighbour_electrons
+        star, flare = gain * x.source_electrons + behind, gain * y.source_electrons + behind
         pedestal = x.n_frames * (x.dark_dn + x.bias_dn)
         recorded = y.recorded_dn - pedestal
         sources: dict[str, Any] = {

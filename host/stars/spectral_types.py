@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 
-from mauvecl.host.stars.catalogue import library_table
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
+
+from .catalogue import library_table
 
 #: Spectral classes in order of decreasing temperature.
 CLASSES = "OBAFGKM"

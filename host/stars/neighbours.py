@@ -1,0 +1,218 @@
+"""Neighbouring stars, whose light enters the fibre together with the target's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.schema.errors import InputError
+
+from ..response import Order, electrons_per_second
+from .catalogue import embedded, library_table
+from .source import Source
+from .spectral_types import nearest_spectrum
+
+if TYPE_CHECKING:
+    from ..instrument.instrument import Instrument
+
+Float = NDArray[np.float64]
+
+#: Distance up to which a row of a table may be the target itself, which a message then says, arcsec.
+SAME_STAR_ARCSEC = 2.0
+#: Largest number of neighbours that a message names.
+MOST_NAMED = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbour:
+    """A star near the target; its spectrum is chosen only if its light enters the fibre.
+
+    Attributes
+    ----------
+    name : str
+    separation_arcsec : float
+        From the target.
+    magnitude : float, optional
+        In `band`; None if unknown.
+    band : str
+    spectral_type : str
+        Empty if unknown; the nearest spectrum of the library is used.
+    file : Path, optional
+        Spectrum file, in place of a type.
+    temperature_k : float, optional
+        Effective temperature, which chooses the spectrum if the type is unknown.
+    bp_rp : float, optional
+        Gaia colour, which chooses the spectrum if type and temperature are unknown.
+    """
+
+    name: str
+    separation_arcsec: float
+    magnitude: float | None = None
+    band: str = "V"
+    spectral_type: str = ""
+    file: Path | None = None
+    temperature_k: float | None = None
+    bp_rp: float | None = None
+
+    @cached_property
+    def spectrum(self) -> tuple[str, str]:
+        """Name of the spectrum, and the statement on its choice, empty if it is the star's own.
+
+        Raises InputError if nothing tells the spectrum.
+        """
+        if self.file is not None:
+            return self.file.name, ""
+        if self.spectral_type:
+            entry = embedded(self.spectral_type)
+            if entry is not None:
+                return entry["name"], ""
+            nearest = nearest_spectrum(self.spectral_type)
+            return nearest, f"of type {self.spectral_type}: {nearest}, the nearest type of the library"
+        if self.temperature_k is not None:
+            nearest, kelvin = _nearest(_temperatures(), np.log(self.temperature_k))
+            text = f"of {self.temperature_k:.0f} K: {nearest} ({np.exp(kelvin):.0f} K), the nearest of the library"
+            return nearest, text
+        if self.bp_rp is not None:
+            nearest, colour = _nearest(_colours(), self.bp_rp)
+            text = f"of BP - RP = {self.bp_rp:.2f}: {nearest} ({colour:.2f}), the nearest colour of the library"
+            return nearest, text
+        raise InputError(
+            f"neighbour {self.name}, {self.separation_arcsec:.3g} arcsec away, has no spectral type, spectrum file, "
+            "temperature or colour",
+            "one of them, since its light enters the fibre",
+            key="neighbours",
+            value=self.name,
+        )
+
+    @cached_property
+    def source(self) -> Source:
+        """Spectrum at the telescope. Raises InputError if spectrum or magnitude is unknown."""
+        name, _ = self.spectrum
+        if self.magnitude is None and self.file is None:
+            raise InputError(
+                f"neighbour {self.name}, {self.separation_arcsec:.3g} arcsec away, has no magnitude",
+                "one, since its light enters the fibre",
+                key="neighbours",
+                value=self.name,
+            )
+        star = Source.from_library(name) if self.file is None else Source.read(self.file)
+        if self.magnitude is not None:
+            star = star.at_magnitude(self.magnitude, self.band)
+        if star.unscaled:
+            raise InputError(
+                f"the spectrum of neighbour {self.name} is not as bright as the star is seen: {star.unscaled}",
+                "a magnitude as well",
+                key="neighbours",
+                value=self.name,
+            )
+        return star
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbours:
+    """Neighbours of one target.
+
+    Attributes
+    ----------
+    stars : tuple of Neighbour
+    share : float
+        Share of the light that enters the fibre, of stars within its radius; an assumption.
+    notes : tuple of str
+        Statements on how the table was read.
+    """
+
+    stars: tuple[Neighbour, ...]
+    share: float = 1.0
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.share <= 1:
+            raise InputError.of("share", self.share, "0 to 1")
+
+    def within(self, instrument: Instrument) -> list[Neighbour]:
+        """Return the neighbours within the radius of the fibre."""
+        return [one for one in self.stars if one.separation_arcsec <= instrument.field_of_view_radius_arcsec]
+
+    def electrons_per_second(self, instrument: Instrument, order: Order = "paper") -> Float:
+        """Return the mean electrons per second of all neighbours in the fibre, shape (n_pixel,)."""
+        total = np.zeros(instrument.wavelength_nm.size)
+        for one in self.within(instrument):
+            total += self.share * rate_of(one, instrument, order)
+        return total
+
+    def provenance(self, instrument: Instrument) -> dict[str, str]:
+        """Return the neighbours in the fibre with their spectra, for the record of an expectation."""
+        inside = [
+            f"{one.name} ({one.separation_arcsec:.6g} arcsec, {one.spectrum[0]}, {one.source.digest})"
+            for one in self.within(instrument)
+        ]
+        return {"neighbours": "; ".join(inside), "share of neighbours": f"{self.share:g} (assumption)"}
+
+    def messages(self, target: str, instrument: Instrument) -> list[str]:
+        """Return what readers must know of the neighbours of a target."""
+        radius, inside = instrument.field_of_view_radius_arcsec, self.within(instrument)
+        outside = len(self.stars) - len(inside)
+        beyond = f"{_stars(outside)} beyond {'does' if outside == 1 else 'do'} not enter"
+        if not inside:
+            return [f"NEIGHBOURS of {target}: none within {radius:g} arcsec; {beyond}.", *self.notes]
+        names = ", ".join(f"{one.name} at {one.separation_arcsec:.3g} arcsec" for one in inside[:MOST_NAMED])
+        more = len(inside) - MOST_NAMED
+        text = (
+            f"NEIGHBOURS of {target}: the light of {_stars(len(inside))} within {radius:g} arcsec is in the fibre "
+            f"({names}{f' and {more} more' if more > 0 else ''}); assumption: {100 * self.share:g} % of it enters"
+        )
+        chosen = [f"Light of {one.name}, {one.spectrum[1]}." for one in inside if one.spectrum[1]]
+        if len(chosen) > MOST_NAMED:
+            chosen = [*chosen[:MOST_NAMED], f"Spectra of {len(chosen) - MOST_NAMED} more neighbours are chosen alike."]
+        same = [
+            f"{one.name} is {one.separation_arcsec:.2g} arcsec from {target} and counts as a neighbour: if it is the "
+            "star itself, name its row in star.neighbours_of."
+            for one in inside
+            if one.separation_arcsec < SAME_STAR_ARCSEC
+        ]
+        return [f"{text}; {beyond}." if outside else f"{text}.", *same, *chosen, *self.notes]
+
+
+#: Cached since flares and sweep values of a star have the same neighbours.
+@lru_cache(maxsize=4096)
+def rate_of(neighbour: Neighbour, instrument: Instrument, order: Order) -> Float:
+    """Return the mean electrons per second of a neighbour if all of its light enters, shape (n_pixel,)."""
+    source = neighbour.source
+    rate = electrons_per_second(instrument, source.wavelength_nm, source.flux_flam, order)
+    rate = np.maximum(rate * instrument.per_pixel("response", 1.0), 0.0)
+    rate.setflags(write=False)
+    return rate
+
+
+def _stars(n: int) -> str:
+    return "1 star" if n == 1 else f"{n} stars"
+
+
+def _nearest(values: Sequence[tuple[str, float]], wanted: float) -> tuple[str, float]:
+    return min(values, key=lambda one: abs(one[1] - wanted))
+
+
+def _typed() -> list[str]:
+    """Return the names of the embedded spectra that stand for a spectral type."""
+    table = library_table()
+    return [str(row["name"]) for row in table if row["kept"] == "embedded" and row["name"] == row["spectral_type"]]
+
+
+@cache
+def _temperatures() -> tuple[tuple[str, float], ...]:
+    """Return the logarithms of the temperatures of typical spectra."""
+    named = ((name, Source.from_library(name).temperature_k) for name in _typed())
+    return tuple((name, float(np.log(kelvin))) for name, kelvin in named if kelvin is not None)
+
+
+@cache
+def _colours() -> tuple[tuple[str, float], ...]:
+    """Return the Gaia colours BP - RP of typical spectra, by synthetic photometry."""
+    stars = ((name, Source.from_library(name)) for name in _typed())
+    return tuple((name, star.magnitude("Gaia BP") - star.magnitude("Gaia RP")) for name, star in stars)

@@ -1,0 +1,178 @@
+"""Neighbours in the fibre: closed forms against a sum of spectra, tables of catalogues, and the choice of spectra."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import Table
+from refusals import refused
+
+from mauvecl.host.expectation import Expectation, expect
+from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.stars.neighbour_table import read_neighbours
+from mauvecl.host.stars.neighbours import Neighbour, Neighbours
+from mauvecl.host.stars.source import Source
+from mauvecl.noise.comparison import Comparison
+from mauvecl.statistics.linear import Matched
+from mauvecl.statistics.statistic import Setting
+
+MAUVE = Instrument.load("mauve")
+STAR = Source.from_library("G2V").at_magnitude(7.4)
+B = Neighbour("B", 12.5, 6.9, "V", "K5V")
+C = Neighbour("C", 47.0, 8.0, "V", "F5V")
+FAR = Neighbour("D", 47.47, 1.0, "V", "A0V")
+
+
+def seen(star: Source, *neighbours: Neighbour, share: float = 1.0) -> Expectation:
+    return expect(star, MAUVE, exposure=50.0, neighbours=Neighbours(neighbours, share) if neighbours else None)
+
+
+def blend(share: float) -> Source:
+    """Return the sum of the spectra of the star and its neighbours, made by hand."""
+    b, c = Source.from_library("K5V").at_magnitude(6.9), Source.from_library("F5V").at_magnitude(8.0)
+    nm = np.unique(np.concatenate([one.wavelength_nm for one in (STAR, b, c)]))
+    nm = nm[(nm >= max(one.wavelength_nm[0] for one in (STAR, b, c))) & (nm <= 1000)]
+    flux = [np.interp(nm, one.wavelength_nm, one.flux_flam) for one in (STAR, b, c)]
+    return Source.from_arrays(nm, flux[0] + share * (flux[1] + flux[2]), name="blend")
+
+
+@pytest.mark.parametrize("share", [1.0, 0.3])
+def test_light_and_noise_equal_those_of_the_summed_spectrum(share: float) -> None:
+    x, whole = seen(STAR, B, C, FAR, share=share), seen(blend(share))
+    np.testing.assert_allclose(x.mean_raw_dn, whole.mean_raw_dn, rtol=1e-9)
+    np.testing.assert_allclose(x.variance_dn2, whole.variance_dn2, rtol=1e-9)
+    # The signal is the star's alone, and its S/N falls by the noise of the others.
+    np.testing.assert_allclose(x.signal_dn, seen(STAR).signal_dn, rtol=1e-9)
+    noise = np.sqrt(whole.variance_dn2 - x.n_frames / 12)
+    np.testing.assert_allclose(x.snr(), seen(STAR).signal_dn / noise, rtol=1e-6)
+
+
+def test_flare_snr_equals_that_of_the_summed_spectrum() -> None:
+    """The matched filter has the S/N sqrt(sum(delta^2 / v)), v with the photons of all stars."""
+    quiet, flare, whole = seen(STAR, B, C), seen(STAR.flaring(0.081), B, C), seen(blend(1.0))
+    delta = seen(STAR.flaring(0.081)).recorded_light_dn - seen(STAR).recorded_light_dn
+    expected = np.sqrt(np.sum(delta**2 / whole.variance_dn2))
+    setting = Setting(quiet, ~quiet.saturated, Comparison.of("template", "model"), [flare], None, None)
+    form = Matched().closed_form(setting, flare, flare)
+    assert form.mean / Matched().closed_form(setting, quiet, flare).std == pytest.approx(expected, rel=1e-6)
+
+
+def test_dilution_follows_from_magnitudes() -> None:
+    """Stars of one type share the light as their magnitudes say."""
+    x = seen(STAR, Neighbour("twin", 1.0, 8.4, "V", "G2V"), Neighbour("faint", 1.0, 9.9, "V", "G2V"), share=0.5)
+    assert x.target_share == pytest.approx(1 / (1 + 0.5 * (10**-0.4 + 10**-1.0)), rel=1e-9)
+
+
+def test_stars_beyond_the_fibre_or_without_share_add_nothing() -> None:
+    for x in (seen(STAR, FAR), seen(STAR, B, share=0.0)):
+        np.testing.assert_array_equal(x.variance_dn2, seen(STAR).variance_dn2)
+        assert x.target_share == 1.0
+    assert "none within 47.46 arcsec; 1 star beyond does not enter" in seen(STAR, FAR).messages[0]
+
+
+def test_noise_budget_has_the_photons_of_neighbours() -> None:
+    budget = seen(STAR, B).noise_budget()
+    parts = [budget[name].value ** 2 for name in budget.colnames if name not in ("wavelength", "total")]
+    np.testing.assert_allclose(np.sum(parts, axis=0), budget["total"].value ** 2, rtol=1e-12)
+    assert "neighbour_photon" not in seen(STAR).noise_budget().colnames
+
+
+@pytest.mark.parametrize(
+    ("star", "spectrum", "statement"),
+    [
+        (Neighbour("a", 1.0, 9.0, spectral_type="K5V"), "K5V", ""),
+        (Neighbour("b", 1.0, 9.0, spectral_type="k3v"), "K2.5V", ""),
+        (Neighbour("c", 1.0, 9.0, spectral_type="M2V"), "M1V", "of type M2V: M1V, the nearest type"),
+        (Neighbour("d", 1.0, 9.0, temperature_k=6040.0), "F8V", "of 6040 K: F8V (6039 K), the nearest"),
+        (Neighbour("e", 1.0, 9.0, bp_rp=2.95), "M4V", "of BP - RP = 2.95: M4V (2.98), the nearest colour"),
+        (Neighbour("f", 1.0, 9.0, spectral_type="A0V", temperature_k=3000.0), "A0V", ""),
+    ],
+)
+def test_spectra_are_chosen_and_stated(star: Neighbour, spectrum: str, statement: str) -> None:
+    assert star.spectrum[0] == spectrum
+    assert star.spectrum[1].startswith(statement)
+    assert bool(statement) == bool(star.spectrum[1])
+    assert any("nearest" in text for text in seen(STAR, star).messages) == bool(statement)
+
+
+def test_missing_values_matter_only_within_the_fibre() -> None:
+    for star in (Neighbour("x", 5.0, 9.0), Neighbour("x", 5.0, spectral_type="G2V")):
+        with refused("neighbours", "x", "5 arcsec"):
+            seen(STAR, star)
+    with refused("spectral_type", "DA2"):
+        seen(STAR, Neighbour("x", 5.0, 9.0, spectral_type="DA2"))
+    seen(STAR, Neighbour("x", 50.0))
+
+
+#: Positions 10 arcsec north and 20 arcsec east of a star at 60 deg declination.
+RA, DEC = 150.0, 60.0
+EAST = 20 / 3600 / np.cos(np.radians(60.0))
+TABLES: dict[str, tuple[dict[str, Any], str | None]] = {
+    "archive": (
+        {"designation": ["Gaia DR3 1", "Gaia DR3 2", "Gaia DR3 3"], "ra": [RA, RA, RA + EAST],
+         "dec": [DEC, DEC + 10 / 3600, DEC], "phot_g_mean_mag": [7.2, 9.0, 12.0], "bp_rp": [0.8, 0.85, 3.0],
+         "teff_gspphot": [5700.0, 5586.0, np.nan]}, "Gaia DR3 1"),
+    "archive by coordinates": (
+        {"source_id": [2, 3], "ra": [RA, RA + EAST], "dec": [DEC + 10 / 3600, DEC], "phot_g_mean_mag": [9.0, 12.0],
+         "bp_rp": [0.85, 3.0]}, f"{RA} +{DEC}"),
+    "web form": (
+        {"source_id": [2, 3], "target_separation (deg)": [10 / 3600, 20 / 3600], "phot_g_mean_mag": [9.0, 12.0],
+         "bp_rp": [0.85, 3.0]}, None),
+    "astroquery": ({"SOURCE_ID": [2, 3], "phot_g_mean_mag": [9.0, 12.0], "bp_rp": [0.85, 3.0],
+                    "dist": [10 / 3600, 20 / 3600]}, None),
+    "VizieR": ({"_r": [10.0, 20.0] * u.arcsec, "Source": [2, 3], "Gmag": [9.0, 12.0] * u.mag,
+                "BP-RP": [0.85, 3.0] * u.mag}, None),
+    "own": ({"name": ["2", "3"], "separation": [10.0, 20.0], "magnitude": [9.0, 12.0], "band": ["G", "Gaia G"],
+             "spectral_type": ["G5V", "M4V"]}, None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("ending", ["ecsv", "fits", "vot"])
+@pytest.mark.parametrize("name", TABLES)
+def test_tables_of_catalogues_are_read(tmp_path: Path, name: str, ending: str) -> None:
+    columns, target = TABLES[name]
+    path = tmp_path / f"near.{ending}"
+    Table(columns).write(path, **({"format": "votable"} if ending == "vot" else {}))
+    stars, _ = read_neighbours(path, target)
+    assert [one.separation_arcsec for one in stars] == pytest.approx([10.0, 20.0], rel=1e-6)
+    assert [(one.magnitude, one.band) for one in stars] == [(9.0, "Gaia G"), (12.0, "Gaia G")]
+    assert [one.name[-1] for one in stars] == ["2", "3"]
+    assert [one.spectrum[0] for one in stars] == [("G2V", "G5V")[name in ("archive", "own")], "M4V"]
+
+
+def test_rows_may_name_spectrum_files(tmp_path: Path) -> None:
+    (tmp_path / "b.txt").write_text("\n".join(f"{nm} 1e-13" for nm in range(180, 751)))
+    (tmp_path / "near.csv").write_text("name,separation,file\nB,3,b.txt\n")
+    (star,), _ = read_neighbours(tmp_path / "near.csv")
+    assert star.source.flux_flam.max() == pytest.approx(1e-13)
+
+
+@pytest.mark.parametrize(
+    ("text", "target", "key", "facts"),
+    [
+        ("name,mag\nB,3\n", None, "neighbours", ("separation", "mag")),
+        ("name,ra,dec\nB,1,2\n", None, "neighbours_of", ("position",)),
+        ("name,ra,dec\nB,1,2\n", "Q", "neighbours_of", ("Q",)),
+        ("name,separation\nB,3\n", "Q", "neighbours_of", ("Q",)),
+        ("name,separation\nB,-3\n", None, "neighbours", ("row 1", "-3")),
+        ("name,separation\nB,wide\n", None, "neighbours", ("row 1", "wide")),
+        ("name,separation,magnitude\nB,3,\nC,,4\n", None, "neighbours", ("row 2", "separation")),
+        ("name,_r\nB,3\n", None, "neighbours", ("_r",)),
+        ("name,separation,magnitude,band\nB,3,4,Q\n", None, "band", ("Q",)),
+        ("name,separation,teff\nB,3,-4\n", None, "neighbours", ("teff", "-4")),
+    ],
+)
+def test_unusable_tables_are_refused(
+    tmp_path: Path, text: str, target: str | None, key: str, facts: tuple[str, ...]
+) -> None:
+    (tmp_path / "near.csv").write_text(text)
+    with refused(key, *facts):
+        read_neighbours(tmp_path / "near.csv", target)
+
+
+def test_a_star_at_the_same_place_is_pointed_out() -> None:
+    assert any("star.neighbours_of" in text for text in seen(STAR, Neighbour("A", 0.3, 7.2, "V", "G2V")).messages)
