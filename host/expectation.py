@@ -34,7 +34,7 @@ from .spectra.wavelength_range import SPAN_NM
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from .stars.neighbours import Neighbours
+    from .neighbours import Neighbours
     from .stars.source import Source
 
 Float = NDArray[np.float64]

@@ -8,8 +8,8 @@ import numpy as np
 
 from mauvecl.host.expectation import Expectation, expect
 from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.neighbours import Neighbour, Neighbours
 from mauvecl.host.sky.zodiacal import Sky
-from mauvecl.host.stars.neighbours import Neighbour, Neighbours
 from mauvecl.host.stars.source import Source
 from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.stare import Stare

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
     from mauvecl.host.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
+    from mauvecl.host.neighbours import Neighbours
     from mauvecl.host.sky.zodiacal import Sky
-    from mauvecl.host.stars.neighbours import Neighbours
     from mauvecl.host.stars.source import Source
     from mauvecl.lightcurve.flares.events import Event
     from mauvecl.lightcurve.stares.light_curves import StareExpectation

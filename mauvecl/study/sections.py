@@ -34,9 +34,9 @@ from mauvecl.study.flare_light import FlareLight
 
 if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import Instrument
+    from mauvecl.host.neighbours import Neighbours
     from mauvecl.host.sky.zodiacal import Sky
     from mauvecl.host.stars.flare_spectra import FlareSpectrum
-    from mauvecl.host.stars.neighbours import Neighbours
     from mauvecl.host.stars.source import Source
     from mauvecl.noise.comparison import Comparison
 
@@ -169,8 +169,8 @@ class Star(Section):
         """Read the star's neighbours, or return None if it has none."""
         if self.neighbours is None:
             return None
-        from mauvecl.host.stars.neighbour_table import read_neighbours
-        from mauvecl.host.stars.neighbours import Neighbours
+        from mauvecl.host.neighbour_table import read_neighbours
+        from mauvecl.host.neighbours import Neighbours
 
         stars, notes = read_neighbours(self.neighbours, self.neighbours_of)
         return Neighbours(stars, self.neighbour_share, notes)

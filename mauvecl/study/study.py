@@ -253,7 +253,8 @@ class Study(Section):
     @property
     def has_neighbours(self) -> bool:
         """True if a star or a target of a plan has a table of neighbours."""
-        return any(one.neighbours is not None for one in (*self.star, *self.plan.targets))
+        targets = any(target.neighbours is not None for target in self.plan.targets)
+        return targets or any(star.neighbours is not None for star in self.star)
 
     def expectations(self, star: Star) -> list[Expectation]:
         """Return the expectations of a star without a flare and with each flare."""

@@ -13,8 +13,8 @@ from refusals import refused
 
 from mauvecl.host.expectation import Expectation, expect
 from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.host.stars.neighbour_table import read_neighbours
-from mauvecl.host.stars.neighbours import Neighbour, Neighbours
+from mauvecl.host.neighbour_table import read_neighbours
+from mauvecl.host.neighbours import Neighbour, Neighbours
 from mauvecl.host.stars.source import Source
 from mauvecl.noise.comparison import Comparison
 from mauvecl.statistics.linear import Matched

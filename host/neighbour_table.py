@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened, shown
 
-from ..files.tables import read_table
-from .band_names import known_band
+from .files.tables import read_table
 from .neighbours import Neighbour
+from .stars.band_names import known_band
 
 Float = NDArray[np.float64]
 
@@ -209,10 +209,10 @@ class _Columns:
 
 def _coordinates(text: str, named: str) -> tuple[float, float]:
     """Return right ascension and declination in radians. Raises InputError unless the text is coordinates."""
-    from ..orbit.targets import Target
+    from .sky.helioecliptic import parse_position
 
     try:
-        place = Target.of(text)
+        place = parse_position(text)
     except InputError as error:
         raise InputError(
             f"{named} has no row named {shortened(text)}, and it is no position",
@@ -220,4 +220,4 @@ def _coordinates(text: str, named: str) -> tuple[float, float]:
             key="neighbours_of",
             value=text,
         ) from error
-    return float(np.radians(place.ra_deg)), float(np.radians(place.dec_deg))
+    return float(place.ra.rad), float(place.dec.rad)

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
 
-from ..response import Order, electrons_per_second
-from .catalogue import embedded, library_table
-from .source import Source
-from .spectral_types import nearest_spectrum
+from .response import Order, electrons_per_second
+from .stars.catalogue import embedded, library_table
+from .stars.source import Source
+from .stars.spectral_types import nearest_spectrum
 
 if TYPE_CHECKING:
-    from ..instrument.instrument import Instrument
+    from .instrument.instrument import Instrument
 
 Float = NDArray[np.float64]
 
