@@ -217,8 +217,8 @@ def known_strengths(stare: Stare, quiet: Expectation) -> Float:
 
 def less_known(raw: Float, quiet: Expectation, known: Float, weights: Float) -> Float:
     """Return weighted sums, (n_frame, n_sum), of frames less their means without a flare for `known_strengths`."""
-    means = np.vstack([quiet.net_source_dn, quiet.sky_dn, quiet.dark_dn, quiet.bias_dn])
-    strengths = np.column_stack([known[:, :3], np.ones(len(known))])
+    means = np.vstack([quiet.net_source_dn, quiet.sky_dn, quiet.dark_dn, quiet.neighbour_dn, quiet.bias_dn])
+    strengths = np.column_stack([known, np.ones(len(known))])
     return np.asarray(raw @ weights.T - strengths @ (means @ weights.T))
 
 
