@@ -12,7 +12,7 @@ from scenes import instrument, star
 from mauvecl.device.engine import Engine
 from mauvecl.device.tiles import Tile
 from mauvecl.device.variants import scene_launches
-from mauvecl.host.expectation import Expectation
+from mauvecl.host.expectation import PER_PIXEL, Expectation
 from mauvecl.noise import layout, reference
 from mauvecl.noise.processes import CosmicRays, Processes
 from mauvecl.noise.scene import Scene, prepare
@@ -103,10 +103,7 @@ def test_draws_at_counter_boundaries_equal_reference(engine: Engine, index: int)
 
 def wide(pixels: int) -> Expectation:
     (x,) = star(exposure=5.0)
-    tiled = {
-        name: np.resize(getattr(x, name), pixels)
-        for name in ("source_electrons", "sky_electrons", "dark_dn", "bias_dn", "read_noise_dn", "gain_dn_per_electron")
-    }
+    tiled = {name: np.resize(getattr(x, name), pixels) for name in PER_PIXEL}
     element = np.arange(pixels) // 35
     return replace(
         x,

@@ -172,7 +172,12 @@ def _sums(
     n = len(scene.weights)
     pairs = unique(n, 2)
     place = {key: i for i, key in enumerate(key for order in (1, 2, 3, 4) for key in unique(n, order))}
-    lit = [(conditions["star"], 1), (conditions["sky"], 2), (conditions["neighbours"], 4), *((f, 5 + j) for j, f in enumerate(flare))]
+    lit = [
+        (conditions["star"], 1),
+        (conditions["sky"], 2),
+        (conditions["neighbours"], 4),
+        *((f, 5 + j) for j, f in enumerate(flare)),
+    ]
 
     def cumulant(key: tuple[int, ...], light: bool = True) -> Floats:
         total = np.full_like(z[0], table.rows[0, place[key]])
