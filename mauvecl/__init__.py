@@ -41,8 +41,9 @@ if TYPE_CHECKING:
     from mauvecl.host.sky.zodiacal import Sky
     from mauvecl.host.stars.flare_spectra import BalmerFlare, Blackbody, FlareWithLines, ObservedFlare, TwoBlackbodies
     from mauvecl.host.stars.source import Source
+    from mauvecl.lightcurve.flares.cooling import Cooling
     from mauvecl.lightcurve.flares.energies import EnergyScale
-    from mauvecl.lightcurve.flares.events import Cooling, Event
+    from mauvecl.lightcurve.flares.events import Event
     from mauvecl.lightcurve.flares.shapes import SHAPES, TableShape
     from mauvecl.lightcurve.stares.cooling_fit import fit_cooling
     from mauvecl.lightcurve.stares.curves import Sinusoid
@@ -147,7 +148,7 @@ _HOMES = HOMES | {
     "fit": "results.measurements.fit",
     "forecast": "results.measurements.fit",
     "Comparison": "noise.comparison",
-    "Cooling": "lightcurve.flares.events",
+    "Cooling": "lightcurve.flares.cooling",
     "CosmicRays": "noise.processes",
     "DaskWorkers": "runs.cluster",
     "Detection": "results.detection.detection",

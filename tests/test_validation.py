@@ -33,7 +33,7 @@ def public_functions() -> Iterator[tuple[str, Callable[..., Any]]]:
         if inspect.isfunction(thing):
             yield name, thing
         elif inspect.isclass(thing) and thing is not InputError:
-            if not issubclass(thing, Record):
+            if not issubclass(thing, Record) or "__init__" in vars(thing):
                 yield name, thing.__init__
             for method in dir(thing):
                 found = inspect.getattr_static(thing, method)
@@ -228,8 +228,9 @@ def error_of(call: Callable[[], Any]) -> InputError | None:
 
 
 def records(record: type[Record] = Record) -> Iterator[type[Record]]:
+    """Yield all records, but for those with a constructor of their own, which is a public function."""
     for one in record.__subclasses__():
-        if not inspect.isabstract(one):
+        if not inspect.isabstract(one) and "__init__" not in vars(one):
             yield one
         yield from records(one)
 

@@ -1,64 +1,70 @@
-"""Observing limits as plain values; `visibility`, which applies them, takes longer to import."""
+"""Observing limits, which are also a section of studies; `visibility`, which applies them, takes longer to import."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
-from typing import Literal
+from typing import Annotated, Any, Literal, Self
 
+from pydantic import model_serializer, model_validator
+
+from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Flag, Help, OrNone, Range, Unit
+from mauvecl.schema.section import Section
 
-EclipseRule = Literal["any", "only", "never"]
+#: Angle between two directions; None for no limit.
+Separation = Annotated[float | None, Unit("deg"), Range(0, 180), OrNone()]
 
 
-@dataclass(frozen=True)
-class Limits:
-    """Limits on when a target can be observed. Mauve's own limits are not public: all defaults are assumptions.
+class Limits(Section):
+    """Conditions for a target to be visible. Mauve's own limits are not public: all defaults are assumptions.
 
-    Attributes
-    ----------
-    earth_limb_deg, sun_deg, moon_deg : float or None
-        Smallest angles from the Earth's limb, the Sun and the Moon; None means no limit.
-    declination_deg : (low, high) or None
-        Field of regard in declination.
-    normal_cone_deg : float or None
-        Field of regard as a double cone about the orbit's normal.
-    eclipse : {"any", "only", "never"}
-        Whether to observe in the Earth's shadow.
-    proton_flux : float or None
-        Largest flux of trapped protons above 10 MeV, cm^-2 s^-1, which excludes the South Atlantic Anomaly.
-    anomaly : tuple of (longitude, latitude), deg
-        Polygon that replaces the proton map.
-    shortest_s : float
-        Length below which windows are dropped.
-    duty_cycle : float
-        Fraction of a window in which the star is exposed.
+    None means no limit; study files say "none".
     """
 
-    earth_limb_deg: float | None = 25.0
-    sun_deg: float | None = 46.0
-    moon_deg: float | None = 25.0
-    declination_deg: tuple[float, float] | None = (-46.4, 31.8)
-    normal_cone_deg: float | None = None
-    eclipse: EclipseRule = "any"
-    proton_flux: float | None = 10.0
-    anomaly: tuple[tuple[float, float], ...] = ()
-    shortest_s: float = 0.0
-    duty_cycle: float = 1.0
+    earth_limb_deg: Annotated[
+        Annotated[float | None, Unit("deg"), Range(0, 90), OrNone()],
+        Help("Smallest angle from the Earth's limb", "or none"),
+        Flag("--earth-limb", kind=str),
+    ] = 25.0
+    sun_deg: Annotated[Separation, Help("Smallest angle from the Sun", "or none"), Flag("--sun", kind=str)] = 46.0
+    moon_deg: Annotated[Separation, Help("Smallest angle from the Moon", "or none"), Flag("--moon", kind=str)] = 25.0
+    declination_deg: Annotated[
+        tuple[float, float] | None,
+        Unit("deg"),
+        OrNone(),
+        Help("Field of regard, low:high", "or none", default="-46.4:31.8"),
+        Flag("--declination", kind=str, read=parsing.declinations),
+    ] = (-46.4, 31.8)
+    normal_cone_deg: Annotated[
+        Separation, Help("Field of regard as a double cone about the orbit's normal", "or none", default="none")
+    ] = None
+    eclipse: Annotated[
+        Literal["any", "only", "never"],
+        Help("Observing in the Earth's shadow", choices="any, only (in the shadow) or never"),
+        Flag("--eclipse"),
+    ] = "any"
+    proton_flux: Annotated[
+        Annotated[float | None, Unit("1 / (cm2 s)"), Range(0, open_low=True), OrNone()],
+        Help("Largest flux of protons above 10 MeV", "or none"),
+        Flag("--protons", kind=str),
+    ] = 10.0
+    anomaly: Annotated[
+        tuple[tuple[float, float], ...],
+        Unit("deg"),
+        Help("Polygon of longitude and latitude in deg that replaces the map of protons"),
+    ] = ()
+    shortest_s: Annotated[float, Unit("s"), Range(0), Help("Length below which windows are dropped")] = 0.0
+    duty_cycle: Annotated[
+        float, Range(0, 1, open_low=True), Help("Fraction of a window in which the star is exposed")
+    ] = 1.0
 
-    def __post_init__(self) -> None:
-        for name, most in (("earth_limb_deg", 90), ("sun_deg", 180), ("moon_deg", 180), ("normal_cone_deg", 180)):
-            value = getattr(self, name)
-            if value is not None and not 0 <= value <= most:
-                raise InputError.of(name, value, f"0 to {most}, or none")
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
         if self.declination_deg is not None:
             low, high = self.declination_deg
             if not -90 <= low < high <= 90:
                 raise InputError.of("declination_deg", (low, high), "two rising values within -90 to 90")
-        if self.eclipse not in ("any", "only", "never"):
-            raise InputError.of("eclipse", self.eclipse, "any, only or never")
-        if self.proton_flux is not None and not self.proton_flux > 0:
-            raise InputError.of("proton_flux", self.proton_flux, "> 0 or none")
         if self.anomaly and (
             len(self.anomaly) < 3 or not all(math.isfinite(one) for corner in self.anomaly for one in corner)
         ):
@@ -68,19 +74,17 @@ class Limits:
                 key="anomaly",
                 value=self.anomaly,
             )
-        if not (math.isfinite(self.shortest_s) and self.shortest_s >= 0):
-            raise InputError.of("shortest_s", self.shortest_s, ">= 0")
-        if not 0 < self.duty_cycle <= 1:
-            raise InputError.of("duty_cycle", self.duty_cycle, "above 0, at most 1")
+        return self
+
+    @model_serializer(mode="plain")
+    def _with_none_as_text(self) -> dict[str, Any]:
+        """Write "none" for no limit, since studies leave out what is None."""
+        return {name: "none" if value is None else value for name, value in self}
 
     @property
     def assumptions(self) -> list[tuple[str, str, str]]:
         """Name, value and source of each limit in force."""
-        return [
-            (field.name, _text(getattr(self, field.name)), SOURCES[field.name])
-            for field in fields(self)
-            if getattr(self, field.name) not in (None, ())
-        ]
+        return [(name, _text(value), SOURCES[name]) for name, value in self if value not in (None, ())]
 
 
 _UVEX = "assumption, borrowed from UVEX (m4opt's definition of that mission); Mauve's own is not public"

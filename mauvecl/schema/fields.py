@@ -25,7 +25,13 @@ if TYPE_CHECKING:
 Metadata = TypeVar("Metadata")
 
 #: Units as people write them, where they differ from astropy's notation.
-WRITTEN = {"deg_C": "deg C", "mag / arcsec2": "mag/arcsec2", "solRad": "solar radii", "solMass": "solar masses"}
+WRITTEN = {
+    "deg_C": "deg C",
+    "mag / arcsec2": "mag/arcsec2",
+    "solRad": "solar radii",
+    "solMass": "solar masses",
+    "1 / (cm2 s)": "cm^-2 s^-1",
+}
 
 
 @dataclass(frozen=True)
@@ -126,6 +132,24 @@ class OneOrMore:
 
     def _listed(self, value: Any) -> Any:
         return (value,) if isinstance(value, self.item) else value
+
+
+class OrNone:
+    """Number that may be None, for which study files and flags write ``none``."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        from pydantic_core import core_schema
+
+        inner = handler(source)
+        schema = core_schema.no_info_before_validator_function(self._or_none, inner)
+        expected = str(inner.get("custom_error_message", "")).removeprefix("Input should be ")
+        return _or_error(schema, f"{expected or 'a number'}, or none")
+
+    def _or_none(self, value: Any) -> Any:
+        return None if isinstance(value, str) and value.strip().lower() == "none" else value
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
+        return {"anyOf": [handler(schema), {"const": "none"}]}
 
 
 def _or_error(schema: CoreSchema, words: str, **metadata: str) -> CoreSchema:

@@ -85,7 +85,7 @@ def _orbit(study: Study) -> str:
             ("Sun", limits.sun_deg),
             ("Moon", limits.moon_deg),
         )
-        if not isinstance(value, str)
+        if value is not None
     ]
     source = "embedded elements" if study.orbit.tle is None else study.orbit.tle.name
     return f"orbit of {source}; least angles: {', '.join(kept) or 'none'}"

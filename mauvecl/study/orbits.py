@@ -6,19 +6,18 @@ import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic import ValidationError, field_validator, model_validator
 
 from mauvecl.host.files.text_table import read_text_table
-from mauvecl.schema import parsing
+from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, Widget
 from mauvecl.schema.physical import Distance, Duration, Energy, Magnitude
-from mauvecl.schema.records import holds_truth, input_error
+from mauvecl.schema.records import input_error
 from mauvecl.schema.text import shortened, shown
 from mauvecl.study.sections import Section
 
 if TYPE_CHECKING:
-    from mauvecl.host.orbit.observing_limits import Limits
     from mauvecl.host.orbit.orbit import Orbit
     from mauvecl.host.orbit.targets import Target
     from mauvecl.host.orbit.time_grid import TimeGrid
@@ -26,70 +25,8 @@ if TYPE_CHECKING:
     from mauvecl.lightcurve.search.completeness import DurationLaw
     from mauvecl.study.study import Study
 
-#: A number, or "none" for no limit.
-Limit = float | Literal["none"]
 #: Largest number of rows of a table of targets; a plan has a page for each.
 MAX_TARGETS = 500
-
-
-class LimitsText(Section):
-    """Conditions for a target to be visible; see `host.orbit.limits.Limits`."""
-
-    earth_limb_deg: Annotated[
-        Limit, Help("Smallest angle from the Earth's limb, deg", "or none"), Flag("--earth-limb")
-    ] = 25.0
-    sun_deg: Annotated[Limit, Help("Smallest angle from the Sun, deg", "or none"), Flag("--sun")] = 46.0
-    moon_deg: Annotated[Limit, Help("Smallest angle from the Moon, deg", "or none"), Flag("--moon")] = 25.0
-    declination_deg: Annotated[
-        tuple[float, float] | Literal["none"],
-        Help("Field of regard, low:high in deg", "or none", default="-46.4:31.8"),
-        Flag("--declination", kind=str, read=parsing.declinations),
-    ] = (-46.4, 31.8)
-    normal_cone_deg: Annotated[
-        Limit, Help("Field of regard as a double cone about the orbit's normal, deg, or none")
-    ] = "none"
-    eclipse: Annotated[
-        Literal["any", "only", "never"],
-        Help("Observing in the Earth's shadow", choices="any, only (in the shadow) or never"),
-        Flag("--eclipse"),
-    ] = "any"
-    proton_flux: Annotated[
-        Limit, Help("Largest flux of protons above 10 MeV, cm^-2 s^-1", "or none"), Flag("--protons")
-    ] = 10.0
-    anomaly: Annotated[
-        tuple[tuple[float, float], ...],
-        Help("Polygon of longitude and latitude in deg that replaces the map of protons"),
-    ] = ()
-    shortest_s: Annotated[float, Unit("s"), Range(0), Help("Length below which windows are dropped")] = 0.0
-    duty_cycle: Annotated[
-        float, Range(0, 1, open_low=True), Help("Fraction of a window in which the star is exposed")
-    ] = 1.0
-
-    @field_validator("earth_limb_deg", "sun_deg", "moon_deg", "normal_cone_deg", "proton_flux", mode="before")
-    @classmethod
-    def _number_or_none(cls, given: Any, info: ValidationInfo) -> Any:
-        if isinstance(given, str) and given.strip().lower() == "none":
-            return "none"
-        if holds_truth(given):
-            # `Record` rejects it.
-            return given
-        try:
-            return float(given)
-        except (TypeError, ValueError):
-            raise InputError.of(f"orbit.limits.{info.field_name}", given, "a number, or none") from None
-
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
-        self.limits()
-        return self
-
-    def limits(self) -> Limits:
-        """Return the limits for the host, with None for no limit."""
-        from mauvecl.host.orbit.observing_limits import Limits
-
-        given = {name: getattr(self, name) for name in type(self).model_fields}
-        values: dict[str, Any] = {name: None if value == "none" else value for name, value in given.items()}
-        return Limits(**values)
 
 
 class OrbitQuestion(Section):
@@ -110,7 +47,7 @@ class OrbitQuestion(Section):
     simbad: Annotated[
         bool, Help("Ask SIMBAD for names that are not embedded", "needs mauvecl[names]"), Flag("--simbad")
     ] = False
-    limits: LimitsText = LimitsText()
+    limits: Limits = Limits()
 
     @field_validator("start", mode="before")
     @classmethod
@@ -397,6 +334,6 @@ def drop_default_plan(data: dict[str, Any], study: Study) -> None:
     for name, default in (("orbit", OrbitQuestion()), ("plan", PlanQuestion())):
         if getattr(study, name) == default:
             del data[name]
-    if "orbit" in data and study.orbit.limits == LimitsText():
+    if "orbit" in data and study.orbit.limits == Limits():
         del data["orbit"]["limits"]
     resolve_plan_paths(data, Path.cwd())

@@ -9,22 +9,21 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.lightcurve.flares.cooling import Cooling
 from mauvecl.lightcurve.flares.energies import EnergyScale, Kind, amplitude_of, amplitude_of_peak
-from mauvecl.lightcurve.flares.events import Cooling, Event, check_contributions, coefficients, temperatures_of
+from mauvecl.lightcurve.flares.events import Event, check_contributions, coefficients, temperatures_of
 from mauvecl.lightcurve.stares.light_curves import StareExpectation
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.noise.priors import Normal, Prior
 from mauvecl.noise.unknowns import CHANGING, COURSES, PROCESSES, Changing, Course, default_spreads
 from mauvecl.schema.errors import InputError
-from mauvecl.study.stare_section import EventText
+from mauvecl.study.stare_section import EventChoice
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from mauvecl.host.instrument.instrument import Instrument
-    from mauvecl.lightcurve.stares.curves import Curve
     from mauvecl.study.cases import Case
-    from mauvecl.study.stare_section import CurveText
     from mauvecl.study.study import Study
 
 Float = NDArray[np.float64]
@@ -89,11 +88,7 @@ def stare_of(case: Case) -> Stare:
     if study.nuisances.usual:
         spreads = {how: documented | spreads[how] for how, documented in default_spreads().items()}
 
-    def curve(name: str) -> Curve | None:
-        text: CurveText | None = getattr(q, name)
-        return None if text is None else text.curve(name, q.orbit_s)
-
-    changes: dict[str, Any] = {name: curve(name) for name in ("variability", "throughput", "sky")} | spreads
+    changes: dict[str, Any] = {name: getattr(q, name) for name in ("variability", "throughput", "sky")} | spreads
     changes["orbit_s"] = q.orbit_s
     if q.along_orbit:
         stare = _along_orbit(study, instrument.frame_s, changes)
@@ -103,7 +98,7 @@ def stare_of(case: Case) -> Stare:
             frame_s=instrument.frame_s,
             gaps=q.all_gaps(),
             temperature_c=instrument.temperature_c,
-            thermal=curve("thermal"),
+            thermal=q.thermal,
             **changes,
         )
     for one in priors:
@@ -131,9 +126,7 @@ def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare
             key="stare.along_orbit",
             value=True,
         )
-    return Stare.along(
-        o.orbit(), targets[0], o.start, q.duration_s, frame_s=frame_s, limits=o.limits.limits(), **changes
-    )
+    return Stare.along(o.orbit(), targets[0], o.start, q.duration_s, frame_s=frame_s, limits=o.limits, **changes)
 
 
 def expect_stare(case: Case) -> StareExpectation:
@@ -218,55 +211,55 @@ def events_of(case: Case) -> list[Event]:
 
     Raises InputError if an energy is given for a star of unknown distance and radius.
     """
-    texts = case.study.events or _evenly_spaced(case.study)
-    events = [_event(case.study, text) for text in texts]
+    choices = case.study.events or _evenly_spaced(case.study)
+    events = [_event(case.study, choice) for choice in choices]
     # The spectrum of a cooling flare is interpolated between the temperatures of all flares.
     kelvin = temperatures_of(events)
-    return [_of_energy(case, text, event, kelvin) for text, event in zip(texts, events, strict=True)]
+    return [_of_energy(case, choice, event, kelvin) for choice, event in zip(choices, events, strict=True)]
 
 
-def _evenly_spaced(study: Study) -> Sequence[EventText]:
+def _evenly_spaced(study: Study) -> Sequence[EventChoice]:
     q = study.stare
     sizes = [{"energy_erg": e} for e in q.energies_erg] or [{"amplitude": a} for a in study.flare.amplitudes]
     # The time before the first flare equals the spacing.
     step = q.duration_s / (len(sizes) + 1)
-    return [EventText(peak_s=step * (n + 1), **size) for n, size in enumerate(sizes)]
+    return [EventChoice(peak_s=step * (n + 1), **size) for n, size in enumerate(sizes)]
 
 
-def _event(study: Study, text: EventText) -> Event:
+def _event(study: Study, choice: EventChoice) -> Event:
     """Return a flare, with amplitude 1 if its energy is given."""
-    shape, flare = text.load_shape(study.stare.shape), study.flare
-    half = study.stare.half_width_s if text.half_width_s is None else text.half_width_s
-    kelvin = flare.temperature_k if text.temperature_k is None else text.temperature_k
-    if text.cooling is not None and flare.spectrum.file is not None:
+    shape, flare = choice.load_shape(study.stare.shape), study.flare
+    half = study.stare.half_width_s if choice.half_width_s is None else choice.half_width_s
+    kelvin = flare.temperature_k if choice.temperature_k is None else choice.temperature_k
+    if choice.cooling is not None and flare.spectrum.file is not None:
         raise InputError(
             "events.cooling is given with a flare spectrum from a file",
             "a flare that has a temperature",
             key="events.cooling",
-            value=text.cooling,
+            value=choice.cooling,
         )
-    temperature = kelvin if text.cooling is None else Cooling(kelvin, text.cooling.end_k, text.cooling.fold_s)
-    amplitude = flare.amplitudes[0] if text.amplitude is None else text.amplitude
-    if text.peak is not None:
-        amplitude = amplitude_of_peak(text.peak, shape)
-    elif text.equivalent_duration_s is not None:
-        amplitude = amplitude_of(text.equivalent_duration_s, half, shape)
-    elif text.energy_erg is not None:
+    temperature = kelvin if choice.cooling is None else Cooling(kelvin, choice.cooling.end_k, choice.cooling.fold_s)
+    amplitude = flare.amplitudes[0] if choice.amplitude is None else choice.amplitude
+    if choice.peak is not None:
+        amplitude = amplitude_of_peak(choice.peak, shape)
+    elif choice.equivalent_duration_s is not None:
+        amplitude = amplitude_of(choice.equivalent_duration_s, half, shape)
+    elif choice.energy_erg is not None:
         amplitude = 1.0
-    return Event(text.peak_s, half, amplitude, temperature, shape)
+    return Event(choice.peak_s, half, amplitude, temperature, shape)
 
 
-def _of_energy(case: Case, text: EventText, event: Event, temperatures_k: Float) -> Event:
+def _of_energy(case: Case, choice: EventChoice, event: Event, temperatures_k: Float) -> Event:
     """Return the flare with the amplitude that follows from its energy, if one is given."""
-    if text.energy_erg is None:
+    if choice.energy_erg is None:
         return event
     # The energy is linear in the amplitude.
-    one = energy_of(case, event, text.energy, temperatures_k)
+    one = energy_of(case, event, choice.energy, temperatures_k)
     if one is None:
         raise InputError(
-            f"the amplitude of a flare of {text.energy_erg:g} erg on {case.source.name} is unknown",
+            f"the amplitude of a flare of {choice.energy_erg:g} erg on {case.source.name} is unknown",
             "the star's distance_pc, or radius_rsun and effective_temperature_k",
             key="events.energy_erg",
-            value=text.energy_erg,
+            value=choice.energy_erg,
         )
-    return replace(event, amplitude=text.energy_erg / one)
+    return replace(event, amplitude=choice.energy_erg / one)

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from mauvecl.lightcurve.defaults import ORBIT_S, SHAPE_NAMES, check_shape
+from mauvecl.lightcurve.flares.cooling import CoolingLaw
+from mauvecl.lightcurve.stares.curves import Curve
 from mauvecl.noise.unknowns import COURSES, Changing
 from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
@@ -18,50 +20,10 @@ from mauvecl.study.sections import Section
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.flares.shapes import Shape
-    from mauvecl.lightcurve.stares.curves import Curve
     from mauvecl.study.study import Study
 
 #: Orbital period rounded down to a multiple of the frame time, s.
 ORBIT_FRAMES_S = 5680.0
-
-
-class CurveText(Section):
-    """Slow change with time: a sinusoid, points, or a file with two columns, time in s and value."""
-
-    amplitude: Annotated[float | None, Help("Half the range of a sinusoid")] = None
-    period_s: Annotated[Duration | None, Help("Period of the sinusoid", default="the orbit's")] = None
-    phase: Annotated[float, Help("Phase of the sinusoid at the start, as a fraction of the period")] = 0.0
-    points: Annotated[tuple[tuple[float, float], ...] | None, Help("Times in s, and values")] = None
-    file: Annotated[Path | None, Help("File with two columns, time in s and value")] = None
-
-    @model_validator(mode="after")
-    def _one_way(self) -> Self:
-        if (self.amplitude is not None) + (self.points is not None) + (self.file is not None) != 1:
-            raise InputError(
-                "a curve has none or several of amplitude, points and file",
-                "one of them",
-                key="amplitude",
-                value=self.amplitude,
-            )
-        if self.amplitude is None and (self.period_s is not None or self.phase):
-            raise InputError(
-                "a curve without amplitude has period_s or phase", "them with an amplitude only", key="amplitude"
-            )
-        if self.file is None:
-            self.curve("curve", ORBIT_S)
-        return self
-
-    def curve(self, name: str, orbit_s: float) -> Curve:
-        """Return the curve for a stare."""
-        import numpy as np
-
-        from mauvecl.lightcurve.stares.curves import Sinusoid, Table
-        from mauvecl.study.weights import read_columns
-
-        if self.amplitude is not None:
-            return Sinusoid(self.amplitude, orbit_s if self.period_s is None else self.period_s, self.phase)
-        columns = np.array(self.points) if self.file is None else read_columns(f"curve of {name}", "values", self.file)
-        return Table(columns[:, 0], columns[:, 1])
 
 
 Spreads = dict[Changing, Positive]
@@ -85,7 +47,7 @@ class StareQuestion(Section):
         False
     )
     thermal: Annotated[
-        CurveText | None,
+        Curve | None,
         Help("Known change of the detector temperature, deg C"),
         Flag(
             "--thermal",
@@ -94,9 +56,9 @@ class StareQuestion(Section):
             help=Help("Half the range of the known thermal cycle of the orbit, deg C", default="0"),
         ),
     ] = None
-    variability: Annotated[CurveText | None, Help("Known relative change of the star's light")] = None
-    throughput: Annotated[CurveText | None, Help("Known relative change of the throughput")] = None
-    sky: Annotated[CurveText | None, Help("Known relative change of the sky")] = None
+    variability: Annotated[Curve | None, Help("Known relative change of the star's light")] = None
+    throughput: Annotated[Curve | None, Help("Known relative change of the throughput")] = None
+    sky: Annotated[Curve | None, Help("Known relative change of the sky")] = None
     jitters: Annotated[Spreads, Help("Standard deviations of unknown changes that differ in each frame")] = Field(
         default_factory=dict
     )
@@ -148,17 +110,11 @@ class StareQuestion(Section):
         return every
 
 
-class CoolingText(Section):
-    """Exponential cooling of a flare from its initial temperature."""
+class EventChoice(Section):
+    """A flare as a study gives it: by one of several sizes, and with the study's values where it has none of its own.
 
-    end_k: Annotated[Temperature, Help("Final temperature")]
-    fold_s: Annotated[Duration, Help("Time in which the temperature excess falls by a factor of e")]
-
-
-class EventText(Section):
-    """A flare at a given time; by default with the amplitude and temperature of the study's flare.
-
-    At most one of `amplitude`, `peak`, `equivalent_duration_s` and `energy_erg` is given.
+    At most one of `amplitude`, `peak`, `equivalent_duration_s` and `energy_erg` is given. The flare that follows, an
+    `Event`, depends on the case: an energy needs the star's size, and sweeps change the study's values.
     """
 
     peak_s: Annotated[float, Unit("s"), Help("Time of the peak after the start of the stare")]
@@ -169,7 +125,7 @@ class EventText(Section):
     energy_erg: Annotated[Energy | None, Help("Energy, instead of an amplitude")] = None
     energy: Annotated[Literal["bolometric", "band"], Help("Meaning of the energy")] = "bolometric"
     temperature_k: Annotated[Temperature | None, Help("Temperature", default="the flare's")] = None
-    cooling: Annotated[CoolingText | None, Help("Exponential cooling from that temperature")] = None
+    cooling: Annotated[CoolingLaw | None, Help("Exponential cooling from that temperature")] = None
     shape: Annotated[str | None, Help("Shape", default="the stare's", choices=", ".join(SHAPE_NAMES))] = None
     shape_file: Annotated[Path | None, Help("File of a shape with two columns, time in half-widths and value")] = None
 
@@ -189,9 +145,9 @@ class EventText(Section):
 
     def load_shape(self, default: str) -> Shape:
         """Return the shape, or the published shape named `default` if none is given."""
+        from mauvecl.host.files.columns import read_columns
         from mauvecl.lightcurve.flares.shapes import TableShape, shape_of
         from mauvecl.schema.text import shortened
-        from mauvecl.study.weights import read_columns
 
         if self.shape_file is None:
             return shape_of(self.shape or default)

@@ -32,7 +32,7 @@ from mauvecl.study.questions import (
 )
 from mauvecl.study.searches import InjectionQuestion, SearchChoice, drop_default_search
 from mauvecl.study.sections import Flare, Observation, Run, Section, SkyLight, Star, Unknowns
-from mauvecl.study.stare_section import EventText, StareQuestion, drop_default_stare, resolve_stare_paths
+from mauvecl.study.stare_section import EventChoice, StareQuestion, drop_default_stare, resolve_stare_paths
 from mauvecl.study.study_text import locate_files, parse_toml_value, read_embedded_study, set_key, with_file_digests
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class Study(Section):
     sweep: Sweep = Sweep()
     unknowns: Unknowns = Unknowns()
     stare: StareQuestion = StareQuestion()
-    events: tuple[EventText, ...] = ()
+    events: tuple[EventChoice, ...] = ()
     search: SearchChoice = SearchChoice()
     injections: InjectionQuestion = InjectionQuestion()
     orbit: OrbitQuestion = OrbitQuestion()

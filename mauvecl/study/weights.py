@@ -1,4 +1,4 @@
-"""Two-column files of users: weights of linear statistics, nuisance spectra, and curves."""
+"""Two-column files of users: weights of linear statistics and nuisance spectra."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.files.parsing import LARGEST, SMALLEST, parsing, read_text
+from mauvecl.host.files.columns import columns
+from mauvecl.host.files.parsing import LARGEST, SMALLEST, read_text
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
@@ -33,29 +34,8 @@ def read_spectrum(name: str, path: Path, wavelength_nm: NDArray[np.float64]) -> 
 
 
 def _read_values(what: str, kind: str, path: Path, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-    return at_pixels(what, kind, _columns(what, kind if kind == "weights" else "spectrum", path), wavelength_nm)
-
-
-def read_columns(what: str, kind: str, path: Path) -> NDArray[np.float64]:
-    """Read times and values from a file, shape (n, 2); # starts a comment.
-
-    `what` names the content and `kind` the values in messages.
-    """
-    pairs = _columns(f"{what} {shortened(path.name)}", what, path)
-    if pairs.ndim != 2 or pairs.shape[1] != 2:
-        raise InputError(f"{what} {shortened(path.name)} has no two columns", f"times and {kind}", key=what)
-    return pairs
-
-
-def _columns(what: str, kind: str, path: Path) -> NDArray[np.float64]:
-    text = read_text(path, kind)
-    return columns(what, text)
-
-
-def columns(what: str, text: str) -> NDArray[np.float64]:
-    """Parse rows of numbers, shape (n, 2) if each row has two."""
-    with parsing(what, "two columns"):
-        return np.array([[float(word) for word in row] for line in text.splitlines() if (row := _words(line))])
+    rows = columns(what, read_text(path, kind if kind == "weights" else "spectrum"))
+    return at_pixels(what, kind, rows, wavelength_nm)
 
 
 def at_pixels(
@@ -94,7 +74,3 @@ def at_pixels(
             key=what,
         )
     return np.asarray(values)
-
-
-def _words(line: str) -> list[str]:
-    return line.split("#", 1)[0].split()

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from mauvecl.host.files.columns import columns
 from mauvecl.host.stars.source import Source
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
-from mauvecl.study.weights import columns
 from mauvecl.web.fields import UPLOADED
 from mauvecl.web.question import Points
 from mauvecl.web.sandboxed_reader import read_limited

@@ -122,5 +122,6 @@ def test_study_contains_all_flags(study: Study) -> None:
     limits = ["orbit.limits.moon_deg=none", "orbit.limits.anomaly=[[-90, -50], [40, -50], [0, 0]]"]
     changed = study.with_settings([*limits, "orbit.limits.eclipse=only"])
     assert Study.build(tomllib.loads(changed.toml()), "text") == changed
-    assert changed.orbit.limits.limits().moon_deg is None
+    assert changed.orbit.limits.moon_deg is None
+    assert 'moon_deg = "none"' in changed.toml()
     assert "orbit" not in tomllib.loads(Study().toml())

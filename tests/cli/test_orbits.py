@@ -19,7 +19,7 @@ def test_visible_writes_its_files(tmp_path: Path) -> None:
     names = {path.name for path in folder.iterdir()}
     assert {"visible.ecsv", "windows.ecsv", "visible.ics", "visible.png", "assumptions.ecsv", "run.json"} <= names
     study = Study.read(folder / "study.toml")
-    assert (study.orbit.limits.sun_deg, study.orbit.limits.moon_deg, study.orbit.days) == (60.0, "none", 3.0)
+    assert (study.orbit.limits.sun_deg, study.orbit.limits.moon_deg, study.orbit.days) == (60.0, None, 3.0)
     # What is not said stays as it is.
     assert study.orbit.limits.earth_limb_deg == 25.0
     rows = json.loads(run("visible", folder / "study.toml", "--json", folder=tmp_path).stdout)["rows"]
@@ -55,7 +55,7 @@ def test_table_of_targets_is_distinguished_from_an_answer(tmp_path: Path) -> Non
     ("words", "told"),
     [
         (("visible",), "no targets, expected names or coordinates, such as --look-at 'eps Eri'"),
-        (("visible", "--look-at", "Vega", "--sun", "wide"), "'wide', expected a number, or none"),
+        (("visible", "--look-at", "Vega", "--sun", "wide"), "'wide', expected 0 to 180 deg, or none"),
         (("visible", "--look-at", "Vega", "--declination", "3"), "--declination '3', expected low:high"),
         (("visible", "--look-at", "Vega", "--tle", "none.tle"), "orbit file 'none.tle' does not exist"),
         (("plan",), "the plan has no targets, expected some, such as --targets targets.csv"),

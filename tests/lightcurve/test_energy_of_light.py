@@ -15,7 +15,7 @@ from mauvecl.lightcurve.flares.events import Cooling, Event, coefficients, tempe
 from mauvecl.study.cases import Case
 from mauvecl.study.sections import Flare, SkyLight, Star
 from mauvecl.study.stare_expectation import energy_of
-from mauvecl.study.stare_section import EventText
+from mauvecl.study.stare_section import EventChoice
 from mauvecl.study.study import Study
 
 STARS = ("A0V", "A7V", "F5V", "G2V", "K1V", "K5V", "M0V", "M3V", "M5V", "Sun")
@@ -36,7 +36,7 @@ def through(name: str, nm: np.ndarray, flux: np.ndarray) -> float:
     return float(np.trapezoid(response * np.interp(fine, nm, flux, left=0, right=0), fine)) * 10
 
 
-def events(rng: np.random.Generator, most: int) -> tuple[EventText, ...]:
+def events(rng: np.random.Generator, most: int) -> tuple[EventChoice, ...]:
     """Return random flares of energies, within a stare of a day."""
     texts = []
     for _ in range(rng.integers(1, most + 1)):
@@ -45,7 +45,7 @@ def events(rng: np.random.Generator, most: int) -> tuple[EventText, ...]:
         if rng.random() < 0.4:
             cooling = {"end_k": float(rng.uniform(5500, hot)), "fold_s": float(spread(1, 2, 1000, rng)[0])}
         texts.append(
-            EventText(
+            EventChoice(
                 peak_s=float(rng.uniform(5000, 20_000)),
                 half_width_s=float(spread(1, 2, 600, rng)[0]),
                 energy_erg=float(spread(1, 1e28, 1e31, rng)[0]),

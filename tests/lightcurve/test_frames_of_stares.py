@@ -9,7 +9,7 @@ from scenes import instrument, star
 from scipy.integrate import quad
 
 from mauvecl.lightcurve.defaults import ORBIT_S
-from mauvecl.lightcurve.stares.curves import Sinusoid, Table
+from mauvecl.lightcurve.stares.curves import Curve, Sinusoid
 from mauvecl.lightcurve.stares.stare import Stare
 
 
@@ -31,13 +31,13 @@ def test_star_month_needs_little_memory():
 
 
 @pytest.mark.parametrize(
-    "curve", [Sinusoid(0.3, 400.0, 1.0), Table(np.array([20.0, 33.0, 36.0, 90.0]), np.array([1.0, -2.0, 5.0, 0.5]))]
+    "curve", [Sinusoid(0.3, 400.0, 1.0), Curve(points=((20, 1.0), (33, -2.0), (36, 5.0), (90, 0.5)))]
 )
 def test_curves_are_averaged_over_frames(curve):
     def at(t):
         if isinstance(curve, Sinusoid):
             return curve.amplitude * np.sin(2 * np.pi * t / curve.period_s + curve.phase)
-        return np.interp(t, curve.time_s, curve.values)
+        return np.interp(t, *zip(*curve.points, strict=True))
 
     start = np.arange(0.0, 120.0, 5.0)
     exact = [quad(at, t, t + 5.0, points=[20.0, 33.0, 36.0, 90.0])[0] / 5.0 for t in start]
@@ -49,7 +49,7 @@ def test_known_conditions_and_unknowns_are_separate():
         ORBIT_S,
         thermal=0.5,
         temperature_c=13.0,
-        variability=Table(np.array([0.0, 6000.0]), np.array([0.0, 0.06])),
+        variability=Curve(points=((0.0, 0.0), (6000.0, 0.06))),
         jitters={"light": 0.02, "temperature": 0.01},
         offsets={"sky": 0.1},
         drifts={"light": 0.01},
@@ -71,7 +71,7 @@ def test_known_conditions_and_unknowns_are_separate():
 
 def test_dark_current_follows_the_law_of_the_instrument():
     (quiet,) = star(payload=instrument(part=True))
-    stare = Stare.of(50.0, thermal=Table(np.array([0.0, 50.0]), np.array([1.0, 1.0])))
+    stare = Stare.of(50.0, thermal=Curve(points=((0.0, 1.0), (50.0, 1.0))))
     np.testing.assert_allclose(stare.dark_factor(quiet), np.exp(0.0684))
 
 

@@ -27,7 +27,7 @@ from mauvecl.lightcurve.search.bank import Bank, Baseline
 from mauvecl.lightcurve.search.completeness import Completeness, DurationLaw, frame_signal, search_threshold
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.search.yields import fit_power_law
-from mauvecl.lightcurve.stares.curves import Sinusoid, Table
+from mauvecl.lightcurve.stares.curves import Curve, Sinusoid
 from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.orbit_stare import stare_along
 from mauvecl.lightcurve.stares.stare import Stare, StareUnknown
@@ -114,9 +114,9 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "offset of": (lambda: Stare.of(100, offsets={"dark": 0.1}), "offsets"),
     "orbit": (lambda: Stare.of(100, orbit_s=0.0), "orbit_s"),
     "period": (lambda: Sinusoid(1.0, -3.0), "period_s"),
-    "times of a curve": (lambda: Table(np.ones(2), np.zeros(2)), "time_s"),
-    "number of values": (lambda: Table(TWO, np.zeros(3)), "values"),
-    "undefined value": (lambda: Table(TWO, np.array([0.0, np.nan])), "values"),
+    "times of a curve": (lambda: Curve(points=((1.0, 0.0), (1.0, 0.0))), "points"),
+    "number of points": (lambda: Curve(points=((0.0, 1.0),)), "points"),
+    "undefined value": (lambda: Curve(points=((0.0, 1.0), (1.0, np.nan))), "points.1.1"),
     "standard deviation": (lambda: StareUnknown("x", "light", 0.0, np.ones(2)), "x"),
     "start of frames": (lambda: Stare(np.array([0.0, 7.0]), 5.0, *[np.ones(2)] * 4), "start_s"),
     "number of frames": (lambda: Stare(np.array([0.0, 5.0]), 5.0, *[np.ones(3)] * 4), "star"),

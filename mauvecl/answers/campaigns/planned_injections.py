@@ -11,11 +11,11 @@ from mauvecl.answers.campaigns.planned import TargetObservation
 from mauvecl.answers.stares.inject import inject
 from mauvecl.lightcurve.flares.rates import BOLOMETRIC
 from mauvecl.lightcurve.search.completeness import PER_DECADE, Completeness, DurationLaw
+from mauvecl.lightcurve.stares.curves import Curve
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool
 from mauvecl.study.cases import Case
 from mauvecl.study.searches import InjectionQuestion
-from mauvecl.study.stare_section import CurveText
 
 if TYPE_CHECKING:
     from mauvecl.device.stare_engine import Stares
@@ -68,7 +68,7 @@ def injection_case(observation: TargetObservation) -> Case:
         "duration_s": ORBITS * orbit_s, "orbit_s": orbit_s, "orbit_gap_s": gap, "gaps": (), "along_orbit": False,
     }  # fmt: skip
     if conditions is not None and study.stare.thermal is None:
-        changes["thermal"] = CurveText(points=conditions.swings(ORBITS, orbit_s))
+        changes["thermal"] = Curve(points=conditions.swings(ORBITS, orbit_s))
     injections = InjectionQuestion(
         of="energy", sizes=2, widths=WIDTHS, half_width_low_s=WIDTH_RANGE_S[0], half_width_high_s=WIDTH_RANGE_S[1],
         count=study.plan.injections, positions=min(POSITIONS, study.plan.injections), fitted=0,

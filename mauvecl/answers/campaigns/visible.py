@@ -342,7 +342,7 @@ def visible(
     o = study.orbit
     track = o.orbit().track(o.times())
     directions = np.array([one.direction for one in targets])
-    answer = VisibleAnswer(study, targets, Visibility.of(track, directions, o.limits.limits()))
+    answer = VisibleAnswer(study, targets, Visibility.of(track, directions, o.limits))
     if progress is not None:
         progress(len(targets), len(targets))
     return answer

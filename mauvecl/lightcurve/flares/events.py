@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from typing import Annotated, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from mauvecl.lightcurve.flares.cooling import SAME_K, Cooling
 from mauvecl.lightcurve.flares.energies import EnergyScale, amplitude_of, amplitude_of_peak, equivalent_duration
 from mauvecl.lightcurve.flares.shapes import SHAPES, Shape, shape_of
 from mauvecl.schema.calls import validated
@@ -22,36 +23,8 @@ Float = NDArray[np.float64]
 MOST_TEMPERATURES, LEAST_STEPS = 8, 3
 #: For a flare that cools: smallest number of steps per frame, half-width and cooling time, and largest per frame.
 PARTS, MOST_PARTS = 16, 512
-#: Temperatures that differ by less are treated as equal, K.
-SAME_K = 0.5
 #: Fraction of a flare's peak and of its fluence below which its light in a frame is neglected.
 LEAST_LIGHT = 1e-9
-
-
-@validated
-@dataclass(frozen=True)
-class Cooling:
-    """Temperature that is constant before the peak, and end + (peak - end) exp(-(t - t_peak) / fold) after it."""
-
-    peak_k: Temperature
-    end_k: Temperature
-    fold_s: Duration
-
-    def __post_init__(self) -> None:
-        if self.end_k > self.peak_k:
-            raise InputError.of(
-                "end_k", self.end_k, f"at most the temperature of the peak, {self.peak_k:g} K", unit="K"
-            )
-
-    def at(self, since_peak_s: Annotated[ArrayLike, Unit("s")]) -> Float:
-        """Return the temperature at times since the peak, K, shape of the time."""
-        cooled = np.exp(-np.maximum(since_peak_s, 0.0) / self.fold_s)
-        return np.asarray(self.end_k + (self.peak_k - self.end_k) * cooled)
-
-    @property
-    def steady(self) -> bool:
-        """True if the temperature hardly changes."""
-        return self.peak_k - self.end_k < SAME_K
 
 
 @validated

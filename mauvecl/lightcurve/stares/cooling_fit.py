@@ -17,7 +17,8 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.lightcurve.flares.events import Cooling, Event
+from mauvecl.lightcurve.flares.cooling import Cooling
+from mauvecl.lightcurve.flares.events import Event
 from mauvecl.lightcurve.flares.shapes import Shape, shape_of
 from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.measured_bins import checked_frames, known_strengths, less_known

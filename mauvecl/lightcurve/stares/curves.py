@@ -1,67 +1,94 @@
-"""Slow changes during a stare: sinusoids and linearly interpolated tables."""
+"""Slow changes during a stare: sinusoids, and values at times that are interpolated linearly."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated
+import math
+from collections.abc import Sequence
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Self
 
-import numpy as np
-from numpy.typing import NDArray
+from pydantic import model_validator
 
 from mauvecl.lightcurve.defaults import ORBIT_S
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Range, Unit
+from mauvecl.schema.fields import Help, Range, Unit
 from mauvecl.schema.physical import Duration
+from mauvecl.schema.section import Section
 
-Float = NDArray[np.float64]
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Float = NDArray[np.float64]
 
 
 @validated
-@dataclass(frozen=True)
-class Sinusoid:
-    """The curve amplitude * sin(2 pi t / period + phase)."""
+class Curve(Section):
+    """Slow change with time: a sinusoid, points, or a file with two columns, time in s and value.
 
-    amplitude: Annotated[float, Range()]  # half of the range
-    period_s: Duration = ORBIT_S
-    phase: Annotated[float, Range()] = 0.0  # radians, at the start of the stare
+    Between points the value is linear in time; before the first and after the last it is constant.
+    """
 
-    def mean_over(self, start_s: Annotated[Float, Unit("s")], frame_s: Duration) -> Float:
-        """Return the mean over each frame, shape (n_frame,)."""
-        angle = 2 * np.pi * (start_s + frame_s / 2) / self.period_s + self.phase
-        return np.asarray(self.amplitude * np.sinc(frame_s / self.period_s) * np.sin(angle))
+    amplitude: Annotated[Annotated[float, Range()] | None, Help("Half the range of a sinusoid")] = None
+    period_s: Annotated[Duration | None, Help("Period of the sinusoid", default="the orbit's")] = None
+    phase: Annotated[float, Unit("rad"), Range(), Help("Phase of the sinusoid at the start of the stare")] = 0.0
+    points: Annotated[tuple[tuple[float, float], ...] | None, Help("Times in s, and values")] = None
+    file: Annotated[Path | None, Help("File with two columns, time in s and value")] = None
 
-
-@dataclass(frozen=True, eq=False)
-class Table:
-    """Values at times, interpolated linearly, and constant before the first and after the last time."""
-
-    time_s: Float  # ascending, shape (n,)
-    values: Float  # shape (n,)
-
-    def __post_init__(self) -> None:
-        for name in ("time_s", "values"):
-            kept = np.array(getattr(self, name), np.float64)
-            kept.setflags(write=False)
-            object.__setattr__(self, name, kept)
-        if self.time_s.ndim != 1 or self.time_s.shape != self.values.shape or self.time_s.size < 2:
-            raise InputError.of("values", self.values.size, f"one for each of {self.time_s.size} times, at least 2")
-        if not (np.isfinite(self.time_s).all() and np.isfinite(self.values).all()):
-            raise InputError("a curve holds a time or value that is not finite", "numbers", key="values")
-        steps = np.diff(self.time_s)
-        if not (steps > 0).all():
-            place = int(np.argmin(steps > 0))
-            raise InputError.of(
-                "time_s", (float(self.time_s[place]), float(self.time_s[place + 1])), "ascending", unit="s"
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if (self.amplitude is not None) + (self.points is not None) + (self.file is not None) != 1:
+            raise InputError(
+                "a curve has none or several of amplitude, points and file",
+                "one of them",
+                key="amplitude",
+                value=self.amplitude,
             )
+        if self.amplitude is None and (self.period_s is not None or self.phase):
+            raise InputError(
+                "a curve without amplitude has period_s or phase", "them with an amplitude only", key="amplitude"
+            )
+        if self.points is not None:
+            _check_points(self.points)
+        return self
 
-    def mean_over(self, start_s: Float, frame_s: float) -> Float:
-        """Return the exact mean over each frame, shape (n_frame,)."""
-        return np.asarray((self._until(start_s + frame_s) - self._until(start_s)) / frame_s)
+    @cached_property
+    def _time_and_value(self) -> tuple[Float, Float]:
+        import numpy as np
 
-    def _until(self, t: Float) -> Float:
+        from mauvecl.host.files.columns import read_columns
+
+        rows = np.array(self.points) if self.file is None else read_columns("curve", "values", self.file)
+        if self.file is not None:
+            _check_points(rows.tolist())
+        return rows[:, 0], rows[:, 1]
+
+    def mean_over(self, start_s: Annotated[Float, Unit("s")], frame_s: Duration, orbit_s: Duration = ORBIT_S) -> Float:
+        """Return the exact mean over each frame, shape (n_frame,).
+
+        Parameters
+        ----------
+        start_s : ndarray, shape (n_frame,)
+        frame_s : float
+        orbit_s : float
+            Period of a sinusoid that has no period of its own.
+        """
+        import numpy as np
+
+        if self.amplitude is None:
+            return np.asarray((self._integral(start_s + frame_s) - self._integral(start_s)) / frame_s)
+        period_s = orbit_s if self.period_s is None else self.period_s
+        angle = 2 * np.pi * (start_s + frame_s / 2) / period_s + self.phase
+        return np.asarray(self.amplitude * np.sinc(frame_s / period_s) * np.sin(angle))
+
+    def _integral(self, t: Float) -> Float:
         """Return the integral from the first point to a time, shape of t."""
-        time, value = self.time_s, self.values
+        import numpy as np
+
+        time, value = self._time_and_value
         slope = np.diff(value) / np.diff(time)
         areas = np.concatenate([[0.0], np.cumsum(np.diff(time) * (value[1:] + value[:-1]) / 2)])
         k = np.clip(np.searchsorted(time, t, side="right") - 1, 0, time.size - 2)
@@ -70,4 +97,25 @@ class Table:
         return np.asarray(inside + np.minimum(t - time[0], 0) * value[0] + np.maximum(t - time[-1], 0) * value[-1])
 
 
-Curve = Sinusoid | Table
+@validated
+class Sinusoid(Curve):
+    """The curve amplitude * sin(2 pi t / period + phase); by default with the period of the orbit."""
+
+    def __init__(
+        self,
+        amplitude: Annotated[float, Range()],
+        period_s: Duration | None = None,
+        phase: Annotated[float, Unit("rad"), Range()] = 0.0,
+    ) -> None:
+        super().__init__(amplitude=amplitude, period_s=period_s, phase=phase)
+
+
+def _check_points(points: Sequence[Sequence[float]]) -> None:
+    """Raise InputError unless there are two or more points of finite values at ascending times."""
+    if len(points) < 2:
+        raise InputError.of("points", len(points), "at least 2 points")
+    if not all(math.isfinite(number) for point in points for number in point):
+        raise InputError("a curve holds a time or value that is not finite", "numbers", key="points")
+    for (time, _), (following, _) in pairwise(points):
+        if time >= following:
+            raise InputError.of("points", (time, following), "ascending times", unit="s")

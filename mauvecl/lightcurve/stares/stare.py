@@ -165,14 +165,14 @@ class Stare:
             Start and end of gaps, s; frames that overlap a gap are lost.
         temperature_c : float
             Mean detector temperature; that of the payload by default.
-        thermal : float, Sinusoid or Table, optional
+        thermal : float or Curve, optional
             Change of the temperature, deg C: the amplitude of a sinusoid with the orbital period, or a curve.
-        variability : Sinusoid or Table, optional
+        variability : Curve, optional
             Relative variability of the star: 0.01 is 1 % brighter.
-        throughput, sky : Sinusoid or Table, optional
+        throughput, sky : Curve, optional
             Known relative changes of all light, and of the sky brightness.
         orbit_s : float
-            Period of `thermal` and `cycles`.
+            Period of `cycles`, and of sinusoids without a period of their own.
         jitters : mapping of {"light", "sky", "temperature"} to float, optional
             Standard deviation from frame to frame.
         offsets, drifts, cycles : mapping of {"star", "light", "sky", "temperature"} to float, optional
@@ -193,7 +193,7 @@ class Stare:
             raise InputError.of("gaps", gaps, f"gaps that leave a frame of {duration_s:g} s")
 
         def over_frames(curve: Curve | None) -> Float:
-            return np.zeros(start.size) if curve is None else curve.mean_over(start, float(frame_s))
+            return np.zeros(start.size) if curve is None else curve.mean_over(start, float(frame_s), orbit_s)
 
         spread = dict(jitters or {})
         known = STARE_CHANGES["jitters"]
@@ -206,7 +206,7 @@ class Stare:
             1.0 + over_frames(variability),
             1.0 + over_frames(throughput),
             1.0 + over_frames(sky),
-            temperature_c + over_frames(Sinusoid(thermal, orbit_s) if isinstance(thermal, int | float) else thermal),
+            temperature_c + over_frames(Sinusoid(thermal) if isinstance(thermal, int | float) else thermal),
             spread.get("light", 0.0),
             spread.get("sky", 0.0),
             spread.get("temperature", 0.0),
