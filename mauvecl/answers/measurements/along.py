@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import InCell
 from mauvecl.answers.measurements.expected import last_of_one_temperature, model_of, models_of
-from mauvecl.lightcurve.flares.events import Cooling
+from mauvecl.lightcurve.flares.cooling import Cooling
 from mauvecl.lightcurve.stares.cooling_fit import CoolingCourse, cooling_course, cooling_event, fit_cooling
 from mauvecl.lightcurve.stares.measured_bins import MeasuredBins, fit_bins, measure_along
 from mauvecl.lightcurve.stares.stare_requests import Arrays, StaresRequest
