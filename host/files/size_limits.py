@@ -9,7 +9,7 @@ import stat
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
@@ -33,8 +33,8 @@ def limit_bytes(variable: str) -> int:
     return int(text) << 20
 
 
-def read_bytes(path: Path, what: str) -> bytes:
-    """Return the content of a regular file of bounded size, without unpacking it.
+def open_regular(path: Path, what: str) -> IO[bytes]:
+    """Open a regular file for reading.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def read_bytes(path: Path, what: str) -> bytes:
     what : str
         What the file should be, for messages: "spectrum file", "study".
 
-    Raises InputError if there is no such file, it is no regular file, is too large, or cannot be read.
+    Raises InputError if there is no such file, it is no regular file, or cannot be opened.
     """
     shown = shortened(str(path))
     try:
@@ -57,16 +57,25 @@ def read_bytes(path: Path, what: str) -> bytes:
     except ValueError as error:
         # Null bytes, and characters that no file name can hold.
         raise InputError(f"{what} {shown} is no path ({error})", "a file's name", key="file", value=path) from error
-    status = os.fstat(descriptor)
-    if not stat.S_ISREG(status.st_mode):
+    mode = os.fstat(descriptor).st_mode
+    if not stat.S_ISREG(mode):
         os.close(descriptor)
-        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "no regular file"
+        kind = "a folder" if stat.S_ISDIR(mode) else "no regular file"
         raise InputError(f"{what} {shown} is {kind}", "a regular file", key="file", value=str(path))
-    with open(descriptor, "rb") as file:
+    return open(descriptor, "rb")
+
+
+def read_bytes(path: Path, what: str) -> bytes:
+    """Return the content of a regular file of bounded size, without unpacking it.
+
+    Raises InputError as `open_regular`, or if the file is too large or cannot be read.
+    """
+    shown = shortened(str(path))
+    with open_regular(path, what) as file:
         most = limit_bytes("MAUVECL_LARGEST_FILE_MIB")
         try:
             # The file may have grown since its size was read.
-            content = file.read(most + 1) if status.st_size <= most else None
+            content = file.read(most + 1) if os.fstat(file.fileno()).st_size <= most else None
         except OSError as error:
             raise InputError(
                 f"{what} {shown} cannot be read ({error.strerror})", "a readable file", key="file", value=str(path)

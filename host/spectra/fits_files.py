@@ -6,7 +6,7 @@ import io
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 from mauvecl.schema.errors import InputError
 
@@ -36,11 +36,21 @@ def fits_tables(content: bytes, name: str, origin: str, asked: Sequence[str]) ->
         # astropy warns of the headers of old archive files, and reads them.
         warnings.simplefilter("ignore")
         hdus = fits.open(io.BytesIO(content), memmap=False, lazy_load_hdus=False, disable_image_compression=True)
-        _check_sums(hdus)
+        check_sums(hdus)
         return _Reader(hdus, name, origin, asked).tables()
 
 
-def check_sizes(content: bytes) -> None:
+class Content(Protocol):
+    """Bytes, or a file that is read where it is sliced."""
+
+    def __len__(self) -> int:
+        """Return the size in bytes."""
+
+    def __getitem__(self, part: slice, /) -> bytes:
+        """Return bytes from `part.start` to `part.stop`."""
+
+
+def check_sizes(content: Content) -> None:
     """Raise InputError for headers whose sizes are impossible or larger than the file.
 
     astropy's reader would loop for ever on a negative size.
@@ -87,7 +97,7 @@ def check_sizes(content: bytes) -> None:
     raise InputError(f"has more than {MAX_EXTENSIONS} extensions", "fewer", key="file", value=MAX_EXTENSIONS)
 
 
-def _check_sums(hdus: Any) -> None:
+def check_sums(hdus: Any) -> None:
     """Raise InputError where DATASUM or CHECKSUM (FITS standard 4.0, section 4.4.2.7) do not fit what is there."""
     for number, hdu in enumerate(hdus):
         for key, verify in (("DATASUM", hdu.verify_datasum), ("CHECKSUM", hdu.verify_checksum)):

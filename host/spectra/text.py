@@ -214,14 +214,15 @@ def _value(row: Row, place: int) -> float:
             f"line {number}: {shortened(line, 60)} has {what}", "wavelength and flux", key="columns", value=line
         )
     try:
-        return _number(cells[place])
+        return number_in(cells[place])
     except ValueError as error:
         raise InputError(
             f"line {number}: {shortened(line, 60)} is not numeric", "wavelength and flux", key="columns", value=line
         ) from error
 
 
-def _number(cell: str) -> float:
+def number_in(cell: str) -> float:
+    """Return the number in a cell, NaN for words such as "null"; raise ValueError for anything else."""
     cell = cell.strip().strip("\"'")
     if "_" in cell:
         raise ValueError(cell)
@@ -277,6 +278,6 @@ def _array_reader(rows: Sequence[Row], place: int) -> Callable[[], Any]:
 
 def _array(cell: str) -> Any:
     try:
-        return np.array([_number(one) for one in cell.strip().strip("()[]").split(",")])
+        return np.array([number_in(one) for one in cell.strip().strip("()[]").split(",")])
     except ValueError as error:
         raise InputError.of("cell", cell, "an array of numbers") from error

@@ -138,7 +138,7 @@ def analyse_frames(
         Seed of the resampled noise and of injections.
     """
     wanted = per_day(false_alarms, per)
-    flux, error = white_light(frames)
+    flux, error = frames.white_light
     level = quiescent_level(frames, flux, error)
     survey = SeriesSurvey.of(frames, flux, error, level, shape_of(shape))
     frequent = max(wanted, CANDIDATES)
@@ -167,17 +167,3 @@ def _threshold(normal: SampledRate, rate: float) -> float:
     """
     lowest = float(normal.thresholds[0])
     return lowest if rate >= normal.rate(lowest).value else normal.threshold(rate).value
-
-
-def white_light(frames: Frames) -> tuple[Float, Float | None]:
-    """Return the light curve of frames: of spectra, the sum over wavelength without pixels that are not finite."""
-    if frames.flux.ndim == 1:
-        return frames.flux, frames.error
-    fine = np.isfinite(frames.flux).all(axis=0)
-    if frames.error is not None:
-        fine &= np.isfinite(frames.error).all(axis=0)
-    if not fine.any():
-        raise InputError(f"{frames.name}: no pixel is finite in every frame", "pixels with light in every frame",
-                         key="flux")  # fmt: skip
-    error = None if frames.error is None else np.sqrt((frames.error[:, fine] ** 2).sum(axis=1))
-    return frames.flux[:, fine].sum(axis=1), error

@@ -21,6 +21,8 @@ Float = NDArray[np.float64]
 MIN_FRAMES = 20
 #: Largest number of frames, for which a search needs some 2 GiB.
 MAX_FRAMES = 2**22
+#: Share of frames in which a pixel has to be finite; others are left out of every frame.
+LIVE_SHARE = 0.5
 #: Shortest time between frames as a share of the cadence; frames that are closer overlap.
 MIN_STEP = 0.5
 
@@ -70,6 +72,8 @@ class Frames:
         Where the times are measured, as FITS TREFPOS has it, such as "TOPOCENTER" or "BARYCENTER"; empty if unknown.
     name : str
         Name of the star or the file.
+    instrument : str
+        Name of the instrument; empty if unknown.
     remarks : tuple of str
         What was done while reading, such as sorting.
     """
@@ -86,6 +90,7 @@ class Frames:
     scale: str = ""
     position: str = ""
     name: str = "frames"
+    instrument: str = ""
     remarks: tuple[str, ...] = ()
 
     @classmethod
@@ -150,7 +155,10 @@ class Frames:
         if not (np.isfinite(exposure) & (exposure > 0)).all():
             raise _bad(name, "exposure", f"{exposure[np.argmin(exposure)]:g} s", "exposure times above 0")
         if how.get("temperature_c") is not None:
-            how["temperature_c"] = np.asarray(how["temperature_c"], np.float64)[order]
+            temperature = np.asarray(how["temperature_c"], np.float64)
+            if temperature.shape != (n,):
+                raise _bad(name, "temperature", temperature.shape, f"({n},)")
+            how["temperature_c"] = temperature[order]
         made = cls(
             time[order], exposure[order], light[order], None if sd is None else sd[order], flags[order],
             name=name, remarks=remarks, **how,
@@ -159,7 +167,37 @@ class Frames:
         if (wavelength is None) != (light.ndim == 1) or (wavelength is not None and wavelength.size != light.shape[1]):
             raise _bad(name, "wavelength", None if wavelength is None else wavelength.shape,
                        "one wavelength for each pixel of spectra, none for a light curve")  # fmt: skip
-        return made
+        return made if wavelength is None else made._in_order_of_wavelength()._without_dead_pixels()
+
+    def _in_order_of_wavelength(self) -> Self:
+        assert self.wavelength_nm is not None
+        if not (np.isfinite(self.wavelength_nm).all() and (self.wavelength_nm > 0).all()):
+            raise _bad(self.name, "wavelength", float(self.wavelength_nm.min()), "wavelengths above 0 nm")
+        order = np.argsort(self.wavelength_nm, kind="stable")
+        return self._with_pixels(order) if (np.diff(order) < 0).any() else self
+
+    def _with_pixels(self, chosen: NDArray[Any]) -> Self:
+        assert self.wavelength_nm is not None
+        error = None if self.error is None else self.error[:, chosen]
+        return replace(self, flux=self.flux[:, chosen], error=error, wavelength_nm=self.wavelength_nm[chosen])
+
+    def _without_dead_pixels(self) -> Self:
+        """Return spectra without the pixels that are not finite in most frames; a remark states their number."""
+        finite = np.isfinite(self.flux) if self.error is None else np.isfinite(self.flux) & np.isfinite(self.error)
+        live = live_pixels(finite.sum(axis=0), self.n_frames, self.name)
+        if live.all():
+            return self
+        return self._with_pixels(live).with_remarks(dead_pixel_remarks(int((~live).sum()), self.name))
+
+    @property
+    def white_light(self) -> tuple[Float, Float | None]:
+        """Light curve and its errors, shape (n_frame,): of spectra, the sum over wavelength.
+
+        Frames with a value that is not finite are not finite.
+        """
+        if self.flux.ndim == 1:
+            return self.flux, self.error
+        return self.flux.sum(axis=1), None if self.error is None else np.sqrt((self.error**2).sum(axis=1))
 
     @property
     def n_frames(self) -> int:
@@ -210,6 +248,20 @@ class Frames:
             self.reference_mjd, time_s / DAY_S, format="mjd", scale=self.scale if self.scale in known else "tdb"
         )
         return str(when.isot)
+
+
+def live_pixels(finite: NDArray[np.int64], n_frames: int, name: str) -> NDArray[np.bool_]:
+    """Return the pixels that are finite in most frames, from the number of frames in which each of them is."""
+    live = finite > LIVE_SHARE * n_frames
+    if not live.any():
+        raise InputError(f"{name}: no pixel is finite in most frames", "pixels with light", key="flux")
+    return np.asarray(live)
+
+
+def dead_pixel_remarks(number: int, name: str) -> tuple[str, ...]:
+    """Return the remark on pixels that are left out; none for no pixel."""
+    words = "1 pixel is" if number == 1 else f"{number} pixels are"
+    return (f"{words} not finite in most frames of {name} and left out",) if number else ()
 
 
 def _bad(name: str, key: str, value: Any, expected: str) -> InputError:

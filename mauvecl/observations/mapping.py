@@ -9,12 +9,14 @@ from pydantic import model_validator
 
 from mauvecl.host.files.parsing import read_text, toml
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import Exposure
 from mauvecl.schema.records import Record
 from mauvecl.schema.text import shortened
 
 #: Epochs by name, as modified Julian dates: of TESS and Kepler (their archive manuals), GPS and Unix seconds.
 EPOCHS_MJD = {
     "mjd": 0.0,
+    "rjd": -0.5,
     "jd": -2_400_000.5,
     "bjd": -2_400_000.5,
     "btjd": 56_999.5,
@@ -25,18 +27,21 @@ EPOCHS_MJD = {
 
 
 class FrameMapping(Record):
-    """Where the quantities of frames are in a file.
+    """Where the quantities of frames are in a file, or in the files of a folder.
+
+    A quantity is the name of a column; in FITS files also of an image, or ``EXTENSION/COLUMN``; in a folder of spectra
+    also a keyword of each file's header. A pattern such as ``flux_*`` names several columns, one for each pixel.
 
     Attributes
     ----------
     hdu : str or int, optional
-        Extension of a FITS file; by default the first table that has the columns.
+        Extension of a FITS file whose columns are meant; by default the first table.
     time : str or (str, str)
-        Column of times, or two columns with start and end of each frame.
+        Times, as numbers or ISO 8601 dates; or start and end of each frame; ``wcs`` for the second axis of an image.
     time_unit : str, optional
         Unit of the times, if the file does not state it.
-    time_at : {"middle", "start", "end"}
-        Part of the frame that the times refer to.
+    time_at : {"middle", "start", "end"}, optional
+        Part of the frame that the times refer to; by default the file's TIMEPIXR, or the middle.
     epoch : str, optional
         Date of time zero: a name of `EPOCHS_MJD`, or an ISO 8601 date.
     scale : str, optional
@@ -44,15 +49,25 @@ class FrameMapping(Record):
     position : str, optional
         Place at which the times hold, as in FITS: TOPOCENTER, GEOCENTER or BARYCENTER.
     flux : str
-        Column of the light: rate, counts or flux density, with any unit. In a file of spectra, the column or HDU that
-        holds one spectrum per frame.
+        The light: rate, counts or flux density, with any linear unit, one value or one spectrum for each frame. If a
+        column of wavelengths has as many rows, each row is one pixel of one frame.
     flux_unit : str, optional
         Unit of the light, if the file does not state it.
-    error, quality, exposure, temperature, wavelength : str, optional
-        Columns or, for images, HDUs. Frames with a quality other than zero are not searched.
+    error, quality, exposure, temperature : str, optional
+        Frames with a quality other than zero are not searched; neither are pixels with one, where there is one for
+        each pixel.
     exposure_s : float, optional
         Exposure time of every frame.
-    wavelength_unit : str, optional
+    exposure_unit, temperature_unit, wavelength_unit : str, optional
+        Units, if the file does not state them. A unit of wavelength may end in " air".
+    wavelength : str, optional
+        Wavelengths of spectra; ``wcs`` for those in the header of an image, ``names`` for numbers in names of columns.
+    wavelength_file : str, optional
+        File of the wavelengths, relative to the mapping; `wavelength` names its column if it has several.
+    table : str, optional
+        Table of the spectra in a folder, relative to it, with times and other quantities of each.
+    files : str
+        In a folder: names of the spectra, with ``*`` for any text; with `table`, its column of the files' names.
     name : str, optional
         Name of the star.
     """
@@ -60,7 +75,7 @@ class FrameMapping(Record):
     hdu: str | int | None = None
     time: str | tuple[str, str]
     time_unit: str | None = None
-    time_at: Literal["middle", "start", "end"] = "middle"
+    time_at: Literal["middle", "start", "end"] | None = None
     epoch: str | None = None
     scale: str = ""
     position: str = ""
@@ -69,10 +84,15 @@ class FrameMapping(Record):
     error: str | None = None
     quality: str | None = None
     exposure: str | None = None
-    exposure_s: float | None = None
+    exposure_s: Exposure | None = None
+    exposure_unit: str | None = None
     temperature: str | None = None
+    temperature_unit: str | None = None
     wavelength: str | None = None
     wavelength_unit: str | None = None
+    wavelength_file: str | None = None
+    table: str | None = None
+    files: str | None = None
     name: str | None = None
 
     @model_validator(mode="after")
@@ -89,8 +109,15 @@ class FrameMapping(Record):
     def read(cls, path: str | Path) -> Self:
         """Read a mapping from a TOML file."""
         path = Path(path)
-        what = f"mapping {shortened(path.name)}"
-        return cls(**toml(read_text(path, "mapping"), what))
+        given = toml(read_text(path, "mapping"), f"mapping {shortened(path.name)}")
+        if isinstance(given.get("wavelength_file"), str):
+            given["wavelength_file"] = str(path.parent / given["wavelength_file"])
+        return cls(**given)
+
+    @property
+    def times(self) -> tuple[str, ...]:
+        """Names of the times: one, or start and end."""
+        return (self.time,) if isinstance(self.time, str) else self.time
 
     @property
     def epoch_mjd(self) -> float | None:
@@ -102,4 +129,8 @@ class FrameMapping(Record):
         from mauvecl.host.sky.helioecliptic import offline, parse_time
 
         with offline():
-            return float(parse_time(self.epoch).mjd)
+            try:
+                return float(parse_time(self.epoch).mjd)
+            except InputError as error:
+                expected = f"one of {', '.join(EPOCHS_MJD)}, or a date such as 2026-03-01T12:00:00"
+                raise InputError.of("epoch", self.epoch, expected) from error

@@ -1,33 +1,40 @@
-"""Read frames from files: tables with a row per frame, and what mauvecl writes itself."""
+"""Read frames from files: what mauvecl writes, light curves of TESS and Kepler, and other files through a mapping."""
 
 from __future__ import annotations
 
 import io
-import warnings
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.files.parsing import as_text, parsing
-from mauvecl.host.files.size_limits import read_bytes, unpacked
+from mauvecl.host.files.parsing import as_text
+from mauvecl.host.files.size_limits import limit_bytes, open_regular, read_bytes, unpacked
 from mauvecl.host.files.text_table import text_table
-from mauvecl.host.spectra.fits_files import check_sizes
+from mauvecl.host.spectra.air import vacuum_from_air
+from mauvecl.host.spectra.fits_files import check_sums
+from mauvecl.host.spectra.formats import without_columns
+from mauvecl.observations.fits_frames import FitsFile, open_fits
+from mauvecl.observations.folder_frames import FolderFile, keywords_of
 from mauvecl.observations.frames import Frames
+from mauvecl.observations.long_tables import spectra_of_rows
 from mauvecl.observations.mapping import FrameMapping
+from mauvecl.observations.reduction import whole_or_reduced
+from mauvecl.observations.stored_frames import StoredFile, is_store, open_hdf5, open_store, stored_in_fits
+from mauvecl.observations.time_system import TimeSystem, mjd_of, position_of, scale_of, seconds_from_first
+from mauvecl.observations.values import FrameFile, TableFile, Values, converted, unit_in
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
-from mauvecl.schema.text import shown
-
-if TYPE_CHECKING:
-    from astropy.table import Table
+from mauvecl.schema.text import shortened
 
 Float = NDArray[np.float64]
 
-FORMATS = "a table in FITS, ECSV or CSV with a row for each frame"
+FORMATS = "FITS, HDF5, ECSV, CSV, a Zarr store or a folder of spectra"
 #: Names of columns that need no mapping, in order of preference: those of mauvecl, of TESS and Kepler light curves, and
 #: of lightkurve's and AltaiPony's tables.
 KNOWN = {
@@ -35,206 +42,287 @@ KNOWN = {
     "flux": ("pdcsap_flux", "flux", "sap_flux"),
     "error": ("pdcsap_flux_err", "flux_err", "sap_flux_err", "flux_error", "error"),
     "quality": ("quality", "sap_quality"),
+    "temperature": ("temperature",),
 }
-
-
-@dataclass(frozen=True, eq=False)
-class FileTable:
-    """A table of a file with the keywords of its header."""
-
-    table: Table
-    header: dict[str, Any]
-    others: dict[str, Any]  # arrays of other extensions, by name
+#: Part of a frame that times refer to.
+PARTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
+SIGNATURES = {b"SIMPLE  =": "FITS", b"\x89HDF\r\n": "HDF5"}
 
 
 @validated
 def read_frames(path: str | Path, mapping: FrameMapping | str | Path | None = None) -> Frames:
-    """Read frames from a file.
+    """Read frames from a file or a folder.
+
+    Spectra that take more memory than `MAUVECL_LARGEST_CONTENT_MIB` are reduced to their sum over wavelength while
+    they are read; a remark says so, and `reduce_frames` reduces them with other weights.
 
     Parameters
     ----------
     path : str or Path
-        FITS, ECSV or CSV, packed or not, with a row for each frame.
+        FITS, HDF5, ECSV or CSV, packed or not; a Zarr store; or a folder of spectra. ``FILE[name]`` names an extension,
+        or an array of a store.
     mapping : FrameMapping or path, optional
         Where the quantities are. Files of mauvecl, TESS, Kepler and lightkurve need none.
     """
-    path = Path(path)
-    if isinstance(mapping, str | Path):
-        mapping = FrameMapping.read(mapping)
+    place, words = without_columns(path)
+    given = FrameMapping.read(mapping) if isinstance(mapping, str | Path) else mapping
+    with open_frames(place, given, words[0] if words else None) as (file, how):
+        return frames_in(file, how, place.stem)
+
+
+@contextmanager
+def open_frames(
+    path: Path, mapping: FrameMapping | None, name: str | None = None
+) -> Iterator[tuple[FrameFile, FrameMapping]]:
+    """Open a file with frames, and return where its quantities are."""
     what = f"file {path.name!r}"
-    content = unpacked(read_bytes(path, "file"), what)
-    if content.startswith(b"SIMPLE  ="):
-        found = _fits_table(content, what, mapping)
-    else:
-        text = as_text(content, what)
-        found = FileTable(text_table(text, what, path.suffix.lower() == ".csv", FORMATS), {}, {})
-    return _frames(found, mapping or _recognised(found, what), what, path.stem)
+    name = name or (None if mapping is None or mapping.hdu is None else str(mapping.hdu))
+    if path.is_dir():
+        what = f"folder {path.name!r}"
+        if is_store(path):
+            with open_store(path, name, what) as store:
+                yield store, mapping or store.mapping
+        elif mapping is None:
+            expected = "a mapping that says where the quantities of its files are"
+            raise InputError(f"{what} is no store of spectra", expected, key="mapping")
+        else:
+            yield FolderFile(path, mapping, what, lambda one: _opened(one, f"file {one.name!r}", name)), mapping
+        return
+    with _opened(path, what, name, mapping) as file:
+        yield file, mapping or (file.mapping if isinstance(file, StoredFile) else _recognised(file))
 
 
-def _fits_table(content: bytes, what: str, mapping: FrameMapping | None) -> FileTable:
-    """Return the table of a FITS file that a mapping names, or the first that has times and light."""
-    from astropy.io import fits
-    from astropy.table import Table
+@contextmanager
+def _opened(path: Path, what: str, name: str | None, mapping: FrameMapping | None = None) -> Iterator[FrameFile]:
+    """Open a file by its first bytes."""
+    with open_regular(path, "file") as raw:
+        start = raw.read(16)
+        raw.seek(0)
+        file: IO[bytes] = raw
+        content: bytes | None = None
+        if not any(start.startswith(mark) for mark in SIGNATURES):
+            content = unpacked(read_bytes(path, "file"), what)
+            start, file = content[:16], io.BytesIO(content)
+        kind = next((kind for mark, kind in SIGNATURES.items() if start.startswith(mark)), "text")
+        if kind == "FITS":
+            with open_fits(file, what) as hdus:
+                if file.seek(0, io.SEEK_END) <= limit_bytes("MAUVECL_LARGEST_FILE_MIB"):
+                    _checked(hdus, what)
+                opened = FitsFile(hdus, what)
+                yield stored_in_fits(opened, name) or FitsFile(hdus, what, name, _wanted(mapping))
+        elif kind == "HDF5":
+            with open_hdf5(file, name, what) as stored:
+                yield stored
+        else:
+            text = as_text(content or b"", what)
+            table = TableFile(text_table(text, what, path.suffix.lower() == ".csv", FORMATS), what)
+            table.header |= keywords_of([line for line in text.splitlines() if line[:1] in "#%!;"])
+            yield table
 
+
+def _checked(hdus: Any, what: str) -> None:
     try:
-        check_sizes(content)
+        check_sums(hdus)
     except InputError as error:
         raise error.within(what) from error
-    with parsing(what, FORMATS), warnings.catch_warnings(), fits.open(io.BytesIO(content), memmap=False) as hdus:
-        warnings.simplefilter("ignore")
-        tables = {n: hdu for n, hdu in enumerate(hdus) if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)}
-        others = {
-            str(hdu.name): np.asarray(hdu.data, np.float64)
-            for hdu in hdus
-            if isinstance(hdu, fits.ImageHDU | fits.PrimaryHDU) and hdu.data is not None
-        }
-        for hdu in tables.values():
-            if hdu.name == "WAVELENGTH" and "WAVELENGTH" in hdu.columns.names:
-                others["WAVELENGTH"] = np.asarray(hdu.data["WAVELENGTH"], np.float64)
-        header = dict(hdus[0].header)
-        for number, hdu in tables.items():
-            names = {str(name).lower() for name in hdu.columns.names}
-            wanted = mapping is not None and mapping.hdu is not None
-            if wanted and str(mapping.hdu) not in (hdu.name, str(number)):  # type: ignore[union-attr]
-                continue
-            if wanted or mapping is not None or ("time" in names and names & set(KNOWN["flux"])):
-                return FileTable(Table.read(hdu), header | dict(hdu.header), others)
-        seen = ", ".join(f"{hdu.name or number}" for number, hdu in tables.items()) or "none"
-        named = "" if mapping is None or mapping.hdu is None else f" called {mapping.hdu!r}"
-        raise InputError(f"{what} has the tables {seen}", f"one{named} with columns of time and flux", key="hdu")
 
 
-def _recognised(found: FileTable, what: str) -> FrameMapping:
-    """Return the mapping of a table whose columns have known names."""
-    lower = {str(name).lower(): str(name) for name in found.table.colnames}
+def _wanted(mapping: FrameMapping | None) -> tuple[tuple[str, ...], ...]:
+    """Return groups of names, of each of which the chosen table has one."""
+    return (KNOWN["time"], KNOWN["flux"]) if mapping is None else tuple((name,) for name in mapping.times)
+
+
+def _recognised(file: FrameFile) -> FrameMapping:
+    """Return the mapping of a file whose columns have known names."""
+    lower = {name.lower(): name for name in file.names}
     columns = {key: next((lower[n] for n in names if n in lower), None) for key, names in KNOWN.items()}
     if columns["time"] is None or columns["flux"] is None:
         raise InputError(
-            f"{what} has the columns {shown(', '.join(map(str, found.table.colnames)), 300)}",
+            f"{file.what} has the columns {shortened(', '.join(file.names), 300)}",
             "columns named time and flux, or a mapping that names them",
             key="mapping",
         )
-    spectra = "SPECTRUM" in found.others and "WAVELENGTH" in found.others
-    if spectra:
-        columns |= {"flux": "SPECTRUM", "error": "SPECTRUM_ERR", "wavelength": "WAVELENGTH"}
-    given = {key: value for key, value in columns.items() if value is not None}
-    return FrameMapping(**given, wavelength_unit="nm" if spectra else None)
+    if "SPECTRUM" in file.names and "WAVELENGTH/WAVELENGTH" in file.names:
+        columns |= {"flux": "SPECTRUM", "error": "SPECTRUM_ERR", "wavelength": "WAVELENGTH/WAVELENGTH"}
+    return FrameMapping(**{key: value for key, value in columns.items() if value is not None})
 
 
-def _frames(found: FileTable, mapping: FrameMapping, what: str, stem: str) -> Frames:
-    columns = _Columns(found, what)
-    unit = mapping.time_unit
-    edges = [columns.numbers(name, unit, "s", "time_unit") for name in _several(mapping.time)]
-    exposure: Float | float | None = mapping.exposure_s
-    if mapping.exposure is not None:
-        exposure = columns.numbers(mapping.exposure, None, "s", "")
-    if len(edges) == 2:
-        time, exposure = (edges[0] + edges[1]) / 2, edges[1] - edges[0]
-    else:
-        time = edges[0]
-    flux = columns.plain(mapping.flux)
-    n = time.size
-    error = None if mapping.error is None else columns.plain(mapping.error)
-    quality = None if mapping.quality is None else columns.whole(mapping.quality)
-    wavelength = None if mapping.wavelength is None else columns.numbers(
-        mapping.wavelength, mapping.wavelength_unit, "nm", "wavelength_unit")  # fmt: skip
-    temperature = None if mapping.temperature is None else columns.numbers(mapping.temperature, "deg_C", "deg_C", "")
-    epoch, scale, position = mapping.epoch_mjd, mapping.scale, mapping.position
-    if epoch is None:
-        epoch, scale, position = _dates(found.header, scale, position)
-    # Times since a date far in the past lose digits as seconds; count from the first frame.
-    finite = time[np.isfinite(time)]
-    first = float(finite.min()) if finite.size else 0.0
-    name = mapping.name or str(found.header.get("OBJECT", "") or stem)
+@dataclass(frozen=True, eq=False)
+class Quantities:
+    """What a mapping names, as the file has it."""
+
+    time: tuple[Values, ...]
+    flux: Values
+    error: Values | None
+    quality: Values | None
+    exposure: Values | None
+    temperature: Values | None
+    wavelength: Values | None
+
+    @classmethod
+    def of(cls, file: FrameFile, mapping: FrameMapping) -> Quantities:
+        """Find the quantities of a mapping."""
+
+        def found(name: str | None) -> Values | None:
+            return None if name is None else file.find(name)
+
+        times = tuple(file.axis(mapping.flux, 2) if name == "wcs" else file.find(name) for name in mapping.times)
+        flux = file.find(mapping.flux)
+        one = cls(times, flux, found(mapping.error), found(mapping.quality), found(mapping.exposure),
+                  found(mapping.temperature), _wavelength(file, mapping))  # fmt: skip
+        nm = one.wavelength
+        if nm is None or not nm.shape == flux.shape == times[0].shape or isinstance(file, FolderFile):
+            return one
+        return cls(*spectra_of_rows(times, flux, one.error, one.quality, one.exposure, one.temperature, nm, file.what))
+
+
+def _wavelength(file: FrameFile, mapping: FrameMapping) -> Values | None:
+    if mapping.wavelength_file is not None:
+        path = Path(mapping.wavelength_file)
+        with _opened(path, f"file {path.name!r}", None) as other:
+            if mapping.wavelength is None and len(other.names) != 1:
+                raise InputError.of("wavelength", None, f"one of {', '.join(other.names)}", where=other.what)
+            found = other.find(mapping.wavelength or other.names[0])
+            return Values.of(found.name, found.numbers().ravel(), found.unit, found.what)
+    if mapping.wavelength is None:
+        return None
+    if mapping.wavelength == "wcs":
+        return file.axis(mapping.flux, 1)
+    if mapping.wavelength == "names":
+        return file.wavelengths_in_names(mapping.flux)
+    return file.find(mapping.wavelength)
+
+
+def frames_in(file: FrameFile, mapping: FrameMapping, stem: str) -> Frames:
+    """Build frames from a file and the names of its quantities."""
+    what = file.what
+    found = Quantities.of(file, mapping)
+    n = found.time[0].n_rows
     if n == 0:
         raise InputError(f"{what} has no rows", "a row for each frame", key="frames", value=0)
-    dropped = ~np.isfinite(time)
-    remarks = (f"{int(dropped.sum())} rows of {what} have no time and were left out",) if dropped.any() else ()
-    kept = ~dropped
+    for values in (*found.time, found.flux, found.error, found.quality, found.exposure, found.temperature):
+        if values is not None and values.n_rows != n:
+            raise InputError(f"{what}: {values.name!r} has {values.n_rows} rows", f"{n} as the times have",
+                             key=values.name, value=values.n_rows)  # fmt: skip
+    time, exposure_s, dates, remarks = _times(found.time, file, mapping)
+    if found.exposure is not None:
+        exposure_s = converted(found.exposure, mapping.exposure_unit, "s", "exposure_unit").numbers().reshape(n)
+    elif mapping.exposure_s is not None:
+        exposure_s = np.full(n, mapping.exposure_s)
+    unit, flux, error, more = _light(found, mapping)
+    remarks += more
+    wavelength = None if found.wavelength is None else _vacuum_nm(found.wavelength, mapping.wavelength_unit)
+    if len(flux.shape) == 2 and flux.shape[1] == 1 and wavelength is None:
+        flux, error = _single(flux), None if error is None else _single(error)
+    temperature = None
+    if found.temperature is not None:
+        temperature = converted(found.temperature, mapping.temperature_unit, "deg_C", "temperature_unit").numbers()
+    elif isinstance(nominal := file.header.get("CCD-TEMP"), int | float):
+        temperature = np.full(n, float(nominal))
+    light, sd, flags, more = whole_or_reduced(flux, error, found.quality)
+    remarks += more
+    if len(light.shape) == 1:
+        wavelength = None
+    kept = np.isfinite(time)
+    if not kept.all():
+        remarks += (f"{np.count_nonzero(~kept)} rows of {what} have no time and were left out",)
+    if not kept.any():
+        raise InputError(f"{what}: no row has a time", "times", key="time")
     made = Frames.of(
-        time[kept] - first,
-        flux[kept],
-        None if error is None else error[kept],
-        exposure_s=exposure if exposure is None or np.ndim(exposure) == 0 else np.asarray(exposure)[kept],
-        quality=None if quality is None else quality[kept],
-        name=name,
+        time[kept],
+        light[kept],
+        None if sd is None else sd[kept],
+        exposure_s=None if exposure_s is None else exposure_s[kept],
+        quality=None if flags is None else np.where(np.isfinite(flags), flags, 1)[kept],
+        name=mapping.name or str(file.header.get("OBJECT", "") or stem),
         wavelength_nm=wavelength,
-        temperature_c=None if temperature is None else temperature[kept],
-        unit=mapping.flux_unit or columns.unit(mapping.flux),
-        reference_mjd=None if epoch is None else epoch + first / DAY_S,
-        scale=scale.lower(),
-        position=position,
+        temperature_c=None if temperature is None else temperature.reshape(n)[kept],
+        unit=unit,
+        instrument=str(file.header.get("INSTRUME", "") or file.header.get("TELESCOP", "")).strip(),
+        reference_mjd=dates.epoch_mjd,
+        scale=dates.scale,
+        position=dates.position,
     )
-    if mapping.time_at != "middle":
-        half = made.exposure_s / 2
-        made = made.shifted(half if mapping.time_at == "start" else -half)
+    if dates.at != 0.5:
+        made = made.shifted((0.5 - dates.at) * made.exposure_s)
     return made.with_remarks(remarks)
 
 
-def _several(time: str | tuple[str, str]) -> tuple[str, ...]:
-    return (time,) if isinstance(time, str) else tuple(time)
+def _times(
+    time: tuple[Values, ...], file: FrameFile, mapping: FrameMapping
+) -> tuple[Float, Float | None, TimeSystem, tuple[str, ...]]:
+    """Return times in seconds from the first, exposure times of frames with a start and an end, and their dates."""
+    import astropy.units as u
+
+    stated = TimeSystem.of(file.header, file.what)
+    scale, position = scale_of(mapping.scale) or stated.scale, position_of(mapping.position) or stated.position
+    epoch, remarks, offset = mapping.epoch_mjd, [], stated.offset
+    texts = [one.texts() for one in time]
+    if all(text is not None and any(_dated(cell) for cell in text) for text in texts):
+        scale, unit, epoch, offset = scale or "utc", u.d, 0.0, 0.0
+        edges = [mjd_of(text or [], scale, one.name, file.what) for text, one in zip(texts, time, strict=True)]
+        if not (mapping.scale or stated.scale):
+            remarks.append(f"the dates of {file.what} state no time scale and are taken for UTC")
+    else:
+        stated_unit = mapping.time_unit or time[0].unit or stated.unit
+        if len({one.unit for one in time}) > 1 and not mapping.time_unit:
+            names = " and ".join(repr(one.name) for one in time)
+            raise InputError(f"{file.what}: {names} have different units", "one unit", key="time")
+        # Checks the unit; times keep theirs, so that long times lose no digits.
+        converted(replace(time[0], unit=stated_unit), mapping.time_unit, "s", "time_unit")
+        unit = unit_in(stated_unit)
+        edges = [one.numbers().ravel() for one in time]
+        epoch = stated.epoch_mjd if epoch is None else epoch
+    exposure = None if len(edges) == 1 else np.asarray(((edges[1] - edges[0]) * unit).to_value(u.s))
+    seconds, first_d = seconds_from_first(np.mean(edges, axis=0) + offset, unit)
+    at = 0.5 if len(edges) == 2 else PARTS.get(mapping.time_at or "", stated.at)
+    dates = replace(stated, epoch_mjd=None if epoch is None else epoch + first_d, scale=scale, position=position, at=at)
+    return (seconds if epoch is not None else seconds + first_d * DAY_S), exposure, dates, tuple(remarks)
 
 
-def _dates(header: dict[str, Any], scale: str, position: str) -> tuple[float | None, str, str]:
-    """Return epoch, scale and position from the keywords of a FITS header (standard 4.0, section 9)."""
-    scale = scale or str(header.get("TIMESYS", "")).strip()
-    position = position or str(header.get("TREFPOS", header.get("TIMEREF", ""))).strip()
-    for keys, zero in ((("MJDREFI", "MJDREFF"), 0.0), (("BJDREFI", "BJDREFF"), -2_400_000.5),
-                       (("JDREFI", "JDREFF"), -2_400_000.5)):  # fmt: skip
-        if keys[0] in header:
-            return float(header[keys[0]]) + float(header.get(keys[1], 0.0)) + zero, scale, position
-    return (float(header["MJDREF"]) if "MJDREF" in header else None), scale, position
+def _dated(cell: str) -> bool:
+    """Return whether a text begins as an ISO 8601 date."""
+    return len(cell) >= 8 and cell[:4].isdigit() and cell[4:5] in ("-", ":")
 
 
-class _Columns:
-    """Columns of a table and arrays of other extensions, by name."""
-
-    def __init__(self, found: FileTable, what: str) -> None:
-        self.found, self.what = found, what
-        self.lower = {str(name).lower(): str(name) for name in found.table.colnames}
-
-    def column(self, name: str) -> Any:
-        if name in self.found.others:
-            return self.found.others[name]
-        if name.lower() not in self.lower:
-            names = ", ".join([*map(str, self.found.table.colnames), *self.found.others])
-            raise InputError.of("column", name, f"one of {shown(names, 300)}", where=self.what)
-        return self.found.table[self.lower[name.lower()]]
-
-    def unit(self, name: str) -> str:
-        unit = getattr(self.column(name), "unit", None)
-        return "" if unit is None else str(unit)
-
-    def plain(self, name: str) -> Float:
-        column = self.column(name)
-        values = np.ma.asarray(getattr(column, "value", column))
-        if values.dtype.kind not in "iufb":
-            raise InputError(f"{self.what}: the column {name!r} holds no numbers", "a column of numbers", key=name)
-        return np.asarray(np.ma.filled(values.astype(np.float64), np.nan))
-
-    def whole(self, name: str) -> NDArray[np.int64]:
-        """Return flags; those that are missing are set."""
-        values = self.plain(name)
-        return np.where(np.isfinite(values), np.nan_to_num(values), 1).astype(np.int64)
-
-    def numbers(self, name: str, given: str | None, unit: str, key: str) -> Float:
-        """Return a column in a unit; raises InputError if neither file nor mapping states its unit."""
-        import astropy.units as u
-
-        column, values = self.column(name), self.plain(name)
-        stated = given or (None if getattr(column, "unit", None) is None else str(column.unit))
-        if stated is None:
-            if not key:
-                stated = unit
-            else:
-                raise InputError(
-                    f"{self.what}: the unit of the column {name!r} is not stated",
-                    f"a mapping with {key}, such as {unit}",
-                    key=key,
-                )
+def _light(found: Quantities, mapping: FrameMapping) -> tuple[str, Values, Values | None, tuple[str, ...]]:
+    """Return the unit of the light, and light and errors in it."""
+    remarks: tuple[str, ...] = ()
+    unit, stated = mapping.flux_unit or found.flux.unit, found.flux.unit
+    if mapping.flux_unit and stated and mapping.flux_unit != stated:
+        remarks = (f"the unit of {found.flux.name!r} is {mapping.flux_unit} as the mapping says, not {stated}",)
+    if "mag" in unit.lower() and "maggie" not in unit.lower():
+        raise InputError.of("flux_unit", unit, "a linear unit: light in magnitudes is to be converted first",
+                            where=found.flux.what)  # fmt: skip
+    error = found.error
+    if error is None:
+        return unit, found.flux, None, remarks
+    if error.shape != found.flux.shape:
+        raise InputError(f"{error.what}: {error.name!r} has the shape {error.shape}",
+                         f"that of the flux, {found.flux.shape}", key="error", value=error.shape)  # fmt: skip
+    if error.unit and unit and error.unit != unit and not mapping.flux_unit:
         try:
-            # TESS and Kepler write BJD - 2457000, days: the epoch is in the header.
-            parsed = u.d if stated.upper().startswith("BJD") else u.Unit(stated)
-            return np.asarray((values * parsed).to_value(unit, u.spectral() if unit == "nm" else []))
-        except (ValueError, TypeError, u.UnitsError) as error:
-            raise InputError.of(key or "unit", stated, f"a unit such as {unit}", where=self.what) from error
+            factor = float(unit_in(error.unit).to(unit_in(unit)))
+        except (ValueError, TypeError) as fault:
+            raise InputError(f"{error.what}: {error.name!r} is in {error.unit} and {found.flux.name!r} in {unit}",
+                             "units of the same kind", key="error", value=error.unit) from fault  # fmt: skip
+        error = error.mapped(lambda values: values * factor, unit)
+    return unit, found.flux, error, remarks
+
+
+def _vacuum_nm(wavelength: Values, given: str | None) -> Float:
+    """Return the wavelengths of the pixels, which have to be the same in every frame."""
+    plain = (given or "").removesuffix(" air").removesuffix(" vacuum") or None
+    nm = converted(wavelength, plain, "nm", "wavelength_unit")
+    rows = np.atleast_2d(nm.rows(0, 1) if len(nm.shape) == 2 else nm.numbers())[0]
+    if len(nm.shape) == 2:
+        for start in range(0, nm.n_rows, nm.piece_rows):
+            if not np.allclose(nm.rows(start, min(start + nm.piece_rows, nm.n_rows)), rows, rtol=1e-9, atol=0.0):
+                raise InputError(f"{wavelength.what}: the wavelengths change from frame to frame",
+                                 "the same in every frame", key="wavelength", value=wavelength.name)  # fmt: skip
+    return vacuum_from_air(rows) if given and given.endswith(" air") else rows
+
+
+def _single(values: Values) -> Values:
+    """Return values of shape (n, 1) as (n,)."""
+    return replace(values, shape=values.shape[:1], read=lambda start, stop: values.rows(start, stop)[:, 0])

@@ -17,6 +17,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.study.messages import collect_messages as messages_of
 
 if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
     from mauvecl.store.layout import Store
 
 #: Units of the calibration per pixel and frame, which each star's group contains.
@@ -50,7 +51,7 @@ def describe(store: Store, folder: Path) -> None:
             x, group = scene.expectation, root.require_group(scene.group)
             if scene.name == "quiescent":
                 group.attrs.update({"star": scene.star, **scene.at})
-                group.attrs.update({"exposure_s": x.exposure_s, "frames": x.n_frames, "messages": messages_of([x])})
+                group.attrs.update(exposure_attributes(x) | {"messages": messages_of([x])})
                 for name, unit in CALIBRATION.items():
                     _values(group, name, np.asarray(getattr(x, name)), unit, ["pixel"])
                 if scene.frames is not None:
@@ -77,6 +78,13 @@ def describe(store: Store, folder: Path) -> None:
             )
             origin: dict[str, Any] = {"star": scene.star, "provenance": dict(x.provenance)} | signed(study)
             array.attrs.update(origin | {"units": "DN", "amplitude": scene.amplitude})
+
+
+def exposure_attributes(x: Expectation) -> dict[str, float | str]:
+    """Return what a reader must know of the exposure in every row of an array."""
+    known: dict[str, float | str] = {"exposure_s": x.exposure_s, "frames": x.n_frames, "instrument": x.instrument}
+    known |= {"saturation_dn": float(x.saturation_dn), "dark_unit": x.dark_unit}
+    return known | ({"temperature_c": x.conditions["temperature_c"]} if "temperature_c" in x.conditions else {})
 
 
 def _values(group: Any, name: str, values: NDArray[Any], unit: str, dimensions: list[str]) -> None:

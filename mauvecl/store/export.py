@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mauvecl.host.files.atomic import UNFINISHED, write_whole
 from mauvecl.host.version import VERSION
 from mauvecl.schema.errors import InputError
-from mauvecl.store.description import CALIBRATION, COMMON_DRAWS, NOMINAL
+from mauvecl.store.description import CALIBRATION, COMMON_DRAWS, NOMINAL, exposure_attributes
 from mauvecl.store.layout import Store, StoredScene
 
 if TYPE_CHECKING:
@@ -177,6 +177,12 @@ def _image(selection: Selection, scene: StoredScene, table: str) -> ImageHDU:
     header["OBJECT"] = scene.star
     header["AMPLITUD"] = (scene.amplitude, "flare amplitude, 0 without a flare")
     header["EXPTIME"] = (x.frame_s if scene.frames is not None else x.exposure_s, "[s] of one row")
+    header["TELAPSE"] = (x.exposure_s, "[s] of one realisation")
+    header["INSTRUME"] = x.instrument
+    header["SATURATE"] = (float(x.saturation_dn), "[adu] of a single frame, with bias")
+    header["DARKUNIT"] = (x.dark_unit, "in which dark counts follow Poisson's law")
+    if "temperature_c" in x.conditions:
+        header["CCD-TEMP"] = (x.conditions["temperature_c"], "[Celsius]")
     header["NFRAMES"] = (1 if scene.frames is not None else x.n_frames, "frames summed in one row")
     # Axis 1 is the vacuum wavelength, by pixel from the calibration table.
     header["CTYPE1"], header["CUNIT1"] = "WAVE-TAB", "nm"
@@ -222,7 +228,9 @@ def _hdf5(selection: Selection, place: io.BytesIO) -> None:
         for scene in selection.scenes:
             group = file.require_group(scene.group)
             if "wavelength_nm" not in group:
-                group.attrs["star"] = scene.star
+                group.attrs.update({"star": scene.star} | exposure_attributes(scene.expectation))
+                if scene.frames is not None:
+                    group["frame"] = np.array(scene.frames)
                 for name, unit in CALIBRATION.items():
                     group[name] = getattr(scene.expectation, name)
                     group[name].attrs["units"] = unit

@@ -115,7 +115,7 @@ def test_light_curves_of_tess_and_kepler_need_no_mapping(tmp_path: Path) -> None
         ({"flux": "x"}, "column"),
         ({"time_unit": None}, "time_unit"),
         ({"time_unit": "parsec"}, "time_unit"),
-        ({"epoch": "yesterday"}, "time"),
+        ({"epoch": "yesterday"}, "epoch"),
         ({"exposure_s": 5.0, "time": ("t", "t")}, "exposure"),
     ],
 )

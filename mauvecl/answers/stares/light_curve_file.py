@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.host.sky.helioecliptic import offline, parse_position, parse_time
 from mauvecl.host.version import VERSION
 from mauvecl.schema.physical import DAY_S
 
@@ -31,20 +32,28 @@ def light_curve_file(answer: StareAnswer, number: int = 0) -> bytes:
     when = answer.study.sky.time
     first, comment = (NO_TIME_MJD, "arbitrary: no time was named") if when is None else (_mjd(when), "start of stare")
     primary = fits.PrimaryHDU()
-    named: tuple[tuple[str, str | int, str], ...] = (
+    named: tuple[tuple[str, str | float, str], ...] = (
         ("OBJECT", one.label, "star, simulated"),
         ("TELESCOP", "Mauve", "simulated"),
         ("INSTRUME", one.staring.quiet.instrument, ""),
+        ("CCD-TEMP", one.staring.quiet.conditions["temperature_c"], "[Celsius] detector, where nothing heats it"),
         ("CREATOR", f"mauvecl {VERSION}", ""),
         ("SEED", str(answer.study.run.seed), "of the draws"),
         ("STARENO", answer.study.stare.number, "number of the stare"),
     )
     for key, value, text in named:
         primary.header[key] = (value, text)
+    if answer.study.sky.target is not None:
+        with offline():
+            place = parse_position(answer.study.sky.target).icrs
+        primary.header["RADESYS"] = "ICRS"
+        primary.header["RA_OBJ"], primary.header["DEC_OBJ"] = (place.ra.deg, "[deg]"), (place.dec.deg, "[deg]")
     hdus = fits.HDUList([primary, _table(one), _intervals(one), *_spectra(one)])
     stare = one.staring.stare
     times: tuple[tuple[str, str | float, str], ...] = (
-        ("TIMESYS", "UTC", "at the satellite"),
+        ("TIMESYS", "UTC", ""),
+        ("TREFPOS", "TOPOCENTER", "at the satellite"),
+        ("TIMEPIXR", 0.5, "times are middles of frames"),
         ("MJDREFI", int(first), comment),
         ("MJDREFF", float(first - int(first)), ""),
         ("TIMEUNIT", "d", ""),
@@ -62,8 +71,6 @@ def light_curve_file(answer: StareAnswer, number: int = 0) -> bytes:
 
 
 def _mjd(when: str) -> float:
-    from mauvecl.host.sky.helioecliptic import parse_time
-
     return float(parse_time(when).utc.mjd)
 
 

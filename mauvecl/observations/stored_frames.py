@@ -1,0 +1,204 @@
+"""Raw spectra that `mauvecl realise` wrote, as frames: Zarr stores, FITS and HDF5 files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.files.parsing import parsing
+from mauvecl.observations.fits_frames import FitsFile
+from mauvecl.observations.mapping import FrameMapping
+from mauvecl.observations.values import FrameFile, Values
+from mauvecl.schema.errors import InputError
+
+Float = NDArray[np.float64]
+
+#: Where the quantities of a stored scene are.
+MAPPING = {"time": "time", "flux": "flux", "error": "error", "quality": "quality", "exposure": "exposure",
+           "wavelength": "wavelength", "flux_unit": "adu"}  # fmt: skip
+#: Attributes that every scene has.
+REQUIRED = ("exposure_s", "frames", "instrument", "dark_unit", "saturation_dn")
+EXPECTED = "a file that `mauvecl realise` wrote, whole"
+
+
+@dataclass(frozen=True, eq=False)
+class StoredScene:
+    """Raw spectra with the calibration of their pixels.
+
+    Attributes
+    ----------
+    path : str
+        Name of the array, such as ``star-1/flare-1``.
+    rows : array
+        DN, shape (n_realisation, n_pixel) or (n_realisation, n_frame, n_pixel), read from the file when it is sliced.
+    calibration : mapping of ndarray
+        Wavelength, bias, dark, read noise and gain of each pixel and frame.
+    attributes : mapping
+        ``exposure_s`` and ``frames`` of an exposure, star, instrument, temperature, saturation, unit of the dark.
+    frames : ndarray, shape (n_frame,), or None
+        Numbers of the stored frames of each exposure.
+    """
+
+    path: str
+    rows: Any
+    calibration: Mapping[str, Float]
+    attributes: Mapping[str, Any]
+    frames: NDArray[np.int64] | None
+
+
+class StoredFile(FrameFile):
+    """A scene of a store as frames without dark and bias, one exposure after the other."""
+
+    def __init__(self, scene: StoredScene, what: str) -> None:
+        of = scene.attributes
+        missing = [key for key in REQUIRED if key not in of]
+        if missing:
+            raise InputError(f"{what} does not state {missing[0]} of {scene.path}", "a file of this version of mauvecl",
+                             key="file", value=missing[0])  # fmt: skip
+        super().__init__(what, {"OBJECT": of.get("star", ""), "INSTRUME": of["instrument"]})
+        self.scene = scene
+        numbers = scene.frames
+        self.stacked = int(of["frames"]) if numbers is None else 1
+        self.per_row = 1 if numbers is None else numbers.size
+        exposure, frame = float(of["exposure_s"]), float(of["exposure_s"]) / int(of["frames"])
+        n = int(scene.rows.shape[0]) * self.per_row
+        within = np.array([exposure / 2]) if numbers is None else (numbers + 0.5) * frame
+        at = np.arange(n)
+        each = np.ones(n)
+        self.parts = {
+            "time": Values.of("time", at // self.per_row * exposure + within[at % self.per_row], "s", what),
+            "exposure": Values.of("exposure", each * (exposure if numbers is None else frame), "s", what),
+            "wavelength": Values.of("wavelength", scene.calibration["wavelength_nm"], "nm", what),
+        }
+        shape = (n, scene.calibration["wavelength_nm"].size)
+        self.parts["flux"] = Values("flux", shape, self._flux, "adu", what)
+        self.parts["error"] = Values("error", shape, self._error, "adu", what)
+        if "temperature_c" in of:
+            self.parts["temperature"] = Values.of("temperature", each * float(of["temperature_c"]), "deg_C", what)
+        self.parts["quality"] = Values("quality", (n,), self._saturated, "", what)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the quantities."""
+        return list(self.parts)
+
+    def named(self, name: str) -> Values | None:
+        """Return a quantity."""
+        return self.parts.get(name)
+
+    @property
+    def mapping(self) -> FrameMapping:
+        """Where the quantities are."""
+        more = {"temperature": "temperature"} if "temperature" in self.parts else {}
+        return FrameMapping(**MAPPING, **more)
+
+    def _raw(self, start: int, stop: int) -> Float:
+        first, last = start // self.per_row, -(-stop // self.per_row)
+        raw = np.asarray(self.scene.rows[first:last], np.float64).reshape(-1, self.parts["flux"].shape[1])
+        skipped = first * self.per_row
+        return raw[start - skipped : stop - skipped]
+
+    def _flux(self, start: int, stop: int) -> Float:
+        of = self.scene.calibration
+        return self._raw(start, stop) - self.stacked * (of["bias_dn"] + of["dark_dn"])
+
+    def _error(self, start: int, stop: int) -> Float:
+        """Return the noise of dark, readout and rounding, and the Poisson noise of the counts themselves."""
+        of, gain = self.scene.calibration, self.scene.calibration["gain_dn_per_electron"]
+        light = np.maximum(self._flux(start, stop), 0.0)
+        dark = of["dark_dn"] * (1.0 if self.scene.attributes["dark_unit"] == "DN" else gain)
+        return np.asarray(np.sqrt(self.stacked * (of["read_noise_dn"] ** 2 + dark + 1 / 12) + gain * light))
+
+    def _saturated(self, start: int, stop: int) -> NDArray[np.int64]:
+        limit = self.stacked * float(self.scene.attributes["saturation_dn"])
+        return np.asarray((self._raw(start, stop) >= limit).any(axis=1), np.int64)
+
+
+def is_store(path: Path) -> bool:
+    """Return whether a folder is a Zarr store."""
+    return (path / "zarr.json").is_file()
+
+
+@contextmanager
+def open_store(path: Path, name: str | None, what: str) -> Iterator[StoredFile]:
+    """Open a scene of a Zarr store."""
+    zarr = _module("zarr")
+    with parsing(what, EXPECTED):
+        group = zarr.open_group(path, mode="r")
+    yield _in_groups(group, name, what)
+
+
+@contextmanager
+def open_hdf5(file: IO[bytes], name: str | None, what: str) -> Iterator[StoredFile]:
+    """Open a scene of an HDF5 file."""
+    h5py = _module("h5py")
+    with parsing(what, EXPECTED):
+        opened = h5py.File(file, "r")
+    with opened:
+        yield _in_groups(opened, name, what)
+
+
+def stored_in_fits(file: FitsFile, name: str | None) -> StoredFile | None:
+    """Return a scene of a FITS file that `mauvecl realise` wrote, or None for another file."""
+    hdus = file.hdus
+    scenes = {str(hdu.name): hdu for hdu in hdus if hdu.is_image and hdu.header.get("CTYPE1") == "WAVE-TAB"}
+    if not str(hdus[0].header.get("ORIGIN", "")).startswith("mauvecl") or not scenes:
+        return None
+    names = {key.lower().replace("_", "/"): key for key in scenes}
+    path = _chosen(list(names), name, file.what)
+    hdu = scenes[names[path]]
+    header = hdu.header
+    with parsing(file.what, EXPECTED):
+        table = hdus[str(header["PS1_0"])].data
+        of = {key.lower(): np.asarray(table[key][0], np.float64).ravel() for key in table.columns.names}
+        of["wavelength_nm"] = of.pop("coords")
+        frames = np.array([int(one) for one in str(header["FRAMES"]).split(",")]) if "FRAMES" in header else None
+        # EXPTIME and NFRAMES are those of a row, which is a single frame or all frames of an exposure.
+        attributes = {"star": header["OBJECT"], "instrument": header["INSTRUME"],
+                      "dark_unit": header["DARKUNIT"], "exposure_s": header["TELAPSE"],
+                      "frames": round(header["NFRAMES"] * header["TELAPSE"] / header["EXPTIME"])}  # fmt: skip
+        attributes |= {key: header[word] for key, word in (("temperature_c", "CCD-TEMP"), ("saturation_dn", "SATURATE"))
+                       if word in header}  # fmt: skip
+        return StoredFile(StoredScene(path, hdu.section, of, attributes, frames), file.what)
+
+
+def _in_groups(root: Any, name: str | None, what: str) -> StoredFile:
+    """Return a scene in the groups of a Zarr store or an HDF5 file, which are alike."""
+    with parsing(what, EXPECTED):
+        found = [f"{star}/{scene}" for star in sorted(root) if star.startswith("star-") for scene in sorted(root[star])
+                 if scene == "quiescent" or (scene.startswith("flare-") and scene[6:].isdigit())]  # fmt: skip
+        path = _chosen(sorted(found, key=lambda one: "flare" in one), name, what)
+        star, _, _ = path.partition("/")
+        group, array = root[star], root[path]
+        of = {key: np.asarray(group[key][:], np.float64) for key in (
+            "wavelength_nm", "bias_dn", "dark_dn", "read_noise_dn", "gain_dn_per_electron")}  # fmt: skip
+        frames = np.asarray(group["frame"][:], np.int64) if "frame" in group else None
+        return StoredFile(StoredScene(path, array, of, dict(group.attrs), frames), what)
+
+
+def _chosen(found: list[str], name: str | None, what: str) -> str:
+    """Return the scene that is asked for, or the only one."""
+    if not found:
+        raise InputError(f"{what} holds no spectra", EXPECTED, key="file")
+    if name is None and len(found) > 1:
+        raise InputError(f"{what} holds {len(found)} arrays ({', '.join(found[:8])})",
+                         f"one: name it as in FILE[{found[-1]}]", key="hdu", value=found)  # fmt: skip
+    wanted = name or found[0]
+    if wanted not in found:
+        raise InputError.of("hdu", wanted, f"one of {', '.join(found[:8])}", where=what)
+    return wanted
+
+
+def _module(name: str) -> Any:
+    from importlib import import_module
+
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise InputError(f"{name} is missing", "it for stores: pip install 'mauvecl[bulk]'", key=name) from error

@@ -1,0 +1,62 @@
+"""Stores, FITS and HDF5 files of raw spectra are read back as frames, with what their metadata state."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from refusals import refused
+from stores import study
+
+from mauvecl import read_frames
+from mauvecl.device.engine import Engine
+from mauvecl.store import bulk
+from mauvecl.store.export import Selection, export
+from mauvecl.store.layout import Store
+from mauvecl.study.study import Study
+
+#: Stacks of two frames, and single frames of which the second is stored.
+STACKED: dict[str, Any] = {"observation": {"exposure_s": 10.0}}
+SINGLE: dict[str, Any] = {"observation": {"exposure_s": 15.0}, "bulk": {"frames": [0, 2]}}
+
+
+@pytest.mark.parametrize("ending", ["zarr", "fits", "h5"])
+@pytest.mark.parametrize("which", ["stacked", "single"])
+def test_stores_are_read_back_with_their_metadata(tmp_path: Path, engine: Engine, ending: str, which: str) -> None:
+    asked = study(40, **(STACKED if which == "stacked" else SINGLE))
+    path = _written(tmp_path, asked, engine, ending)
+    frames = read_frames(f"{path}[star-1/flare-1]")
+    _, x = asked.expectations(asked.star[0])
+    raw = bulk.read(tmp_path / "frames.zarr", "star-1/flare-1").values.reshape(-1, x.wavelength_nm.size)
+    n = 2 if which == "stacked" else 1
+    np.testing.assert_allclose(frames.flux, raw - n * (x.bias_dn + x.dark_dn), rtol=1e-12, atol=1e-9)
+    assert frames.wavelength_nm is not None
+    np.testing.assert_allclose(frames.wavelength_nm, x.wavelength_nm)
+    exposure, times = (10.0, [5.0, 15.0, 25.0, 35.0]) if which == "stacked" else (5.0, [2.5, 12.5, 17.5, 27.5])
+    np.testing.assert_allclose(frames.exposure_s, exposure)
+    np.testing.assert_allclose(frames.time_s[:4], times)
+    assert frames.temperature_c is not None
+    np.testing.assert_allclose(frames.temperature_c, 21.0)
+    assert (frames.instrument, frames.unit, frames.name) == ("mauve", "adu", "G2V V = 7.4")
+    # The mean of the squared errors is the variance of the model: 40 rows of 197 pixels know it to a percent.
+    assert frames.error is not None
+    np.testing.assert_allclose((frames.error**2).mean(), (x.variance_dn2 / x.n_frames * n).mean(), rtol=0.03)
+    assert frames.quality is not None
+    assert not frames.quality.any()
+
+
+def test_a_store_of_several_arrays_asks_for_one(tmp_path: Path, engine: Engine) -> None:
+    path = _written(tmp_path, study(40), engine, "zarr")
+    with refused("hdu", "star-1/quiescent", expected="FILE[star-1/flare-1]"):
+        read_frames(path)
+    with refused("hdu", value="star-2"):
+        read_frames(f"{path}[star-2]")
+
+
+def _written(folder: Path, asked: Study, engine: Engine, ending: str) -> Path:
+    bulk.realise(asked, folder / "frames.zarr", engine)
+    if ending == "zarr":
+        return folder / "frames.zarr"
+    return export(Selection.of(Store.open(folder / "frames.zarr")), folder / f"frames.{ending}")
