@@ -5,7 +5,7 @@ BIN := .venv/bin
 # Compiled files are kept whatever the shell says: the tests start Python some hundred times.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo check quick test lint docs mutants clean
+.PHONY: demo check quick test lowest lint docs mutants clean
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "mauvecl needs Python 3.11 or newer, found " + sys.version.split()[0])'
@@ -42,6 +42,16 @@ quick: .venv/test.stamp
 
 docs: .venv/docs.stamp
 	OPENBLAS_NUM_THREADS=1 $(BIN)/sphinx-build -W -q -b html docs docs/_build
+
+# The oldest versions that pyproject.toml admits, in an environment of their own; uv resolves what pip cannot.
+# Golden tables hold rounding errors and roots to nine digits, which other versions of scipy compute otherwise.
+lowest: .venv/test.stamp
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/python -m venv --clear build/lowest
+	$(BIN)/uv pip install --quiet --python build/lowest/bin/python --resolution lowest-direct '.[all]'
+	$(BIN)/uv pip freeze --python build/lowest/bin/python --exclude mauvecl >build/lowest.txt
+	$(BIN)/uv pip install --quiet --python build/lowest/bin/python --constraint build/lowest.txt '.[test]'
+	OPENBLAS_NUM_THREADS=1 build/lowest/bin/python -m pytest --dist loadfile -n 2 -q -m 'not long' --ignore tests/test_golden.py
 
 mutants: .venv/test.stamp
 	$(BIN)/python tools/mutation_check.py
