@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 MAP_STEPS, MAP_REALISATIONS = 8, 20_000
 #: Injected flares: numbers of sizes and half-widths, flares of each, and positions.
 INJECTED = {"of": "amplitude", "sizes": 12, "widths": 3, "count": 200, "positions": 4, "fitted": 0}
-#: Largest number of simulated fits.
-MOST_FITS = 10_000
+#: Largest number of simulated fits, and of those of two temperatures, which take fifty times as long.
+MOST_FITS, MOST_OF_TWO = 10_000, 1000
 
 
 def detect_and_snr(study: Study, pool: Pool) -> tuple[DetectAnswer, SnrAnswer]:
@@ -64,7 +64,8 @@ def completeness(study: Study, pool: Pool) -> InjectAnswer:
 def fits(study: Study, pool: Pool) -> MeasureAnswer:
     """Simulate fits of the flare's spectrum."""
     data = study.model_dump()
-    data["measure"] |= {"fits": min(study.run.realisations, MOST_FITS)}
+    most = MOST_FITS if study.flare.spectrum.second_area is None else MOST_OF_TWO
+    data["measure"] |= {"fits": min(study.run.realisations, most)}
     return measure(Study.build(data, "page"), pool)
 
 

@@ -3,14 +3,16 @@
 Light of a blackbody, a Balmer continuum or a line only adds. At a given temperature the best fit with non-negative
 amplitudes is the best fit of one face of the orthant, that is of some of the components, without bounds; and so are the
 ends of a profile interval, because the likelihood is convex there. All faces are tried: those whose solution is
-negative somewhere do not count.
+negative somewhere do not count. Only the blackbody depends on the temperature, so that each face has constant matrices.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import chain, combinations
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +20,6 @@ from numpy.typing import NDArray
 from mauvecl.results.measurements.profile import Best, Profile, extreme, temperature_samples
 
 if TYPE_CHECKING:
-    from scipy.interpolate import CubicSpline
-
     from mauvecl.results.measurements.flare_model import FlareModel
     from mauvecl.results.measurements.reduction import Reduction
 
@@ -29,48 +29,108 @@ Float = NDArray[np.float64]
 ROUNDING = 1e-9
 
 
-class Face(NamedTuple):
-    """Fits of some of the components, without bounds, at temperatures (...)."""
+@dataclass(frozen=True, eq=False)
+class Products:
+    """Inner products of components and sums at temperatures (n, ...), or (1, ...) for all frames alike."""
 
-    components: tuple[int, ...]
-    inverse: Float  # of the information, shape (..., size, size)
-    amplitudes: Float  # shape (..., size)
-    gain: Float  # what the components lower chi-squared by
-    positive: NDArray[np.bool_]  # whether no amplitude is negative
+    along: Float  # of the blackbody with the sums, shape (n, ...)
+    power: Float  # of the blackbody with itself, shape (n or 1, ...)
+    cross: Float  # of the blackbody with the fixed components, shape (n_fixed, n or 1, ...)
+    fixed: Float  # of the fixed components with the sums, shape (n_fixed, n, 1, ...)
+    gram: Float  # of the fixed components with each other, shape (n_fixed, n_fixed)
+
+    def face(self, some: tuple[int, ...], hot: bool) -> Face:
+        """Return the fit without bounds of some of the fixed components, and of the blackbody."""
+        which = list(some)
+        inverse = np.asarray(np.linalg.inv(self.gram[np.ix_(which, which)]), np.float64)
+        alone, share = (np.tensordot(inverse, each[which], 1) for each in (self.fixed, self.cross))
+        gain = np.sum(self.fixed[which] * alone, axis=0)
+        power = self.power - np.sum(self.cross[which] * share, axis=0)
+        if not hot:
+            return Face(some, inverse, alone, gain, None, power, share)
+        amplitude = (self.along - np.sum(self.cross[which] * alone, axis=0)) / power
+        return Face(some, inverse, alone - amplitude * share, gain + amplitude**2 * power, amplitude, power, share)
+
+
+@dataclass(frozen=True, eq=False)
+class Face:
+    """The fit of some of the components, without bounds."""
+
+    some: tuple[int, ...]  # fixed components
+    inverse: Float  # of their information, shape (n_some, n_some)
+    others: Float  # their amplitudes, shape (n_some, n, ...)
+    gain: Float  # what the components lower chi-squared by, shape (n, ...)
+    amplitude: Float | None  # of the blackbody, shape (n, ...); None without it
+    power: Float  # inverse of its variance, shape (n or 1, ...)
+    share: Float  # by how much the others fall where it rises by one, shape (n_some, n or 1, ...)
+
+    @cached_property
+    def rounding(self) -> tuple[Float, Float]:
+        """How negative the blackbody's amplitude and the others may be."""
+        variance = np.diag(self.inverse).reshape(-1, *(1,) * (self.others.ndim - 1))
+        if self.amplitude is not None:
+            variance = variance + self.share**2 / self.power
+        return -ROUNDING / np.sqrt(self.power), -ROUNDING * np.sqrt(variance)
+
+    def positive(self, amplitude: Float | None, others: Float) -> NDArray[np.bool_]:
+        """Return whether no amplitude is negative, shape (n, ...)."""
+        least, other_least = self.rounding
+        positive = np.asarray((others >= other_least).all(axis=0))
+        return positive if amplitude is None else positive & (amplitude >= least)
+
+    def change(self, factors: Float) -> tuple[Float | None, Float, Float]:
+        """Return by how much amplitudes change per change of a quantity that is linear in them, and its variance.
+
+        The factors of the quantity have the shape (n_linear, n, ...).
+        """
+        own = factors[1:][list(self.some)]
+        others = np.tensordot(self.inverse, own, 1)
+        variance = np.sum(own * others, axis=0)
+        if self.amplitude is None:
+            return None, others, variance
+        slope = factors[0] - np.sum(own * self.share, axis=0)
+        step = slope / self.power
+        return step, others - step * self.share, variance + slope * step
 
 
 class BoundedProfile(Profile):
     """The profile likelihood of some frames' sums over the temperature, with amplitudes of at least zero."""
 
-    def components(self, log_k: Float) -> Float:
-        """Return sums of all components for amplitudes of one, shape (*log_k.shape, n_linear, n_sum)."""
-        fixed = np.broadcast_to(self.reduction.fixed, (*log_k.shape, *self.reduction.fixed.shape))
-        return np.concatenate([self.hot(log_k)[..., None, :], fixed], axis=-2)
+    def products(self, log_k: Float) -> Products:
+        """Return the inner products at temperatures (n, ...), or (1, ...) for all frames alike."""
+        hot, fixed = self.hot(log_k), self.reduction.fixed
+        one = (1,) * (log_k.ndim - 1)
+        if log_k.shape[0] == 1:
+            along = np.tensordot(self.sums, hot[0], (1, -1))
+        else:
+            along = np.einsum("n...k,nk->n...", hot, self.sums)
+        return Products(
+            along,
+            np.einsum("...k,...k->...", hot, hot),
+            np.moveaxis(hot @ fixed.T, -1, 0),
+            (fixed @ self.sums.T).reshape(len(fixed), len(self.sums), *one),
+            fixed @ fixed.T,
+        )
 
     def solutions(self, log_k: Float) -> Iterator[Face]:
         """Yield the fit without bounds of each face at temperatures (n, ...), or (1, ...) for all frames alike."""
-        components = self.components(log_k)
-        sums = self.sums.reshape(len(self.sums), *(1,) * (log_k.ndim - 1), -1)
-        information = components @ np.swapaxes(components, -1, -2)
-        along = np.einsum("...ik,...k->...i", components, sums)
-        every = range(1 + len(self.reduction.fixed))
-        for face in chain.from_iterable(combinations(every, size) for size in range(len(every) + 1)):
-            some = list(face)
-            inverse = np.asarray(np.linalg.inv(information[..., some, :][..., some]), np.float64)
-            amplitudes = np.einsum("...ij,...j->...i", inverse, along[..., some])
-            gain = np.einsum("...i,...i->...", along[..., some], amplitudes)
-            yield Face(face, inverse, amplitudes, gain, _positive(amplitudes, inverse))
+        products, every = self.products(log_k), range(len(self.reduction.fixed))
+        for some in chain.from_iterable(combinations(every, size) for size in range(len(every) + 1)):
+            yield products.face(some, False)
+            yield products.face(some, True)
 
     def _best_of(self, log_k: Float) -> tuple[Float, Float]:
-        """Return the largest gain (n, ...) and its amplitudes (n, ..., n_linear)."""
+        """Return the largest gain (n, ...) and its amplitudes (n_linear, n, ...)."""
         shape = (len(self.sums), *log_k.shape[1:])
-        gain, amplitudes = np.zeros(shape), np.zeros((*shape, 1 + len(self.reduction.fixed)))
+        gain, amplitudes = np.zeros(shape), np.zeros((1 + len(self.reduction.fixed), *shape))
         for face in self.solutions(log_k):
-            better = face.positive & (face.gain > gain)
-            gain = np.where(better, face.gain, gain)
-            full = np.zeros(amplitudes.shape)
-            full[..., list(face.components)] = np.maximum(face.amplitudes, 0.0)
-            amplitudes = np.where(better[..., None], full, amplitudes)
+            better = (face.gain > gain) & face.positive(face.amplitude, face.others)
+            np.copyto(gain, face.gain, where=better)
+            amplitudes[:, better] = 0.0
+            if face.amplitude is not None:
+                np.copyto(amplitudes[0], np.maximum(face.amplitude, 0.0), where=better)
+            for k, other in zip(face.some, face.others, strict=True):
+                np.copyto(amplitudes[1 + k], np.maximum(other, 0.0), where=better)
         return gain, amplitudes
 
     def gain(self, log_k: Float) -> Float:
@@ -83,18 +143,13 @@ class BoundedProfile(Profile):
 
     def amplitudes(self, log_k: Float) -> Float:
         """Return the best amplitudes at temperatures (n,), shape (n, n_linear)."""
-        return self._best_of(log_k)[1]
+        return np.ascontiguousarray(self._best_of(log_k)[1].T)
 
 
 def with_bounds(reduction: Reduction, sums: Float, best: Best) -> Best:
     """Return fits with amplitudes of at least zero, from fits without this bound."""
     negative = np.flatnonzero((best.linear < 0.0).any(axis=1))
     return best.replaced(negative, BoundedProfile(reduction, sums[negative]).best()) if negative.size else best
-
-
-def _positive(amplitudes: Float, inverse: Float) -> NDArray[np.bool_]:
-    spread = np.sqrt(np.einsum("...ii->...i", inverse))
-    return np.asarray((amplitudes >= -ROUNDING * spread).all(axis=-1))
 
 
 def bounded_intervals(
@@ -106,16 +161,16 @@ def bounded_intervals(
     """
     low, high = profile.ends(best, at_nodes, allowed)
     x = temperature_samples(profile, low, high)
-    faces = list(profile.solutions(x))
+    products, faces = profile.products(x), list(profile.solutions(x))
     least = best.gain[:, None] - allowed
     columns = []
     for one, spline in zip(model.derived, model.splines, strict=True):
         if spline is None:
             ends = np.where(np.isnan(low), -np.inf, np.exp(low)), np.where(np.isnan(high), np.inf, np.exp(high))
         elif one.ratio is None:
-            ends = _linear_ends(faces, spline(x), least)
+            ends = _linear_ends(faces, np.moveaxis(spline(x), -1, 0), least)
         else:
-            ends = _ratio_ends(profile, faces, spline, x, least)
+            ends = _ratio_ends(products, faces, spline(x), least)
             ends = one.offset + ends[0], one.offset + ends[1]
         columns.append(ends)
     # A parabola through the outermost samples may pass a bound.
@@ -124,65 +179,58 @@ def bounded_intervals(
 
 
 def _linear_ends(faces: list[Face], factors: Float, least: Float) -> tuple[Float, Float]:
-    """Return the ends of a quantity that is linear in the amplitudes, with factors (n, n_sample, n_linear)."""
-    lows, highs = np.full(factors.shape[:2], np.inf), np.full(factors.shape[:2], -np.inf)
-    for face, inverse, amplitudes, gain, _ in faces:
-        inside = gain >= least - 1e-9 * np.abs(least)
-        some = factors[..., list(face)]
-        step = np.einsum("...ij,...j->...i", inverse, some)
-        variance = np.einsum("...i,...i->...", some, step)
-        middle = np.einsum("...i,...i->...", some, amplitudes)
-        reach = np.sqrt(np.maximum(gain - least, 0.0) / np.where(variance > 0, variance, np.inf))
+    """Return the ends of a quantity that is linear in the amplitudes, with factors (n_linear, n, n_sample)."""
+    lows, highs = np.full(factors.shape[1:], np.inf), np.full(factors.shape[1:], -np.inf)
+    for face in faces:
+        left = face.gain - least + 1e-9 * np.abs(least)
+        inside = left >= 0.0
+        if not inside.any():
+            continue
+        step, steps, variance = face.change(factors)
+        middle = np.sum(factors[1:][list(face.some)] * face.others, axis=0)
+        if face.amplitude is not None:
+            middle = middle + factors[0] * face.amplitude
+        reach = np.sqrt(np.maximum(face.gain - least, 0.0) / np.where(variance > 0, variance, np.inf))
         for sign, found, which in ((-1.0, lows, np.minimum), (1.0, highs, np.maximum)):
-            there = inside & _positive(amplitudes + sign * reach[..., None] * step, inverse)
-            value = middle + sign * reach * variance
-            found[...] = np.where(there, which(found, value), found)
+            moved = None if face.amplitude is None or step is None else face.amplitude + sign * reach * step
+            there = inside & face.positive(moved, face.others + sign * reach * steps)
+            which(found, middle + sign * reach * variance, out=found, where=there)
     return extreme(lows, np.minimum), extreme(highs, np.maximum)
 
 
-def _ratio_ends(
-    profile: BoundedProfile,
-    faces: list[Face],
-    spline: CubicSpline,
-    x: Float,
-    least: Float,
-) -> tuple[Float, Float]:
-    """Return the ends of per x (amplitude 1) / (amplitude 0); see `profile.ratio_roots`."""
-    components, per = profile.components(x), spline(x)
-    lows, highs = np.full(x.shape, np.inf), np.full(x.shape, -np.inf)
-    for face, _, _, gain, positive in faces:
-        allowed = positive & (gain >= least)
-        if 1 not in face:
-            lows[allowed] = 0.0
-            highs[allowed] = np.maximum(highs, 0.0)[allowed]
-        elif 0 not in face:
-            highs[allowed] = np.inf
-        else:
-            lines = components[..., [k for k in face if k > 1], :]
-            t, f = components[..., 0, :], components[..., 1, :] / per[..., None]
-            y = np.broadcast_to(profile.sums[:, None], t.shape)
-            basis = np.linalg.qr(np.swapaxes(lines, -1, -2))[0]
-
-            def less(values: Float, basis: Float = basis) -> Float:
-                along = np.einsum("...kj,...k->...j", basis, values)
-                return np.asarray(values - np.einsum("...kj,...j->...k", basis, along))
-
-            y0, t0, f0 = less(y), less(t), less(f)
-            yt, yf, tt, tf, ff = (
-                np.einsum("...k,...k->...", a, b) for a, b in ((y0, t0), (y0, f0), (t0, t0), (t0, f0), (f0, f0))
-            )
-            rest = least - np.einsum("...k,...k->...", y, y) + np.einsum("...k,...k->...", y0, y0)
-            # (yt + r yf)^2 = rest |t + r f|^2 at the ends r.
-            a, b, c = yf**2 - rest * ff, yt * yf - rest * tf, yt**2 - rest * tt
-            root = np.sqrt(np.where(b**2 >= a * c, b**2 - a * c, np.nan))
-            for sign in (-1.0, 1.0):
-                with np.errstate(divide="ignore", invalid="ignore"):
-                    r = (-b + sign * root) / a
+def _ratio_ends(products: Products, faces: list[Face], per: Float, least: Float) -> tuple[Float, Float]:
+    """Return the ends of per x (fixed component 0) / (blackbody); see `profile._ratio_interval`."""
+    lows, highs = np.full(per.shape, np.inf), np.full(per.shape, -np.inf)
+    for face in faces:
+        if 0 not in face.some or face.amplitude is None:
+            allowed = (face.gain >= least) & face.positive(face.amplitude, face.others)
+            if 0 not in face.some:
+                np.copyto(lows, 0.0, where=allowed)
+                np.maximum(highs, 0.0, out=highs, where=allowed)
+            else:
+                np.copyto(highs, np.inf, where=allowed)
+            continue
+        lines = list(face.some[1:])
+        inverse = np.linalg.inv(products.gram[np.ix_(lines, lines)])
+        y, t = products.fixed[lines], products.cross[lines]
+        f = products.gram[lines, 0].reshape(-1, 1, 1) / per
+        # Products of sums, blackbody and recombination less their projections on the lines.
+        by_y, by_t, by_f = (np.tensordot(inverse, each, 1) for each in (y, t, f))
+        yt, tt = products.along - np.sum(t * by_y, axis=0), products.power - np.sum(t * by_t, axis=0)
+        yf = products.fixed[0] / per - np.sum(f * by_y, axis=0)
+        tf, ff = (
+            products.cross[0] / per - np.sum(f * by_t, axis=0),
+            products.gram[0, 0] / per**2 - np.sum(f * by_f, axis=0),
+        )
+        rest = least - np.sum(y * by_y, axis=0)
+        # (yt + r yf)^2 = rest |t + r f|^2 at the ends r.
+        a, b, c = yf**2 - rest * ff, yt * yf - rest * tf, yt**2 - rest * tt
+        root = np.sqrt(np.where(b**2 >= a * c, b**2 - a * c, np.nan))
+        for sign in (-1.0, 1.0):
+            with np.errstate(divide="ignore", invalid="ignore"):
+                r = (-b + sign * root) / a
                 amplitude = (yt + r * yf) / (tt + 2 * r * tf + r**2 * ff)
-                left = y - amplitude[..., None] * (t + r[..., None] * f)
-                there = (r >= 0) & (amplitude >= 0)
-                if lines.shape[-2]:
-                    weights = np.einsum("...jk,...k->...j", np.linalg.pinv(np.swapaxes(lines, -1, -2)), left)
-                    there &= (weights >= 0).all(axis=-1)
-                lows[there], highs[there] = np.minimum(lows, r)[there], np.maximum(highs, r)[there]
+                there = (r >= 0) & (amplitude >= 0) & (by_y - amplitude * (by_t + r * by_f) >= 0).all(axis=0)
+            np.minimum(lows, r, out=lows, where=there)
+            np.maximum(highs, r, out=highs, where=there)
     return extreme(lows, np.minimum), extreme(highs, np.maximum)

@@ -65,7 +65,7 @@ class Profile:
 
     def __init__(self, reduction: MeanSums, sums: Float) -> None:
         self.reduction, self.sums = reduction, sums
-        basis, self._triangle = reduction.basis
+        basis, self._inverse = reduction.basis
         self.along = sums @ basis.T
         self.rest = sums - self.along @ basis
         self._basis = basis
@@ -111,8 +111,8 @@ class Profile:
         if not len(self._basis):
             return amplitude[..., None]
         along = self.along.reshape(self.along.shape[:1] + (1,) * (log_k.ndim - 1) + self.along.shape[1:])
-        others = np.linalg.solve(self._triangle, (along - amplitude[..., None] * (hot @ self._basis.T))[..., None])
-        return np.concatenate([amplitude[..., None], others[..., 0]], axis=-1)
+        others = (along - amplitude[..., None] * (hot @ self._basis.T)) @ self._inverse.T
+        return np.concatenate([amplitude[..., None], others], axis=-1)
 
     def best(self, at_nodes: Float | None = None) -> Best:
         """Return the best fit of each frame."""
@@ -231,9 +231,9 @@ def _linear_interval(
 ) -> tuple[Float, Float]:
     factors = spline(x)
     value = np.einsum("nsl,nsl->ns", factors, linear)
-    basis, triangle = profile.reduction.basis
+    basis, inverse = profile.reduction.basis
     if len(basis):
-        others = np.linalg.solve(triangle.T, factors[..., 1:, None])[..., 0]
+        others = factors[..., 1:] @ inverse
         slope = factors[..., 0] - np.einsum("nsk,nsk->ns", others, hot @ basis.T)
         spread = slope**2 * variance + np.einsum("nsk,nsk->ns", others, others)
     else:

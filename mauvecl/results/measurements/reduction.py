@@ -55,11 +55,11 @@ class MeanSums:
 
     @cached_property
     def basis(self) -> tuple[Float, Float]:
-        """Orthonormal directions of the fixed components, (n_linear - 1, n_sum), and their triangular factor."""
+        """Orthonormal directions of the fixed components, (n_linear - 1, n_sum), and their inverted triangle."""
         if not len(self.fixed):
             return np.zeros((0, self.hot.shape[1])), np.zeros((0, 0))
         q, r = np.linalg.qr(self.fixed.T)
-        return q.T, r
+        return q.T, np.linalg.inv(r)
 
     @cached_property
     def spline(self) -> scipy.interpolate.CubicSpline:
