@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.limits.limits import limit, limiting_magnitude, shortest_exposure, smallest_amplitude
     from mauvecl.answers.measurements.measure import measure
     from mauvecl.answers.observations.analyse import analyse
+    from mauvecl.answers.observations.calibrate import calibrate
     from mauvecl.answers.signal.exposures import exposure, exposure_for
     from mauvecl.answers.signal.simulate import simulate
     from mauvecl.answers.signal.snr import snr
@@ -108,6 +109,7 @@ __all__ = [
     "Uniform",
     "analyse",
     "bulk",
+    "calibrate",
     "departures",
     "detect",
     "detection_map",

@@ -14,6 +14,7 @@ from typer.main import get_command
 
 from mauvecl.cli.app import app
 from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.observations.mapping import FrameMapping
 from mauvecl.study.study import Study
 
 ROOT = Path(__file__).parent.parent
@@ -84,6 +85,8 @@ def test_studies_and_instruments_shown_are_valid() -> None:
                 # Files of the reader's are not here.
                 Instrument.load(data["extends"]).with_(**{k: v for k, v in values.items() if ".ecsv" not in str(v)})
                 assert set(values) <= set(Instrument.model_fields)
+            elif "time" in data:
+                FrameMapping(**data)
             else:
                 Study.build(data, page.name)
             seen += 1

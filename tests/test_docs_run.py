@@ -39,6 +39,7 @@ REDUCED = {
     "inject": _CELLS,
     "visible": "--no-pictures --days 5",
     "plan": "--no-pictures --days 5 --completeness 'closed form' --report html",
+    "calibrate": "--no-pictures",
     "realise": "-n 1000",
 }
 #: The same for commands whose own flags would contradict these.

@@ -20,6 +20,7 @@ from mauvecl.schema.records import Record, input_error
 
 from .curve import Curve
 from .pixel_map import MAX_PIXELS, PixelMap
+from .throughput_errors import ThroughputErrors
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -41,6 +42,11 @@ def _as_curve(value: Any) -> Any:
 def _as_map(value: Any) -> Any:
     """Convert a path to a pixel map."""
     return PixelMap.read(value) if isinstance(value, str | Path) else value
+
+
+def _as_errors(value: Any) -> Any:
+    """Convert a path to the uncertainty of a throughput."""
+    return ThroughputErrors.read(value) if isinstance(value, str | Path) else value
 
 
 def _fraction(curve: Curve) -> Curve:
@@ -100,6 +106,13 @@ class Instrument(Record):
     read_noise_dn, bias_dn, frame_s : float
     pixel_map : PixelMap, optional
         Deviations of single pixels from these values.
+    throughput_factor : Curve, optional
+        Calibrated throughput over that of the curves and losses above; the end values hold beyond its knots.
+    throughput_errors : ThroughputErrors, optional
+        Uncertainty of the calibrated throughput.
+    throughput_amplitudes : tuple of float
+        Amplitudes of the modes of `throughput_errors`, the first ones first, by which the throughput differs from the
+        calibrated one.
 
     Examples
     --------
@@ -156,6 +169,9 @@ class Instrument(Record):
     bias_dn: NotNegative
     frame_s: float = Field(gt=0, le=86_400)
     pixel_map: Annotated[PixelMap | None, BeforeValidator(_as_map)] = None
+    throughput_factor: Annotated[Curve | None, BeforeValidator(_as_curve)] = None
+    throughput_errors: Annotated[ThroughputErrors | None, BeforeValidator(_as_errors)] = None
+    throughput_amplitudes: tuple[float, ...] = ()
 
     @classmethod
     def load(cls, name: str | Path) -> Instrument:
@@ -255,6 +271,11 @@ class Instrument(Record):
                 key="pixel_map",
                 value=self.pixel_map.size,
             )
+        modes = 0 if self.throughput_errors is None else len(self.throughput_errors.modes)
+        if len(self.throughput_amplitudes) > modes:
+            raise InputError.of(
+                "throughput_amplitudes", len(self.throughput_amplitudes), f"at most {modes}, one for each mode"
+            )
         if not (self.throughput(self.wavelength_nm) * self.per_pixel("response", 1.0) > 0).any():
             dark = [name for name in CURVES if not (getattr(self, name).at(self.wavelength_nm) > 0).any()]
             what = f"{' and '.join(dark) or 'the throughput'} = 0 from {low:g} to {high:g} nm"
@@ -290,6 +311,7 @@ class Instrument(Record):
     def knots_nm(self) -> tuple[float, ...]:
         """Wavelengths at which the slope of a curve may jump, nm."""
         curves = [getattr(self, name) for name in CURVES]
+        curves += [] if self.throughput_factor is None else [self.throughput_factor]
         return tuple(sorted({knot for curve in curves if len(curve.value) > 1 for knot in curve.wavelength_nm}))
 
     @property
@@ -365,7 +387,16 @@ class Instrument(Record):
             * self.spectrometer_mirror_reflectivity.at(wavelength_nm) ** self.spectrometer_mirrors
             * self.collection_lens_efficiency.at(wavelength_nm)
             * self.window_efficiency.at(wavelength_nm)
+            * self._calibrated(wavelength_nm)
         )
+
+    def _calibrated(self, wavelength_nm: Float) -> Float | float:
+        """Return the factor of the calibration on the throughput."""
+        factor = 1.0 if self.throughput_factor is None else self.throughput_factor.at(wavelength_nm)
+        if self.throughput_errors is None or not self.throughput_amplitudes:
+            return factor
+        modes = self.throughput_errors.at(wavelength_nm)[: len(self.throughput_amplitudes)]
+        return np.asarray(factor * np.exp(np.tensordot(self.throughput_amplitudes, modes, 1)))
 
     def quantum_efficiency(self, wavelength_nm: Wavelengths) -> Float:
         """Return the electrons per photon that reaches the detector.
@@ -429,7 +460,8 @@ class Instrument(Record):
         values = {
             name: (value.wavelength_nm, value.value) if isinstance(value, Curve) else value
             for name, value in self._values().items()
-            if name not in LABELS
+            # Files without a calibration keep the digest that they had before there was one.
+            if name not in LABELS and not (name.startswith("throughput_") and not value)
         }
         return hashlib.sha256(repr(sorted(values.items())).encode()).hexdigest()
 

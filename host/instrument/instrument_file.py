@@ -14,6 +14,7 @@ from .curve import Curve
 from .instrument import CURVES, LABELS, Instrument
 from .paths import instrument_path, shipped_names
 from .pixel_map import PixelMap
+from .throughput_errors import ThroughputErrors
 
 #: Tags of sources: paper, datasheet, computation, assumption, user.
 TAGS = ("P", "D", "C", "A", "U")
@@ -80,7 +81,7 @@ def _entry(name: str, entry: Any, path: Path) -> tuple[Any, str]:
             raise InputError.of("tag", tag, f"one of {', '.join(TAGS)}", where=f"{path.name}, {name}")
         source = f"{tag}: {entry.get('source', f'no source in {path.name}')}"
         entry = entry["value"]
-    if name in CURVES and isinstance(entry, str):
+    if name in (*CURVES, "throughput_factor") and isinstance(entry, str):
         curve = Curve.read(path.parent / entry)
         return curve, curve.source
     if name in CURVES and isinstance(entry, int | float) and not isinstance(entry, bool):
@@ -88,4 +89,7 @@ def _entry(name: str, entry: Any, path: Path) -> tuple[Any, str]:
     if name == "pixel_map" and isinstance(entry, str):
         pixel_map = PixelMap.read(path.parent / entry)
         return pixel_map, pixel_map.source
+    if name == "throughput_errors" and isinstance(entry, str):
+        errors = ThroughputErrors.read(path.parent / entry)
+        return errors, errors.source
     return entry, source

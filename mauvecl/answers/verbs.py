@@ -299,6 +299,19 @@ VERBS: dict[str, Verb] = {
             observation=(),
         ),
         Verb(
+            "calibrate",
+            "observations.calibrate",
+            """Fit an instrument to frames of standard stars and dark frames.
+
+    Throughput with its covariance, dark current, gain, read noise, line width and wavelength zero point. The study
+    names the observations; the instrument file that is written serves every verb.
+
+    Example: mauvecl calibrate standards.toml
+    """,
+            ("observation.instrument", "sky", "calibrate"),
+            observation=(),
+        ),
+        Verb(
             "visible",
             "campaigns.visible",
             """Find when targets can be seen from the orbit.

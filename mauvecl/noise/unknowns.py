@@ -163,16 +163,33 @@ class InstrumentValue(Unknown):
     ----------
     scales : str, optional
         Value of the instrument that the unknown multiplies; by default it replaces the value of its own name.
+    of_throughput : bool
+        Whether it changes the throughput alone, so that modes of a calibrated throughput take its place.
     """
 
     of: Of = "instrument"
     when: When = "campaign"
     treatment: Treatment = "drawn"
     scales: str | None = None
+    of_throughput: bool = False
 
     def changes(self, nominal: Instrument, value: float) -> dict[str, Any]:
         """Return the changes of an instrument that set a value."""
         return {self.name: value} if self.scales is None else {self.scales: value * getattr(nominal, self.scales)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThroughputMode(InstrumentValue):
+    """Unknown amplitude of a mode of a calibrated throughput; `number` counts from 0."""
+
+    number: int
+
+    def changes(self, nominal: Instrument, value: float) -> dict[str, Any]:
+        """Return the changes of an instrument that set a value, of which those of other modes are kept."""
+        set_before = nominal.throughput_amplitudes
+        amplitudes = [*set_before, *[0.0] * (self.number + 1 - len(set_before))]
+        amplitudes[self.number] = value
+        return {"throughput_amplitudes": tuple(amplitudes)}
 
 
 Row = TypeVar("Row", bound=Unknown)
@@ -317,20 +334,48 @@ STARE_CHANGES: dict[Course, dict[Changing, StareChange]] = {
 #: page on nominal values explains the default priors.
 INSTRUMENT_VALUES = _by_name(
     InstrumentValue(name="temperature_c", label="detector temperature (C)", prior=Uniform(13.0, 21.0)),
-    InstrumentValue(name="light_loss", label="light loss", prior=Normal(0.34, 0.10, 0.04, 0.64)),
-    InstrumentValue(name="pointing_loss", label="pointing loss", prior=Uniform(0.0, 0.05)),
+    InstrumentValue(name="light_loss", label="light loss", prior=Normal(0.34, 0.10, 0.04, 0.64), of_throughput=True),
+    InstrumentValue(name="pointing_loss", label="pointing loss", prior=Uniform(0.0, 0.05), of_throughput=True),
     InstrumentValue(
         name="qe_scale",
         label="quantum efficiency, scale",
         prior=Normal(1.0, 0.3, 0.3, 1.7),
         # The collecting area has the same effect.
         scales="collecting_area_cm2",
+        of_throughput=True,
     ),
     InstrumentValue(
         name="conversion_uv_per_electron", label="charge conversion (uV per electron)", prior=Uniform(20.0, 25.0)
     ),
     InstrumentValue(name="read_noise_dn", label="read noise (DN)", prior=Normal(12.0, 1.0, 9.0, 15.0)),
 )
+
+
+#: Largest number of modes of a calibrated throughput that are unknown; later ones are smaller.
+MAX_MODES = 6
+#: Prior of the amplitude of a mode, which has unit variance by definition.
+MODE_PRIOR = Normal(0.0, 1.0, -5.0, 5.0)
+
+
+def values_of(instrument: Instrument) -> dict[str, InstrumentValue]:
+    """Return the unknown values of an instrument by name.
+
+    These are `INSTRUMENT_VALUES`. If the throughput is calibrated, its modes replace those that change the throughput,
+    and values that were fitted as well are known.
+    """
+    if instrument.throughput_errors is None:
+        return dict(INSTRUMENT_VALUES)
+    fitted = {name for name, source in instrument.sources.items() if source.startswith("C: fitted")}
+    kept = {name: row for name, row in INSTRUMENT_VALUES.items() if not row.of_throughput and name not in fitted}
+    modes = range(min(len(instrument.throughput_errors.modes), MAX_MODES))
+    return kept | _by_name(
+        *(
+            ThroughputMode(
+                name=f"throughput_{k + 1}", label=f"calibrated throughput, mode {k + 1}", prior=MODE_PRIOR, number=k
+            )
+            for k in modes
+        )
+    )
 
 
 def default_processes(temperature_c: float) -> dict[str, Prior]:

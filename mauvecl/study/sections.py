@@ -11,7 +11,7 @@ from pydantic import Field, create_model, field_validator, model_validator
 from mauvecl.host.sky import DEFAULT_SKY
 from mauvecl.host.stars.band_names import ALIASES
 from mauvecl.noise.priors import Prior, PriorField
-from mauvecl.noise.unknowns import INSTRUMENT_VALUES
+from mauvecl.noise.unknowns import INSTRUMENT_VALUES, values_of
 from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Quantity, Range, Slider, Widget
@@ -509,7 +509,8 @@ class Unknowns(create_model("_InstrumentValues", __base__=Section, **_unknown_ke
             )
         return self
 
-    def priors(self) -> dict[str, Prior]:
-        """Return the priors of unknown values by the instrument's names, and of `qe_scale`."""
-        given = {name: getattr(self, name) for name in INSTRUMENT_VALUES if name not in self.known}
+    def priors(self, instrument: Instrument) -> dict[str, Prior]:
+        """Return the priors of an instrument's unknown values by name, as in `noise.unknowns.values_of`."""
+        rows = {name: row for name, row in values_of(instrument).items() if name not in self.known}
+        given: dict[str, Any] = {name: getattr(self, name, row.prior) for name, row in rows.items()}
         return {name: prior for name, prior in given.items() if prior is not None}

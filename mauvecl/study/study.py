@@ -15,6 +15,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import AnyUnit
 from mauvecl.schema.records import input_error
 from mauvecl.schema.text import shortened
+from mauvecl.study.calibrations import CalibrateQuestion, drop_default_calibration, resolve_calibration_paths
 from mauvecl.study.data import DataChoice, drop_default_data, resolve_data_paths
 from mauvecl.study.flare_light import drop_default_spectrum, resolve_spectrum_paths
 from mauvecl.study.measurements import MeasureQuestion, drop_default_measure
@@ -79,6 +80,7 @@ class Study(Section):
     plan: PlanQuestion = PlanQuestion()
     measure: MeasureQuestion = MeasureQuestion()
     data: DataChoice = DataChoice()
+    calibrate: CalibrateQuestion = CalibrateQuestion()
 
     @model_validator(mode="after")
     def _one_photosphere(self) -> Self:
@@ -124,6 +126,7 @@ class Study(Section):
         resolve_stare_paths(data, path.parent)
         resolve_plan_paths(data, path.parent)
         resolve_data_paths(data, path.parent)
+        resolve_calibration_paths(data, path.parent)
         resolve_spectrum_paths(data, path.parent)
         return cls.build(data, path.name)
 
@@ -192,6 +195,7 @@ class Study(Section):
         drop_default_plan(data, self)
         drop_default_measure(data, self.measure)
         drop_default_data(data, self)
+        drop_default_calibration(data, self)
         drop_default_spectrum(data, self.flare.spectrum)
         for section in ("processes", "campaign"):
             if not data[section]:

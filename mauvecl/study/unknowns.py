@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.noise.unknowns import INSTRUMENT_VALUES
+from mauvecl.noise.unknowns import ThroughputMode, values_of
 from mauvecl.results.requests.fap_checks import MIN_IN_TAIL
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column
@@ -25,6 +25,7 @@ from mauvecl.statistics.intervals import CONFIDENCE, Interval
 from mauvecl.study.parts import First
 
 if TYPE_CHECKING:
+    from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.noise.priors import Prior
     from mauvecl.study.study import Study
 
@@ -39,6 +40,7 @@ class DrawnStudies:
     """Draws of unknown instrument values."""
 
     names: tuple[str, ...]
+    labels: tuple[str, ...]
     values: Float  # shape (n_draw, n_name)
     studies: tuple[Study, ...]  # the study with each draw's instrument, without unknowns, and its share of realisations
 
@@ -58,32 +60,37 @@ def drawn(study: Study) -> DrawnStudies:
     """
     from scipy.stats import qmc
 
-    asked, priors = study.unknowns, _unknown_priors(study)
+    asked = study.unknowns
+    nominal = study.observation.load_instrument()
+    rows, priors = values_of(nominal), _unknown_priors(study, nominal)
     sequence = qmc.LatinHypercube(len(priors), rng=np.random.default_rng(study.run.seed))
     even = sequence.random(asked.draws)
     values = np.column_stack([prior.quantile(even[:, k]) for k, prior in enumerate(priors.values())])
-    nominal = study.observation.load_instrument()
     run = study.run.model_copy(update={"realisations": realisations_each(study)})
     certain = study.model_copy(update={"unknowns": type(asked)(), "run": run})
     studies = []
     for row in values:
         changes: dict[str, Any] = {}
+        at = nominal
         for name, value in zip(priors, row, strict=True):
-            changes |= INSTRUMENT_VALUES[name].changes(nominal, float(value))
+            one = rows[name].changes(at, float(value))
+            changes |= one
+            # The next mode is added to those before it.
+            at = at.model_copy(update=one) if isinstance(rows[name], ThroughputMode) else at
         changed = certain.with_instrument(changes)
         try:
-            changed.observation.load_instrument()
+            nominal.with_(**changes)
         except InputError as error:
             raise error.within("the priors of unknown values include impossible ones") from error
         studies.append(changed)
-    return DrawnStudies(tuple(priors), values, tuple(studies))
+    return DrawnStudies(tuple(priors), tuple(rows[name].label for name in priors), values, tuple(studies))
 
 
-def _unknown_priors(study: Study) -> dict[str, Prior]:
-    """Return the priors of unknown instrument values; values that the study sets are known."""
+def _unknown_priors(study: Study, nominal: Instrument) -> dict[str, Prior]:
+    """Return the priors of unknown values of a study's instrument; values that the study sets are known."""
     o = study.observation
     known = {*o.changes, *(() if o.temperature_c is None else ("temperature_c",))}
-    priors = {name: prior for name, prior in study.unknowns.priors().items() if name not in known}
+    priors = {name: prior for name, prior in study.unknowns.priors(nominal).items() if name not in known}
     if study.unknowns.draws and not priors:
         raise InputError("no instrument value is unknown", "a prior, or unknowns.draws = 0", key="unknowns.draws")
     return priors
@@ -160,9 +167,9 @@ def describe_shares(shares: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {100 * share:.0f} %" for name, share in first) + note
 
 
-def draw_columns(names: Iterable[str]) -> tuple[Column, ...]:
+def draw_columns(draws: DrawnStudies) -> tuple[Column, ...]:
     """Return the columns of the drawn values of unknowns, for rows with `draws`."""
     return tuple(
-        Column(name, description=f"drawn {INSTRUMENT_VALUES[name].label}").of(lambda row: row.draws.by_name)
-        for name in names
+        Column(name, description=f"drawn {label}").of(lambda row: row.draws.by_name)
+        for name, label in zip(draws.names, draws.labels, strict=True)
     )

@@ -109,8 +109,8 @@ def differ(one: Any, other: Any, *, messages: bool) -> bool:
     return messages and set(one.messages) != set(other.messages)
 
 
-#: Verbs that draw from a study; `analyse` reads measured frames.
-ASKED = [verb for verb in VERBS if verb != "analyse"]
+#: Verbs that draw from a study; the others read measured frames.
+ASKED = [verb for verb in VERBS if verb not in ("analyse", "calibrate")]
 FAST = ("exposure", "visible", "simulate", "plan")
 
 

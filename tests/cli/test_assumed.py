@@ -9,11 +9,15 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
+from astropy.io import fits
+from astropy.table import Table
 from commands import run
 from marks import long_but
 from typer.main import get_command
 
 from mauvecl.cli.app import app
+from mauvecl.host.expectation import expect
+from mauvecl.host.stars.source import Source
 from mauvecl.study.assumptions import Use, assumption_line
 from mauvecl.study.study import Study
 
@@ -39,6 +43,7 @@ ASKED = {
              "instrument mauve, detector at 21 deg C; " + FLARE + "orbit of embedded elements; "
              "least angles: Earth's limb 25 deg, Sun 46 deg, Moon 25 deg; " + REST),
     "analyse": ("frames.csv --mapping mapping.toml", "flares of the shape davenport2014; noise as measured; seed 1"),
+    "calibrate": ("standards.toml", USUAL[:-2]),
     "measure": ("--star G2V -m 7.4 --set measure.fits=100", USUAL + FLARE + REST),
     "realise": ("--star G2V -m 7.4 -n 10 --output r.zarr", USUAL + FLARE + REST),
 }  # fmt: skip
@@ -50,6 +55,23 @@ def verbs() -> list[str]:
     return [name for name, one in commands.commands.items() if any(p.name == "study_file" for p in one.params)]
 
 
+def write_standards(folder: Path) -> None:
+    """Write a study with frames of one standard star."""
+    x = expect(Source.from_library("A0V").at_magnitude(6.0), "mauve", exposure=5.0)
+    raw = np.random.default_rng(1).poisson(x.mean_raw_dn, (20, x.wavelength_nm.size)).astype(float)
+    times = fits.BinTableHDU(Table({"TIME": 5.0 * np.arange(20)}), name="FRAMES")
+    images = [fits.ImageHDU(raw, name="RAW"), fits.ImageHDU(x.wavelength_nm, name="NM")]
+    fits.HDUList([fits.PrimaryHDU(), times, *images]).writeto(folder / "a0v.fits")
+    (folder / "frames.toml").write_text(
+        'hdu = "FRAMES"\ntime = "TIME"\ntime_unit = "s"\nflux = "RAW"\nflux_unit = "DN"\nwavelength = "NM"\n'
+        'wavelength_unit = "nm"\n'
+    )
+    (folder / "standards.toml").write_text(
+        '[[calibrate.observations]]\nframes = "a0v.fits"\nmapping = "frames.toml"\nlibrary = "A0V"\n'
+        "magnitude = 6.0\ntemperature_c = 21.0\n"
+    )
+
+
 @pytest.mark.parametrize("verb", long_but(verbs(), "simulate", "exposure", "detect", "visible"))
 def test_every_verb_prints_its_assumptions(verb: str, tmp_path: Path) -> None:
     flags, expected = ASKED[verb]
@@ -57,6 +79,8 @@ def test_every_verb_prints_its_assumptions(verb: str, tmp_path: Path) -> None:
     light = np.random.default_rng(1).normal(100, 1, 200)
     (tmp_path / "frames.csv").write_text("t,f\n" + "".join(f"{600 * k},{f:.3f}\n" for k, f in enumerate(light)))
     (tmp_path / "mapping.toml").write_text('time = "t"\ntime_unit = "s"\nflux = "f"\n')
+    if verb == "calibrate":
+        write_standards(tmp_path)
     pictures = () if verb == "realise" else ("--no-pictures",)
     words = (verb, *shlex.split(flags), *pictures)
     lines = run(*words, folder=tmp_path).stdout.splitlines()

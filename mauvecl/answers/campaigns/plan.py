@@ -178,7 +178,7 @@ class PlanAnswer(Answer):
                 orbit.resolved(self.seen.times),
                 f"{orbit.elements.source}, epoch {orbit.elements.epoch}; mean is a Sun-synchronous orbit through them",
             ),
-            ("throughput", self.study.observation.instrument, "nominal, not a flight calibration"),
+            ("throughput", self.study.observation.instrument, self.study.observation.load_instrument().notice),
             ("sky", "zodiacal light", "median over the days on which a target is seen; table of the MauveSim paper"),
             (
                 "duration of flares",

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.limits.search import LimitSearch, single_flares
 from mauvecl.noise.priors import Uniform
-from mauvecl.noise.unknowns import INSTRUMENT_VALUES
+from mauvecl.noise.unknowns import values_of
 from mauvecl.schema.calls import validated
 from mauvecl.schema.tables import Column, table_of
 from mauvecl.study.cases import Case, cases
@@ -36,9 +36,10 @@ class Assumption:
 def assumptions(nominal: Instrument) -> tuple[Assumption, ...]:
     """Return the uncertain values of the payload and their ranges; normal priors extend to one standard deviation."""
     rows = []
-    for name, prior in Unknowns().priors().items():
+    values = values_of(nominal)
+    for name, prior in Unknowns().priors(nominal).items():
         ends = (prior.low, prior.high) if isinstance(prior, Uniform) else (prior.mean - prior.sd, prior.mean + prior.sd)
-        value = INSTRUMENT_VALUES[name]
+        value = values[name]
         low, high = (value.changes(nominal, float(f"{end:.12g}")) for end in ends)
         rows.append(Assumption(value.label, (f"{ends[0]:g}", f"{ends[1]:g}"), (low, high)))
     dark = Assumption(

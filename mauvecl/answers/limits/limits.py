@@ -180,7 +180,7 @@ class LimitAnswer(Answer):
     def draws(self) -> QTable:
         """One row per limit and draw of the unknown: its values and the closed-form limit."""
         of = self.study.limit.of
-        drawn = (one.unknown.draws.names for one in self.limits if one.unknown is not None)
+        drawn = (one.unknown.draws for one in self.limits if one.unknown is not None)
         limit = Column(of, "unknown.limits", description="closed-form limit")
         values = (column.of(attrgetter("unknown")) for column in draw_columns(next(drawn)))
         return table_of((*self._place, *values, limit), self.limits, study=self.study.text())

@@ -1,0 +1,480 @@
+"""An instrument fitted to frames of standard stars and to frames without light."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from mauvecl.answers.answer import Answer
+from mauvecl.host.expectation import expect
+from mauvecl.host.instrument.paths import shipped_names
+from mauvecl.host.instrument.throughput_errors import MODE, ThroughputErrors
+from mauvecl.observations.calibration.dark import DarkFit, assumed_dark, fit_dark
+from mauvecl.observations.calibration.exposures import CalibrationFrames
+from mauvecl.observations.calibration.photon_transfer import (
+    MeasuredVariance,
+    NoiseModel,
+    PhotonTransfer,
+    fit_photon_transfer,
+    measured_variance,
+)
+from mauvecl.observations.calibration.throughput import ERROR_KNOTS, ThroughputFit, fit_throughput
+from mauvecl.observations.frames import Frames
+from mauvecl.observations.reading import read_frames
+from mauvecl.schema.calls import validated
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import Column, View, number, percent, table_of
+
+if TYPE_CHECKING:
+    from astropy.table import QTable, Table
+
+    from mauvecl.device.engine import Engine
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.instrument.instrument import Instrument
+    from mauvecl.runs.pool import Pool
+    from mauvecl.study.assumptions import Use
+    from mauvecl.study.study import Study
+
+#: Change of temperature, deg C, within which consecutive dark frames are compared for their variance.
+SAME_TEMPERATURE_C = 0.05
+#: Knots of the written throughput factor, nm apart.
+KNOT_NM = 2.0
+#: Probability of chi-squared below which a fit is reported as bad.
+REJECTED = 0.01
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A value of the instrument: fitted, or assumed where the observations do not determine it."""
+
+    name: str
+    value: float
+    error: float  # NaN if it is assumed
+    nominal: float
+    unit: str
+    determined: bool
+
+    @property
+    def deviation(self) -> float:
+        """Difference from the nominal value in standard errors."""
+        return (self.value - self.nominal) / self.error if self.determined and self.error > 0 else float("nan")
+
+
+def _significant(value: float, error: float) -> str:
+    return f"{value:.6g} +- {error:.2g}" if error == error else f"{value:.6g}"
+
+
+#: Columns of the table of values.
+COLUMNS = (
+    Column("quantity", "name", "", "value of the instrument", "quantity", kind=str),
+    Column("value", "value", "", "fitted, or nominal where it is not determined", "value", _significant, ("error",)),
+    Column("error", "error", "", "standard error; nan: not determined by these observations"),
+    Column("nominal", "nominal", "", "value of the instrument that was given", "nominal", ".6g"),
+    Column("deviation", "deviation", "", "fitted less nominal value in standard errors", "sigma", number("+.1f")),
+    Column("unit", "unit", "", "of the value", "unit", kind=str),
+    Column("determined", "determined", "", "whether these observations determine it", "status",
+           lambda determined: "" if determined else "assumed", kind=bool),
+)  # fmt: skip
+#: Columns of the table of fits.
+FIT_COLUMNS = (
+    Column("fit", "name", "", "what is fitted", "fit", kind=str),
+    Column("chi2", "chi2", "", "chi-squared", "chi-squared / dof", lambda chi2, dof: f"{chi2:.1f} / {dof:.1f}",
+           ("dof",)),
+    Column("dof", "dof", "", "values less the effective number of parameters"),
+    Column("p_value", "p_value", "", "probability of a chi-squared at least as large", "p", number(".3g")),
+)  # fmt: skip
+#: Columns of the throughput, one row per pixel.
+THROUGHPUT_COLUMNS = (
+    Column("wavelength", "wavelength_nm", "nm", "middle of the pixel"),
+    Column("throughput", "", "", "electrons per photon"),
+    Column("error", "", "", "its standard error"),
+    Column("nominal", "", "", "throughput of the instrument that was given"),
+    Column("ratio", "", "", "fitted over nominal throughput"),
+    Column("relative_error", "", "", "relative standard error, with that of the gain"),
+    Column("relative_error_counts", "", "", "relative standard error of DN per photon, which the gain does not change"),
+)
+#: Columns of the dark current, one row per pixel.
+DARK_COLUMNS = (
+    Column("wavelength", "", "nm", "middle of the pixel"),
+    Column("dark", "level_dn_per_s", "DN / s", "dark current at the reference temperature"),
+    Column("dark_error", "level_error", "DN / s", "its standard error"),
+    Column(
+        "slope", "pixel_slope_per_c", "1 / deg_C", "slope of the logarithm of this pixel alone; nan: not determined"
+    ),
+    Column("slope_error", "pixel_slope_error", "1 / deg_C", "its standard error"),
+    Column("bias", "bias_dn", "DN", "fitted or assumed"),
+    Column("bias_error", "bias_error", "DN", "its standard error"),
+)
+#: Columns of the photon transfer, one row per observation and usable pixel.
+TRANSFER_COLUMNS = (
+    Column("light", "mean_dn", "DN", "mean light of a frame"),
+    Column("variance", "variance", "DN2", "variance of frames"),
+    Column("model", "model", "DN2", "fitted variance"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrateAnswer(Answer):
+    """The answer of `calibrate`.
+
+    Attributes
+    ----------
+    study : Study
+    nominal : Instrument
+        The instrument from which the fit starts, which gives what is not determined.
+    observations : tuple of CalibrationFrames
+    dark : DarkFit
+    transfer : PhotonTransfer
+    throughput : ThroughputFit
+    """
+
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky")
+    JSON: ClassVar[Mapping[str, str]] = {"rows": "values_table", "fits": "fits"}
+
+    study: Study
+    nominal: Instrument
+    observations: tuple[CalibrationFrames, ...]
+    dark: DarkFit
+    transfer: PhotonTransfer
+    throughput: ThroughputFit
+
+    @property
+    def stars(self) -> list[CalibrationFrames]:
+        """Observations of standard stars."""
+        return [one for one in self.observations if one.star is not None]
+
+    @cached_property
+    def values(self) -> list[Fitted]:
+        """Values of the instrument, fitted or assumed."""
+        d, t, f, n = self.dark, self.transfer, self.throughput, self.nominal
+        level = float(np.mean(d.level_dn_per_s))
+        at = float(n.dark_scale_dn_per_s * np.exp(n.dark_slope_per_c * d.reference_c))
+        rows = [
+            ("dark current", level, float(np.sqrt(d.shared[1, 1])), at, "DN / s", "dark current" not in d.assumed),
+            (
+                "dark slope",
+                d.slope_per_c,
+                d.slope_error,
+                n.dark_slope_per_c,
+                "1 / deg_C",
+                "dark slope" not in d.assumed,
+            ),
+            ("bias", float(d.bias_dn.mean()), float(d.bias_error.mean()), n.bias_dn, "DN", "bias" not in d.assumed),
+            ("gain", t.noise.gain, t.gain_error, n.gain_dn_per_electron, "DN / electron", "gain" not in t.assumed),
+            ("read noise", t.read_noise_dn, t.read_noise_error, n.read_noise_dn, "DN", "read noise" not in t.assumed),
+        ]
+        for name, found, usual, unit in (
+            ("wavelength shift", f.shift_nm, 0.0, "nm"),
+            ("wavelength stretch", f.stretch_nm, 0.0, "nm"),
+            ("line width", f.fwhm_nm, n.gaussian_fwhm_nm, "nm"),
+            ("line width, change to the red", f.fwhm_change_nm, 0.0, "nm"),
+        ):
+            known = found is not None
+            rows.append((name, found.value if found else usual, found.error if found else np.nan, usual, unit, known))
+        return [Fitted(name, value, error if known else float("nan"), usual, unit, known)
+                for name, value, error, usual, unit, known in rows]  # fmt: skip
+
+    @property
+    def values_table(self) -> QTable:
+        """One row per value of the instrument."""
+        return table_of(COLUMNS, self.values, reference_c=self.dark.reference_c, dark_unit=self.transfer.dark_unit,
+                        study=self.study.text())  # fmt: skip
+
+    @property
+    def fits(self) -> QTable:
+        """One row per fit: its goodness."""
+        named: dict[str, ThroughputFit | DarkFit | PhotonTransfer] = {
+            "throughput": self.throughput, "dark current": self.dark, "photon transfer": self.transfer
+        }  # fmt: skip
+        rows = [{"name": name, "chi2": one.chi2, "dof": float(one.dof), "p_value": one.p_value}
+                for name, one in named.items() if one.dof > 0]  # fmt: skip
+        return table_of(FIT_COLUMNS, rows)
+
+    @cached_property
+    def throughput_table(self) -> QTable:
+        """One row per pixel: fitted and nominal throughput."""
+        f = self.throughput
+        nominal, ratio = self.nominal.throughput(f.wavelength_nm), np.exp(f.log_factor)
+        counts = np.sqrt(np.maximum(f.error**2 - (self.transfer.gain_error / self.transfer.noise.gain) ** 2, 0.0))
+        fitted = ratio * nominal
+        row = {"wavelength_nm": f.wavelength_nm, "throughput": fitted, "error": fitted * f.error, "nominal": nominal,
+               "ratio": ratio, "relative_error": f.error, "relative_error_counts": counts}  # fmt: skip
+        return table_of(THROUGHPUT_COLUMNS, [row], study=self.study.text())
+
+    @property
+    def dark_table(self) -> QTable:
+        """One row per pixel: dark current and bias."""
+        names = (column.get for column in DARK_COLUMNS[1:])
+        row = {name: getattr(self.dark, str(name)) for name in names} | {"wavelength": self.nominal.wavelength_nm}
+        return table_of(DARK_COLUMNS, [row], reference_c=self.dark.reference_c)
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """Values, goodness of fit, throughput, dark current, photon transfer, and what the instrument file names."""
+        return {
+            "calibrate": self.values_table,
+            "fits": self.fits,
+            "throughput": self.throughput_table,
+            "dark": self.dark_table,
+            "photon-transfer": table_of(TRANSFER_COLUMNS, [self.transfer]),
+            **self.instrument_tables,
+        }
+
+    @property
+    def views(self) -> list[View]:
+        n, at = len(self.stars), self.dark.reference_c
+        stars = f"{n} standard star{'s' if n > 1 else ''}"
+        title = f"{self.nominal.name} fitted to {stars}; dark current at {at:.1f} C"
+        rows = self.throughput_table
+        every = np.linspace(0, len(rows) - 1, 11).astype(int)
+        shown = (
+            replace(THROUGHPUT_COLUMNS[0], heading="nm", format=".1f"),
+            replace(THROUGHPUT_COLUMNS[1], heading="throughput", format=".4f"),
+            replace(THROUGHPUT_COLUMNS[4], heading="over nominal", format=".4f"),
+            replace(THROUGHPUT_COLUMNS[5], heading="error", format=percent(".2f")),
+        )
+        return [
+            View(title, COLUMNS, table_of(COLUMNS, self.values)),
+            View("Throughput, electrons per photon", shown, rows[every]),
+            View("Goodness of fit", FIT_COLUMNS, self.fits),
+        ]
+
+    @property
+    def messages(self) -> list[str]:
+        lines = []
+        assumed = [*self.dark.assumed, *self.transfer.assumed, *self.throughput.assumed]
+        if assumed:
+            lines.append(f"NOT DETERMINED by these observations, taken as nominal: {', '.join(assumed)}.")
+        error, given = self.throughput.spectrum_error, self.study.calibrate.spectrum_error is not None
+        if len(self.stars) == 1 and not given:
+            lines.append(
+                "One star cannot tell errors of its spectrum from the throughput: an error of "
+                f"{100 * error:.2g} % at each of {ERROR_KNOTS} wavelengths is assumed."
+            )
+        elif error > 0 and not given:
+            lines.append(
+                f"The stars disagree: their spectra are taken to be wrong by {100 * error:.2g} % at each of "
+                f"{ERROR_KNOTS} wavelengths."
+            )
+        if self.study.calibrate.light_error == 0:
+            lines.append("Losses by pointing are taken to be alike in all observations (calibrate.light_error).")
+        for row in self.fits:
+            if row["p_value"] < REJECTED:
+                lines.append(f"The fit of the {row['fit']} is rejected: p = {row['p_value']:.2g}.")
+        if self.dark.slopes_p_value < REJECTED:
+            lines.append(
+                "The dark current of single pixels rises differently with temperature: the instrument file has the "
+                f"common slope (p = {self.dark.slopes_p_value:.2g})."
+            )
+        change = self.throughput.fwhm_change_nm
+        if change is not None and abs(change.value) > 3 * change.error:
+            lines.append("The line width changes along the spectrum: the instrument file has its mean.")
+        saturated = [one.name for one in self.stars if not one.usable(self.nominal).all()]
+        if saturated:
+            lines.append(f"Saturated pixels are not used: {', '.join(saturated)}.")
+        return lines
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        exposure, sky = self.nominal.frame_s, self.study.sky.sky()
+        return [
+            expect(one.star, self.nominal, exposure=exposure, sky=sky) for one in self.stars if one.star is not None
+        ]
+
+    @property
+    def source(self) -> str:
+        """Origin of the fitted values."""
+        return f"fitted to {', '.join(one.name for one in self.stars)}"
+
+    @cached_property
+    def instrument(self) -> Instrument:
+        """The fitted instrument."""
+        from mauvecl.host.instrument.curve import Curve
+        from mauvecl.host.instrument.pixel_map import PixelMap
+
+        changes: dict[str, Any] = dict(self.changes)
+        tables = self.instrument_tables
+        factor, errors, pixels = tables["throughput-factor"], tables["throughput-errors"], tables["pixel-map"]
+        changes["throughput_factor"] = Curve(
+            tuple(factor["wavelength"].to_value("nm").tolist()),
+            tuple(np.asarray(factor["factor"]).tolist()),
+            f"C: {self.source}",
+        )
+        modes = np.array([errors[name] for name in errors.colnames[1:]])
+        changes["throughput_errors"] = ThroughputErrors(errors["wavelength"].to_value("nm"), modes, f"C: {self.source}")
+        columns = {name: np.asarray(pixels[name].value if hasattr(pixels[name], "value") else pixels[name])
+                   for name in pixels.colnames[1:]}  # fmt: skip
+        changes["pixel_map"] = PixelMap(**columns, source=f"C: {self.source}")
+        return self.nominal.with_(name=self.name, notice=self.notice, **changes)
+
+    @property
+    def name(self) -> str:
+        """Name of the fitted instrument."""
+        return f"{self.nominal.name}-calibrated"
+
+    @property
+    def notice(self) -> str:
+        """Remark on the fitted values that every answer repeats."""
+        error = 100 * float(np.median(self.throughput.error))
+        return f"The throughput is {self.source}; median standard error {error:.2g} %."
+
+    @property
+    def changes(self) -> dict[str, float | str]:
+        """Plain values of the fitted instrument by name."""
+        n, d, t, f = self.nominal, self.dark, self.transfer, self.throughput
+        found: dict[str, float | str] = {}
+        if "dark current" not in d.assumed:
+            found["dark_slope_per_c"] = d.slope_per_c
+            found["dark_scale_dn_per_s"] = float(np.mean(d.level_dn_per_s) * np.exp(-d.slope_per_c * d.reference_c))
+            found["bias_dn"] = float(d.bias_dn.mean())
+        if "gain" not in t.assumed:
+            volts = n.adc_range_v / 2**n.adc_bits
+            found |= {"conversion_uv_per_electron": float(t.noise.gain * volts * 1e6), "read_noise_dn": t.read_noise_dn,
+                      "dark_unit": t.dark_unit}  # fmt: skip
+        if f.shift_nm is not None and f.stretch_nm is not None:
+            # A feature is found at a pixel whose nominal wavelength is too small by the shift.
+            half = np.ptp(f.wavelength_nm) / 2
+            found["dispersion_nm_per_pixel"] = n.dispersion_nm_per_pixel * (1 + f.stretch_nm.value / half)
+            first = n.pixel_zero_nm - f.wavelength_nm.mean()
+            found["pixel_zero_nm"] = n.pixel_zero_nm + f.shift_nm.value + f.stretch_nm.value * first / half
+        if f.fwhm_nm is not None:
+            found["gaussian_fwhm_nm"] = f.fwhm_nm.value
+        return found
+
+    @cached_property
+    def instrument_tables(self) -> dict[str, Table]:
+        """Tables that the instrument file names: factor and errors of the throughput, and the pixels."""
+        nm = self.throughput.wavelength_nm
+        knots = np.unique(np.concatenate([nm[:1], np.arange(np.ceil(nm[0]), nm[-1], KNOT_NM), nm[-1:]]))
+        origin = {"tag": "C", "source": self.source}
+        moved = self.nominal.with_(
+            **{key: value for key, value in self.changes.items() if key in ("pixel_zero_nm", "dispersion_nm_per_pixel")}
+        )
+        # The throughput of a pixel stays; its wavelength, and with it the nominal throughput, is another one.
+        centres = (
+            moved.pixel_zero_nm + moved.dispersion_nm_per_pixel * np.arange(moved.pixels)[self.nominal.read_pixels]
+        )
+        fitted = np.exp(self.throughput.log_factor) * self.nominal.throughput(nm)
+        low, high = self.nominal.curves_nm
+        factor = np.interp(knots, centres, fitted / self.nominal.throughput(np.clip(centres, low, high)))
+        at = np.searchsorted(nm, knots).clip(0, nm.size - 1)
+        errors = ThroughputErrors.of_covariance(knots, self.throughput.covariance[np.ix_(at, at)], f"C: {self.source}")
+        modes = {f"{MODE}{k}": mode for k, mode in enumerate(errors.modes, 1)}
+        pixels: dict[str, Any] = {"pixel": np.arange(self.nominal.pixels)}
+        part = self.nominal.read_pixels
+        dark = np.ones(self.nominal.pixels)
+        dark[part] = self.dark.level_dn_per_s / self.dark.level_dn_per_s.mean()
+        pixels["dark"] = dark
+        columns = [Column("pixel"), Column("dark", "", "", "factor on the dark current")]
+        for name in ("response", "gain", "read_noise_dn"):
+            kept = None if self.nominal.pixel_map is None else getattr(self.nominal.pixel_map, name)
+            if kept is not None:
+                pixels[name] = kept
+                columns.append(Column(name, unit="DN" if name.endswith("_dn") else ""))
+        if np.ptp(self.dark.bias_dn) > 0:
+            pixels["bias_dn"] = np.full(self.nominal.pixels, self.dark.bias_dn.mean())
+            pixels["bias_dn"][part] = self.dark.bias_dn
+            columns.append(Column("bias_dn", "", "DN", "bias"))
+        wavelength = Column("wavelength", unit="nm")
+        return {
+            "throughput-factor": table_of(
+                (wavelength, Column("factor")), [{"wavelength": knots, "factor": factor}], **origin
+            ),
+            "throughput-errors": table_of(
+                (wavelength, *map(Column, modes)), [{"wavelength": knots, **modes}], **origin
+            ),
+            "pixel-map": table_of(columns, [pixels], **origin),
+        }
+
+    def instrument_toml(self) -> bytes:
+        """Return the content of the instrument file."""
+        import tomli_w
+
+        given = self.study.observation.instrument
+        extends = given if given in shipped_names() else str(Path(given).resolve())
+        values: dict[str, Any] = {"extends": extends, "name": self.name, "notice": self.notice}
+        values |= {key: {"value": value, "tag": "C", "source": self.source} for key, value in self.changes.items()}
+        values |= {"throughput_factor": "throughput-factor.ecsv", "throughput_errors": "throughput-errors.ecsv",
+                   "pixel_map": "pixel-map.ecsv"}  # fmt: skip
+        return tomli_w.dumps(values).encode()
+
+    @property
+    def documents(self) -> dict[str, Callable[[], bytes]]:
+        """The instrument file, in addition to those of every answer."""
+        return super().documents | {"instrument.toml": self.instrument_toml}
+
+
+@validated
+def calibrate(
+    study: Study,
+    engine: Engine | Pool | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    frames: tuple[Frames, ...] | None = None,
+) -> CalibrateAnswer:
+    """Fit an instrument to raw frames of standard stars and to frames without light.
+
+    Parameters
+    ----------
+    study : Study
+        Its ``calibrate`` lists the observations, and its observation names the instrument from which the fit starts.
+    engine, progress : optional
+        Not used: nothing is drawn on a device.
+    frames : tuple of Frames, optional
+        Frames in memory, in place of the files of the observations, in their order.
+
+    Raises
+    ------
+    InputError
+        If no observation has a star, or frames are not raw spectra of the instrument's pixels.
+    """
+    asked = study.calibrate
+    if not any(one.library or one.spectrum for one in asked.observations):
+        raise InputError("no observation of a standard star is given",
+                         "calibrate.observations with library or spectrum", key="calibrate.observations")  # fmt: skip
+    if frames is not None and len(frames) != len(asked.observations):
+        raise InputError.of("frames", len(frames), f"{len(asked.observations)}, one for each observation")
+    nominal = study.observation.load_instrument()
+    read = frames or tuple(read_frames(one.frames, one.mapping) for one in asked.observations)
+    observations = tuple(
+        CalibrationFrames.of(given, nominal, one.source(), one.temperature_c)
+        for given, one in zip(read, asked.observations, strict=True)
+    )
+    stars = [one for one in observations if one.star is not None]
+    without = [one for one in observations if one.star is None]
+    dark = assumed_dark(nominal, nominal.wavelength_nm.size)
+    if without:
+        dark = fit_dark(without, nominal, NoiseModel.nominal(nominal))
+    transfer = fit_photon_transfer(_variances(observations, dark, nominal), nominal)
+    if without:
+        dark = fit_dark(without, nominal, transfer.noise)
+        error = float(dark.bias_error.mean())
+        transfer = fit_photon_transfer(_variances(observations, dark, nominal), nominal, error)
+    throughput = fit_throughput(
+        stars, nominal, dark, transfer, knots=asked.knots, sky=study.sky.sky(), order=study.observation.order,
+        light_error=asked.light_error, spectrum_error=asked.spectrum_error,
+    )  # fmt: skip
+    return CalibrateAnswer(study, nominal, observations, dark, transfer, throughput)
+
+
+def _variances(
+    observations: tuple[CalibrationFrames, ...], dark: DarkFit, nominal: Instrument
+) -> list[MeasuredVariance]:
+    """Measure the variances of all observations, of dark frames apart for each temperature."""
+    found = []
+    for one in observations:
+        usable = one.usable(nominal)
+        breaks = np.flatnonzero(np.abs(np.diff(one.temperature_c)) > SAME_TEMPERATURE_C) + 1
+        for part in np.split(np.arange(one.n_frames), breaks if one.star is None else []):
+            if part.size < 3:
+                continue
+            same = replace(one, raw_dn=one.raw_dn[part], temperature_c=one.temperature_c[part])
+            mean = dark.mean_dn(same)
+            light = np.zeros(mean.size) if one.star is None else same.raw_dn.mean(axis=0) - mean
+            found.append(measured_variance(same.raw_dn, light, mean - dark.bias_dn, usable))
+    return found

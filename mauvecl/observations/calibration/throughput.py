@@ -1,0 +1,440 @@
+"""Throughput, wavelength zero point and line width from the spectra of standard stars.
+
+The logarithm of the throughput over the nominal one is a cubic B-spline. Its second derivative has a normal prior whose
+width follows from the data by restricted maximum likelihood; the posterior covariance then covers a smooth truth with
+its nominal probability on average over wavelength (Wahba 1983; Nychka 1988, doi 10.1080/01621459.1988.10478711).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+from scipy.optimize import minimize_scalar
+
+from mauvecl.host.expectation import expect
+from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.response import Order
+from mauvecl.host.sky.zodiacal import Sky
+from mauvecl.host.stars.source import Source
+from mauvecl.observations.calibration.dark import DarkFit
+from mauvecl.observations.calibration.exposures import CalibrationFrames
+from mauvecl.observations.calibration.photon_transfer import PhotonTransfer
+from mauvecl.schema.errors import InputError
+
+Float = NDArray[np.float64]
+
+#: Knots of the errors of a star's spectrum, and their relative size if one star alone cannot tell: an assumption.
+ERROR_KNOTS, ONE_STAR_ERROR = 12, 0.10
+#: Probability of chi-squared below which errors of the stars' spectra are fitted.
+REJECTED = 0.01
+#: Steps of wavelength, nm, and of the line's width, as a factor, for derivatives.
+STEP_NM, STEP_WIDTH = 0.2, 0.05
+#: Largest fitted shift and stretch, nm, and relative change of the line's width, beyond which nothing is linear.
+LIMITS = np.array([5.0, 5.0, 0.3, 0.3])
+#: Largest number of iterations, and the change of log throughput at which they end.
+ITERATIONS, SETTLED = 50, 1e-5
+#: Range of the logarithm of the smoothing parameter, relative to the information, and of that of spectra's errors.
+LOG_SMOOTHING, LOG_ERROR = (-25.0, 25.0), (-9.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Value:
+    """A fitted value with its standard error."""
+
+    value: float
+    error: float
+
+
+@dataclass(frozen=True, eq=False)
+class ThroughputFit:
+    """Fit of the throughput.
+
+    Attributes
+    ----------
+    wavelength_nm : ndarray, shape (n_pixel,)
+    log_factor : ndarray, shape (n_pixel,)
+        Logarithm of the throughput over the nominal one.
+    covariance : ndarray, shape (n_pixel, n_pixel)
+    shift_nm, stretch_nm : Value or None
+        Wavelength of a feature less the nominal one in the middle of the spectrum, and its change to either end.
+    fwhm_nm, fwhm_change_nm : Value or None
+        Width of the line function's Gaussian in the middle of the spectrum, and its change to the red end.
+    residual : ndarray, shape (n_star, n_pixel)
+        Observed less fitted counts in standard deviations; NaN for pixels that are not used.
+    chi2 : float
+    dof : float
+        Pixels less the effective number of parameters.
+    smoothing : float
+        Weight of the squared second derivative.
+    spectrum_error : float
+        Relative error of the stars' spectra at each of `ERROR_KNOTS` knots.
+    assumed : tuple of str
+        Quantities that these stars do not determine.
+    """
+
+    wavelength_nm: Float
+    log_factor: Float
+    covariance: Float
+    shift_nm: Value | None
+    stretch_nm: Value | None
+    fwhm_nm: Value | None
+    fwhm_change_nm: Value | None
+    residual: Float
+    chi2: float
+    dof: float
+    smoothing: float
+    spectrum_error: float
+    assumed: tuple[str, ...]
+
+    @property
+    def error(self) -> Float:
+        """Standard error of `log_factor`, shape (n_pixel,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a chi-squared at least as large."""
+        return float(scipy.stats.chi2.sf(self.chi2, self.dof))
+
+
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    """Observed counts as a linear function of the parameters, independent and of variance one.
+
+    Attributes
+    ----------
+    values : ndarray, shape (n,)
+    design : ndarray, shape (n, n_parameter)
+        The spline's coefficients first.
+    prior : ndarray, shape (n_parameter,)
+        Standard deviations; infinite for free parameters.
+    penalty : ndarray, shape (n_coefficient, n_coefficient)
+    """
+
+    values: Float
+    design: Float
+    prior: Float
+    penalty: Float
+
+    def solved(self, smoothing: float, prior: Float | None = None) -> tuple[Float, Float]:
+        """Return the parameters and their covariance."""
+        covariance = np.linalg.inv(self.normal + self._full(smoothing, self.prior if prior is None else prior))
+        return np.asarray(covariance @ self.projected), np.asarray(covariance)
+
+    def likelihood(self, smoothing: float, prior: Float | None = None) -> float:
+        """Return minus twice the logarithm of the restricted likelihood, up to a constant."""
+        prior = self.prior if prior is None else prior
+        full = self.normal + self._full(smoothing, prior)
+        found = np.linalg.solve(full, self.projected)
+        rank = len(self.penalty) - 2
+        known = np.isfinite(prior)
+        return float(
+            self.values @ self.values - self.projected @ found - rank * np.log(smoothing)
+            + 2 * np.log(prior[known]).sum() + np.linalg.slogdet(full)[1]
+        )  # fmt: skip
+
+    def smoothing(self) -> float:
+        """Return the smoothing of the largest restricted likelihood."""
+        n = len(self.penalty)
+        middle = np.log(np.trace(self.normal[:n, :n]) / np.trace(self.penalty))
+        found = minimize_scalar(
+            lambda log: self.likelihood(np.exp(log)), bounds=middle + np.array(LOG_SMOOTHING), method="bounded"
+        )
+        return float(np.exp(found.x))
+
+    def error_of(self, which: NDArray[np.bool_], smoothing: float) -> float:
+        """Return the prior standard deviation of some parameters that has the largest restricted likelihood."""
+        found = minimize_scalar(
+            lambda log: self.likelihood(smoothing, np.where(which, np.exp(log), self.prior)),
+            bounds=LOG_ERROR,
+            method="bounded",
+        )
+        return float(np.exp(found.x))
+
+    def goodness(self, found: Float, covariance: Float) -> tuple[float, float]:
+        """Return chi-squared, and the values less the effective number of parameters."""
+        left = self.values - self.design @ found
+        return float(left @ left), float(np.any(self.design != 0, axis=1).sum() - np.sum(covariance * self.normal))
+
+    @cached_property
+    def normal(self) -> Float:
+        """Information of the values, shape (n_parameter, n_parameter)."""
+        return np.asarray(self.design.T @ self.design)
+
+    @cached_property
+    def projected(self) -> Float:
+        """Values times the design, shape (n_parameter,)."""
+        return np.asarray(self.design.T @ self.values)
+
+    def _full(self, smoothing: float, prior: Float) -> Float:
+        full = np.diag(prior**-2.0)
+        n = len(self.penalty)
+        full[:n, :n] += smoothing * self.penalty
+        return full
+
+
+@dataclass(frozen=True, eq=False)
+class ThroughputModel:
+    """Mean light of standard stars for a throughput, wavelength scale and line width.
+
+    Attributes
+    ----------
+    stars : tuple of CalibrationFrames
+    nominal : Instrument
+    dark : DarkFit
+    transfer : PhotonTransfer
+    sky : Sky
+    order : {"paper", "physical"}
+    basis, penalty : ndarray
+        B-spline at the pixels, shape (n_pixel, n_coefficient), and the matrix of its squared second derivative.
+    light_error : float
+        Relative standard deviation of the light of an observation.
+    """
+
+    stars: tuple[CalibrationFrames, ...]
+    nominal: Instrument
+    dark: DarkFit
+    transfer: PhotonTransfer
+    sky: Sky
+    order: Order
+    basis: Float
+    penalty: Float
+    light_error: float
+
+    @cached_property
+    def x(self) -> Float:
+        """Wavelengths of the pixels from -1 to 1."""
+        nm = self.nominal.wavelength_nm
+        return np.asarray(2 * (nm - nm[0]) / np.ptp(nm) - 1)
+
+    @property
+    def n_shape(self) -> int:
+        """Number of fitted values of wavelengths (shift, stretch) and width (mean, change): none for a single star."""
+        return 0 if len(self.stars) < 2 else 4 if self.nominal.gaussian_fwhm_nm > 0 else 2
+
+    @cached_property
+    def observed_dn(self) -> Float:
+        """Mean light of a frame, shape (n_star, n_pixel)."""
+        return np.array([one.raw_dn.mean(axis=0) - self.dark.mean_dn(one) for one in self.stars])
+
+    @cached_property
+    def usable(self) -> NDArray[np.bool_]:
+        """Pixels that stay below saturation, shape (n_star, n_pixel)."""
+        return np.array([one.usable(self.nominal) for one in self.stars])
+
+    @cached_property
+    def dark_terms(self) -> Float:
+        """Seconds of dark current and their change with its slope, shape (n_star, 2)."""
+        return np.array([self.dark.terms(one) for one in self.stars])
+
+    def light_dn(self, one: CalibrationFrames, log_factor: Float, shape: Float) -> Float:
+        """Return the mean light of a frame, DN, shape (n_pixel,)."""
+        assert one.star is not None
+        shift, stretch, width, change = np.pad(shape, (0, 4 - shape.size))
+        at, flux = one.star.wavelength_nm, one.star.flux_flam
+        nm = self.nominal.wavelength_nm
+        if shift or stretch:
+            flux = np.interp(at + shift + stretch * np.interp(at, nm, self.x), at, flux)
+        if self.order == "physical":
+            flux = flux * np.exp(np.interp(at, nm, log_factor))
+        star = replace(one.star, flux_flam=flux)
+        electrons = self._electrons(star, 1.0 + width)
+        if change:
+            wide, narrow = (self._electrons(star, 1.0 + width + sign * STEP_WIDTH) for sign in (1, -1))
+            electrons = electrons + change * self.x * (wide - narrow) / (2 * STEP_WIDTH)
+        counts = self.transfer.noise.gain * electrons * one.exposure_s / self.nominal.frame_s
+        return np.asarray(counts if self.order == "physical" else counts * np.exp(log_factor))
+
+    def _electrons(self, star: Source, width: float) -> Float:
+        instrument = self.nominal
+        if width != 1.0:
+            instrument = instrument.with_(gaussian_fwhm_nm=instrument.gaussian_fwhm_nm * float(width))
+        x = expect(star, instrument, exposure=instrument.frame_s, sky=self.sky, order=self.order)
+        return np.asarray(x.source_electrons + x.sky_electrons)
+
+    def variance_dn2(self, light_dn: Float) -> Float:
+        """Return the variance of the mean frames of all stars, shape (n_star, n_pixel)."""
+        frames = np.array([one.n_frames for one in self.stars])
+        dark = self.dark_terms[:, :1] * self.dark.level_dn_per_s
+        return np.asarray(self.transfer.noise.variance(light_dn, dark) / frames[:, None])
+
+    @cached_property
+    def dark_covariance(self) -> Float:
+        """Covariance between stars of each pixel's subtracted dark, shape (n_pixel, n_star, n_star)."""
+        jacobian = np.column_stack([np.ones(len(self.stars)), self.dark_terms[:, 0]])
+        return np.asarray(jacobian @ self.dark.covariance @ jacobian.T)
+
+    @cached_property
+    def slopes_dn(self) -> list[Float]:
+        """Derivatives of the light with respect to the shape, for the nominal instrument, shape (n_star, n_pixel)."""
+        slopes = []
+        for step, place in [(STEP_NM, 0), (STEP_WIDTH, 2)][: self.n_shape // 2]:
+            moved = step * np.eye(self.n_shape)[place]
+            more, less = (np.array([self.light_dn(one, np.zeros(self.x.size), sign * moved) for one in self.stars])
+                          for sign in (1, -1))  # fmt: skip
+            slopes += [(more - less) / (2 * step), (more - less) / (2 * step) * self.x]
+        return slopes
+
+    def linearised(self, coefficients: Float, shape: Float, error: float) -> _Linearised:
+        """Return the linear problem around a spline and a shape, for a relative error of the stars' spectra."""
+        n_star, own = len(self.stars), self.basis @ coefficients
+        model = np.array([self.light_dn(one, own, shape) for one in self.stars])
+        columns = [model * column for column in self.basis.T]
+        columns += [slope * np.exp(own) for slope in self.slopes_dn]
+        around = np.concatenate([coefficients, shape])
+        prior = [np.inf] * around.size
+        for k in range(n_star):
+            alone = np.zeros((n_star, 1))
+            alone[k] = 1.0
+            if self.light_error > 0:
+                columns.append(alone * model)
+                prior.append(self.light_error)
+            if error > 0:
+                columns += [alone * model * column for column in _linear_basis(self.nominal.wavelength_nm).T]
+                prior += [error] * ERROR_KNOTS
+        level = self.dark.level_dn_per_s.mean()
+        jacobian = np.column_stack([np.ones(n_star), self.dark_terms[:, 0], level * self.dark_terms[:, 1]])
+        values, vectors = np.linalg.eigh(self.dark.shared)
+        for value, vector in zip(values, vectors.T, strict=True):
+            if value > 0:
+                columns.append(np.sqrt(value) * (jacobian @ vector)[:, None] * np.ones_like(model))
+                prior.append(1.0)
+        white = self._whitener(self.variance_dn2(model))
+        design = np.column_stack([white(column) for column in columns])
+        values = white(self.observed_dn - model) + design[:, : around.size] @ around
+        return _Linearised(values, design, np.array(prior), self.penalty)
+
+    def _whitener(self, variance: Float) -> Callable[[Float], Float]:
+        """Return a function that makes values of shape (n_star, n_pixel) independent and of variance one."""
+        used = self.usable.T
+        covariance = np.where(used[:, :, None] & used[:, None, :], self.dark_covariance, 0.0)
+        index = np.arange(len(self.stars))
+        covariance[:, index, index] += np.where(used, variance.T, 1.0)
+        inverse = np.linalg.inv(np.linalg.cholesky(covariance))
+        return lambda values: np.einsum("pij,jp->ip", inverse, np.where(used.T, values, 0.0)).ravel()
+
+
+def fit_throughput(
+    stars: Sequence[CalibrationFrames],
+    nominal: Instrument,
+    dark: DarkFit,
+    transfer: PhotonTransfer,
+    *,
+    knots: int,
+    sky: Sky,
+    order: Order,
+    light_error: float = 0.0,
+    spectrum_error: float | None = None,
+) -> ThroughputFit:
+    """Fit the throughput to the mean frames of standard stars.
+
+    With two or more stars the zero point of the wavelengths and the width of the line function are fitted as well.
+
+    Parameters
+    ----------
+    stars : sequence of CalibrationFrames
+        At least one, each with its spectrum.
+    nominal : Instrument
+    dark : DarkFit
+    transfer : PhotonTransfer
+    knots : int
+        Number of intervals of the spline.
+    sky : Sky
+    order : {"paper", "physical"}
+    light_error : float
+        Relative standard deviation of the light of an observation, by pointing.
+    spectrum_error : float, optional
+        Relative standard deviation of the stars' spectra at each of `ERROR_KNOTS` knots. By default it is assumed for
+        one star, and fitted for several if they disagree.
+    """
+    nm = nominal.wavelength_nm
+    model = ThroughputModel(tuple(stars), nominal, dark, transfer, sky, order, *_basis(nm, knots), light_error)
+    if not model.usable.any(axis=1).all():
+        bad = stars[int(np.argmin(model.usable.any(axis=1)))].name
+        raise InputError.of("observations", bad, "a star with a pixel below saturation")
+    several = len(stars) > 1
+    error = spectrum_error if spectrum_error is not None else 0.0
+    best = _iterated(model, error)
+    chi2, dof = best.linear.goodness(best.found, best.covariance)
+    m = model.n_shape
+    if several and spectrum_error is None and scipy.stats.chi2.sf(chi2, dof) < REJECTED:
+        trial = _iterated(model, ONE_STAR_ERROR)
+        error = trial.linear.error_of(trial.linear.prior == ONE_STAR_ERROR, trial.smoothing)
+        best = _iterated(model, error)
+        chi2, dof = best.linear.goodness(best.found, best.covariance)
+    n = model.basis.shape[1]
+    if (np.abs(best.found[n : n + m]) > LIMITS[:m]).any():
+        raise InputError(
+            "the spectra of the stars do not match a wavelength scale and line width near the nominal ones",
+            f"shifts up to {LIMITS[0]:g} nm and widths within {100 * LIMITS[2]:g} %",
+            key="observations",
+        )
+    curve = model.basis @ best.covariance[:n, :n] @ model.basis.T
+    if not several and spectrum_error is None:
+        # One star cannot tell errors of its spectrum from the throughput.
+        error = ONE_STAR_ERROR
+        curve = curve + error**2 * _linear_basis(nm) @ _linear_basis(nm).T
+    # Counts determine the product of gain and throughput.
+    curve = curve + (transfer.gain_error / transfer.noise.gain) ** 2
+    log_factor, shape = model.basis @ best.found[:n], best.found[n : n + m]
+    errors = np.sqrt(np.diag(best.covariance))[n : n + m]
+    scale = [1.0, 1.0, nominal.gaussian_fwhm_nm, nominal.gaussian_fwhm_nm]
+    values = [Value(scale[k] * float(shape[k] + (k == 2)), scale[k] * float(errors[k])) for k in range(m)]
+    light = np.array([model.light_dn(one, log_factor, shape) for one in stars])
+    sd = np.sqrt(model.variance_dn2(light) + np.diagonal(model.dark_covariance, axis1=1, axis2=2).T)
+    residual = np.where(model.usable, (model.observed_dn - light) / sd, np.nan)
+    assumed = [*(() if m else ("wavelength zero point",)), *(() if m == 4 else ("line width",)),
+               *(() if several else ("errors of the star's spectrum",))]  # fmt: skip
+    padded: list[Value | None] = [*values, *[None] * (4 - m)]
+    shift, stretch, width, change = padded
+    return ThroughputFit(nm, log_factor, curve, shift, stretch, width, change, residual, chi2, dof, best.smoothing,
+                         error, tuple(assumed))  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    linear: _Linearised
+    smoothing: float
+    found: Float
+    covariance: Float
+
+
+def _iterated(model: ThroughputModel, error: float) -> _Solution:
+    """Return the solution of the problem that is linearised around it."""
+    n, m = model.basis.shape[1], model.n_shape
+    coefficients, shape = np.zeros(n), np.zeros(m)
+    for _ in range(ITERATIONS):
+        linear = model.linearised(coefficients, shape, error)
+        smoothing = linear.smoothing()
+        found, covariance = linear.solved(smoothing)
+        moved = np.abs(model.basis @ (found[:n] - coefficients)).max()
+        coefficients, shape = found[:n], np.clip(found[n : n + m], -LIMITS[:m], LIMITS[:m])
+        if moved < SETTLED:
+            return _Solution(linear, smoothing, found, covariance)
+    raise InputError(f"the throughput did not settle within {ITERATIONS} iterations",
+                     "standard stars of the stated brightness", key="observations")  # fmt: skip
+
+
+def _basis(nm: Float, knots: int) -> tuple[Float, Float]:
+    """Return a cubic B-spline basis, shape (n_pixel, knots + 3), and the matrix of its squared second derivative."""
+    inner = np.linspace(nm[0], nm[-1], knots + 1)
+    full = np.concatenate([np.full(3, nm[0]), inner, np.full(3, nm[-1])])
+    design = BSpline.design_matrix(nm, full, 3).toarray()
+    # The second derivative is linear between knots, so that two Gauss nodes integrate its square exactly.
+    half = np.diff(inner)[:, None] / 2
+    nodes = inner[:-1, None] + half * (1 + np.array([-1.0, 1.0]) / np.sqrt(3.0))
+    second = BSpline(full, np.eye(knots + 3), 3).derivative(2)(nodes.ravel())
+    weight = np.repeat(half, 2, axis=1).ravel()
+    return design, np.asarray((second * weight[:, None]).T @ second)
+
+
+def _linear_basis(nm: Float) -> Float:
+    """Return the basis of piecewise linear curves with `ERROR_KNOTS` knots, shape (n_pixel, ERROR_KNOTS)."""
+    at = np.linspace(nm[0], nm[-1], ERROR_KNOTS)
+    return np.column_stack([np.interp(nm, at, row) for row in np.eye(ERROR_KNOTS)])

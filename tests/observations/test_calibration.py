@@ -1,0 +1,243 @@
+"""Calibration of an instrument from simulated standard stars whose throughput, dark law and gain the fit does not know.
+
+Draws are NumPy's, so that the simulation shares no code with the engine.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from refusals import refused
+
+from mauvecl import Frames, Instrument, Sky, Source, Study, calibrate, expect
+from mauvecl.answers.limits.assumptions import assumptions
+from mauvecl.answers.observations.calibrate import CalibrateAnswer
+from mauvecl.host.instrument.curve import Curve
+from mauvecl.host.instrument.throughput_errors import ThroughputErrors
+from mauvecl.observations.calibration.dark import fit_dark
+from mauvecl.observations.calibration.exposures import CalibrationFrames
+from mauvecl.observations.calibration.photon_transfer import NoiseModel, fit_photon_transfer, measured_variance
+from mauvecl.schema.errors import InputError
+from mauvecl.study.unknowns import drawn
+
+NOMINAL = Instrument.load("mauve")
+SKY = Sky.of_brightness(22.1)
+STARS = (("B3V", 4.5), ("A0V", 5.0), ("F0V", 4.0), ("G2V", 4.0), ("B0V", 5.0))
+#: Standard deviations beyond which a fitted value is wrong; a normal one is once in 16 000 times.
+FAR = 4.0
+
+
+def truth(**changes: Any) -> Instrument:
+    """Return an instrument that differs from the nominal one in all that is fitted."""
+    nm = np.linspace(195, 705, 103)
+    x = (nm - 450) / 250
+    factor = np.exp(-0.1 + 0.2 * np.sin(2.3 * x + 1) + 0.1 * x**2 - 0.05 * np.sin(6 * x))
+    true = {
+        "throughput_factor": Curve(tuple(nm), tuple(factor)), "dark_scale_dn_per_s": 95.0, "dark_slope_per_c": 0.072,
+        "conversion_uv_per_electron": 22.0, "read_noise_dn": 13.0, "bias_dn": 612.0,
+    }  # fmt: skip
+    return NOMINAL.with_(**(true | changes))
+
+
+@cache
+def star(name: str, magnitude: float) -> Source:
+    return Source.from_library(name).at_magnitude(magnitude)
+
+
+def frames_of(
+    instrument: Instrument, source: Source | None, temperatures: list[float], n: int, rng: np.random.Generator,
+    exposure_s: float = 5.0,
+) -> Frames:  # fmt: skip
+    """Draw raw frames, n at each temperature."""
+    raw = []
+    for celsius in temperatures:
+        one = instrument.with_(temperature_c=celsius)
+        x = expect(source or star("G2V", 7.4), one, exposure=5.0, sky=SKY)
+        scale = exposure_s / x.frame_s
+        light = (x.source_electrons + x.sky_electrons) * scale if source else np.zeros(x.wavelength_nm.size)
+        gain, shape = x.gain_dn_per_electron, (n, light.size)
+        step = x.dark_step_dn
+        dark = step * rng.poisson(x.dark_dn * scale / step, shape)
+        photons = gain * (light + np.sqrt(light) * rng.standard_normal(shape))
+        raw.append(np.rint(photons + dark + x.bias_dn + x.read_noise_dn * rng.standard_normal(shape)))
+    counts = np.clip(np.concatenate(raw), 0, 65535)
+    return Frames.of(
+        np.arange(len(counts)) * 5.0, counts, exposure_s=exposure_s, wavelength_nm=NOMINAL.wavelength_nm, unit="DN",
+        temperature_c=np.repeat(temperatures, n), name="dark" if source is None else source.name,
+    )  # fmt: skip
+
+
+def study_of(stars: tuple[tuple[str, float], ...], dark: bool = True) -> Study:
+    rows = [f'{{frames="x", library="{name}", magnitude={magnitude}}}' for name, magnitude in stars]
+    rows += ['{frames="y"}'] if dark else []
+    return Study().with_settings([f"calibrate.observations=[{', '.join(rows)}]"])
+
+
+def answer_of(
+    stars: tuple[tuple[str, float], ...], instrument: Instrument, seed: int, dark: bool = True
+) -> CalibrateAnswer:
+    rng = np.random.default_rng(seed)
+    frames = [frames_of(instrument, star(*one), [16.0 + k], 40, rng) for k, one in enumerate(stars)]
+    if dark:
+        frames.append(frames_of(instrument, None, [13.0, 15.0, 17.0, 19.0, 21.0], 30, rng))
+    return calibrate(study_of(stars, dark), frames=tuple(frames))
+
+
+@pytest.fixture(scope="module")
+def answer() -> CalibrateAnswer:
+    return answer_of(STARS, truth(), 1)
+
+
+def test_fit_recovers_values(answer: CalibrateAnswer) -> None:
+    """Nine values: a false failure once in 1800 seeds."""
+    true = truth()
+    expected = {
+        "dark slope": 0.072, "bias": 612.0, "gain": true.gain_dn_per_electron, "read noise": 13.0,
+        "wavelength shift": 0.0, "wavelength stretch": 0.0, "line width": 10.5, "line width, change to the red": 0.0,
+    }  # fmt: skip
+    values = {one.name: one for one in answer.values}
+    for name, value in expected.items():
+        assert abs(values[name].value - value) < FAR * values[name].error, name
+        assert values[name].determined
+    at = answer.dark.reference_c
+    found = values["dark current"]
+    assert abs(found.value - true.with_(temperature_c=at).dark_dn_per_s) < FAR * found.error
+    assert answer.transfer.dark_unit == "DN"
+    assert all(row["p_value"] > 1e-4 for row in answer.fits)
+
+
+def test_fit_recovers_throughput(answer: CalibrateAnswer) -> None:
+    f = answer.throughput
+    true = np.log(truth().throughput(f.wavelength_nm) / NOMINAL.throughput(f.wavelength_nm))
+    far = (f.log_factor - true) / f.error
+    assert np.abs(far).max() < FAR
+    assert 0.005 < np.median(f.error) < 0.02
+
+
+def test_written_instrument_is_the_fitted_one(answer: CalibrateAnswer, tmp_path: Path) -> None:
+    answer.write(tmp_path)
+    read = Instrument.load(tmp_path / "instrument.toml")
+    assert read == answer.instrument
+    assert read.notice.startswith("The throughput is fitted to")
+    nm = answer.throughput.wavelength_nm[5:-5]
+    ratio = np.interp(nm, answer.throughput.wavelength_nm, np.exp(answer.throughput.log_factor))
+    np.testing.assert_allclose(read.throughput(nm) / NOMINAL.throughput(nm), ratio, rtol=3e-3)
+    assert read.throughput_errors is not None
+    np.testing.assert_allclose(
+        read.throughput_errors.sd(nm),
+        np.interp(nm, answer.throughput.wavelength_nm, answer.throughput.error),
+        rtol=0.01,
+    )
+
+
+def test_one_star_determines_throughput_alone() -> None:
+    one = answer_of((("A0V", 5.0),), truth(), 2, dark=False)
+    undetermined = {value.name for value in one.values if not value.determined}
+    assert undetermined == {
+        "dark current", "dark slope", "bias", "wavelength shift", "wavelength stretch", "line width",
+        "line width, change to the red",
+    }  # fmt: skip
+    assert one.throughput.spectrum_error == 0.1
+    assert np.median(one.throughput.error) > 0.05
+    assert any(text.startswith("NOT DETERMINED") for text in one.messages)
+    assert any(text.startswith("One star") for text in one.messages)
+
+
+def test_wrong_spectrum_is_noticed() -> None:
+    """A standard star that is 10 % too bright: the fit is rejected, or its spectra are taken for wrong."""
+    rng = np.random.default_rng(3)
+    stars = STARS[:3]
+    frames = [frames_of(truth(), star(*one), [16.0], 40, rng) for one in stars]
+    frames[0] = frames_of(truth(), star("B3V", 4.4), [16.0], 40, rng)
+    frames.append(frames_of(truth(), None, [13.0, 17.0, 21.0], 30, rng))
+    found = calibrate(study_of(stars), frames=tuple(frames))
+    assert found.throughput.spectrum_error > 0.01
+    assert any(text.startswith("The stars disagree") for text in found.messages)
+    f = found.throughput
+    true = np.log(truth().throughput(f.wavelength_nm) / NOMINAL.throughput(f.wavelength_nm))
+    assert np.abs((f.log_factor - true) / f.error).max() < FAR
+
+
+def test_dark_fit_determines_bias_of_pixels_from_exposure_times() -> None:
+    rng = np.random.default_rng(4)
+    bias = np.full(NOMINAL.pixels, 600.0)
+    bias[NOMINAL.read_pixels] += np.linspace(-20, 20, NOMINAL.wavelength_nm.size)
+    from mauvecl.host.instrument.pixel_map import PixelMap
+
+    instrument = truth(pixel_map=PixelMap(bias_dn=bias))
+    parts = [frames_of(instrument, None, [15.0, 19.0], 30, rng, exposure_s) for exposure_s in (1.0, 5.0)]
+    dark = [CalibrationFrames.of(one, NOMINAL, None) for one in parts]
+    found = fit_dark(dark, NOMINAL, NoiseModel.nominal(instrument))
+    far = (found.bias_dn - bias[NOMINAL.read_pixels]) / found.bias_error
+    # 1643 normal values have a mean square of 1 within 4 standard errors.
+    assert abs(np.mean(far**2) - 1) < 4 * np.sqrt(2 / far.size)
+    assert abs(found.slope_per_c - 0.072) < FAR * found.slope_error
+    assert found.p_value > 1e-4
+    assert found.slopes_p_value > 1e-4
+
+
+def test_photon_transfer_ignores_jitter_of_light() -> None:
+    """Gain within 4 standard errors although the light of frames jitters by 5 %, which alone would triple it."""
+    rng = np.random.default_rng(5)
+    light, gain = np.linspace(100.0, 20_000.0, 1600), 0.6
+    jitter = 1 + 0.05 * rng.standard_normal((200, 1))
+    raw = light * jitter + np.sqrt(gain * light + 150.0) * rng.standard_normal((200, 1600))
+    dark = np.zeros(1600)
+    found = fit_photon_transfer([measured_variance(raw, light, dark, np.ones(1600, bool))], NOMINAL)
+    assert abs(found.noise.gain - gain) < FAR * found.gain_error
+    assert found.p_value > 1e-4
+
+
+def test_modes_have_the_covariance() -> None:
+    nm = np.linspace(200, 700, 60)
+    covariance = 0.01 * np.exp(-(((nm[:, None] - nm) / 100) ** 2)) + 0.02
+    errors = ThroughputErrors.of_covariance(nm, covariance, "C: test", lost=0.0)
+    np.testing.assert_allclose(errors.modes.T @ errors.modes, covariance, atol=1e-12)
+    np.testing.assert_allclose(errors.sd(nm), np.sqrt(np.diag(covariance)))
+
+
+def test_unknowns_of_a_calibrated_instrument_are_its_modes(answer: CalibrateAnswer, tmp_path: Path) -> None:
+    """The drawn throughputs scatter as the fitted covariance says, with the error of a variance of 256 draws."""
+    answer.write(tmp_path)
+    name = str(tmp_path / "instrument.toml")
+    study = Study().with_settings([f"observation.instrument={name}", "unknowns.draws=256"])
+    draws = drawn(study)
+    assert "light_loss" not in draws.names
+    assert "qe_scale" not in draws.names
+    assert "throughput_1" in draws.names
+    nm = np.array([250.0, 450.0, 650.0])
+    fitted = answer.instrument
+    log = np.log([fitted.with_(**one.observation.changes).throughput(nm) for one in draws.studies])
+    assert fitted.throughput_errors is not None
+    modes = fitted.throughput_errors.at(nm)[:6]
+    np.testing.assert_allclose(log.std(axis=0), np.sqrt((modes**2).sum(axis=0)), rtol=4 * np.sqrt(0.5 / 256))
+    np.testing.assert_allclose(np.exp(log.mean(axis=0)), fitted.throughput(nm), rtol=2e-3)
+    named = [one.name for one in assumptions(fitted)]
+    assert "calibrated throughput, mode 1" in named
+    assert "light loss" not in named
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"unit": "electron"}, "unit"),
+        ({"temperature_c": None}, "temperature_c"),
+        ({"wavelength_nm": NOMINAL.wavelength_nm + 50}, "wavelength"),
+    ],
+)
+def test_frames_that_cannot_be_calibrated_raise(change: dict[str, Any], key: str) -> None:
+    from dataclasses import replace
+
+    frames = frames_of(truth(), star("A0V", 5.0), [16.0], 20, np.random.default_rng(6))
+    with pytest.raises(InputError) as error:
+        calibrate(study_of((("A0V", 5.0),), dark=False), frames=(replace(frames, **change),))
+    assert error.value.key == key
+
+
+def test_calibration_without_a_star_raises() -> None:
+    with refused("calibrate.observations"):
+        calibrate(Study())
