@@ -14,7 +14,7 @@ from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Unit
 
-from ..content import ContentEquality
+from ..content_equality import ContentEquality
 from ..files.ecsv import read_numbers
 
 Float = NDArray[np.float64]
