@@ -95,6 +95,7 @@ def test_faint_and_bright_flares_have_tables_and_pictures(amplitude: float, engi
         assert (tmp_path / f"{name}.png").exists()
 
 
+@pytest.mark.long
 def test_flares_are_measured_along_a_stare(engine: Engine, tmp_path: Path) -> None:
     """A cooling flare, in bins and by a joint fit. False failures: pulls beyond chi-squared's 1e-9 quantiles."""
     events = [{"peak_s": 100.0, "amplitude": 2.0, "half_width_s": 40.0, "cooling": {"end_k": 7000.0, "fold_s": 80.0}}]

@@ -364,8 +364,7 @@ def test_the_schema_describes_every_key(tmp_path: Path) -> None:
 def test_library_and_devices_are_listed(tmp_path: Path) -> None:
     assert "HD 40307" in run("library", folder=tmp_path).stdout
     assert len(json.loads(run("library", "--json", folder=tmp_path).stdout)) >= 25
-    assert "Portable Computing Language" in run("devices", folder=tmp_path).stdout
-    assert json.loads(run("devices", "--json", folder=tmp_path).stdout)[0]["default"]
+    assert json.loads(run("devices", "--no-rate", "--json", folder=tmp_path).stdout)[0]["default"]
     assert "mauvecl 0" in run("--version", folder=tmp_path).stdout
 
 

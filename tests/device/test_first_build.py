@@ -10,8 +10,11 @@ import time
 from pathlib import Path
 
 import pytest
+from refusals import refused
 
-from mauvecl.device import processor
+from mauvecl.device import first_build, processor
+
+pytestmark = pytest.mark.long
 
 #: Script that draws on the default device and prints the level and the counts' digest, or the error.
 RUN = """
@@ -37,13 +40,10 @@ if asked["name"] == "bad" or asked["name"] is None:
 """
 #: Failures of compilers and the messages that report them.
 ACTS = {
-    "os.abort()": "crashed: aborted",
     "ctypes.string_at(0)": "crashed: segmentation fault",
-    "os.kill(os.getpid(), 4)": "crashed: illegal instruction",
     "bytearray(6 * 2**30)": "failed",
     "\n    while True: pass": "of processor time",
     "time.sleep(60)": "not built after",
-    "os._exit(3)": "failed",
     "print('no kernels today'); sys.exit(1)": "no kernels today",
     "os.write(2, b'198 warnings generated.'); os.abort()": "crashed: aborted",
 }
@@ -85,8 +85,7 @@ def misbehaving(act: str, names: str) -> str:
     return f"{clock}first_build.CHILD = {CHILD.format(act=act)!r}; processor.names = lambda device: {names}"
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("act", [act for act in ACTS if any(word in act for word in ("string_at", "bytearray", "198"))])
+@pytest.mark.parametrize("act", ["ctypes.string_at(0)", "bytearray(6 * 2**30)"])
 def test_next_level_is_tried_after_compiler_failure(act: str, tmp_path: Path, plain, chooses) -> None:
     best = plain[1]["level"]
     found = run(tmp_path, misbehaving(act, f"('bad', {best!r})"), MAUVECL_BUILD_LIMIT_S="2")
@@ -135,7 +134,6 @@ def test_read_only_store_suffices(plain: tuple[Path, dict[str, str]]) -> None:
             path.chmod(mode)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("how", ["stdin", "thread", "no executable"])
 def test_first_build_works_for_every_way_to_start_python(how: str, tmp_path: Path, plain) -> None:
     code = RUN.format(before="sys.executable = None" if how == "no executable" else "")
@@ -154,7 +152,6 @@ def test_first_build_works_for_every_way_to_start_python(how: str, tmp_path: Pat
     assert dict(line.split(" ", 1) for line in child.stdout.splitlines()) == plain[1]
 
 
-@pytest.mark.long
 def test_concurrent_processes_build_once(tmp_path: Path, plain: tuple[Path, dict[str, str]]) -> None:
     log = tmp_path / "log"
     count = f"real = first_build._try; first_build._try = lambda *a: (open({str(log)!r}, 'a').write('.'), real(*a))[1]"
@@ -166,17 +163,18 @@ def test_concurrent_processes_build_once(tmp_path: Path, plain: tuple[Path, dict
     assert log.read_text() == "."
 
 
-@pytest.mark.long
 def test_first_build_stops_compiler_of_zen_4(tmp_path: Path, plain: tuple[Path, dict[str, str]], chooses) -> None:
     """Stop the child of PoCL 3.0 with AVX-512, which crashes for the name znver3 after minutes and gigabytes."""
     if "avx512f" not in processor.flags():
         pytest.skip("this processor has no AVX-512")
     names = f"processor.names = lambda device: ('znver3', {plain[1]['level']!r})"
     start = time.monotonic()
-    assert run(tmp_path, names, MAUVECL_BUILD_LIMIT_S="6") == plain[1]
+    assert run(tmp_path, names, MAUVECL_BUILD_LIMIT_S="4") == plain[1]
     assert time.monotonic() - start < 100
 
 
-def test_invalid_build_limit_raises(tmp_path: Path) -> None:
-    for wrong in ("-1", "inf", "nan"):
-        assert "MAUVECL_BUILD_LIMIT_S" in run(tmp_path, MAUVECL_BUILD_LIMIT_S=wrong)["sentence"]
+@pytest.mark.parametrize("wrong", ["-1", "inf", "nan", "x"])
+def test_invalid_build_limit_raises(wrong: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(first_build.LIMIT, wrong)
+    with refused(first_build.LIMIT, value=wrong):
+        first_build._limit_s()

@@ -116,9 +116,7 @@ def test_damaged_program_is_not_restored(filled: tuple[Path, str], tmp_path: Pat
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("kind", "ending"), [("a flipped bit", ".so"), ("garbage", ".json"), ("a flipped bit", ".txt")]
-)
+@pytest.mark.parametrize(("kind", "ending"), [("a flipped bit", ".so"), ("a flipped bit", ".txt")])
 def test_damaged_store_is_rebuilt(filled: tuple[Path, str], tmp_path: Path, kind: str, ending: str) -> None:
     source, digest = filled
     cache = tmp_path / "cache"
@@ -193,15 +191,15 @@ def test_error_without_free_space_names_remedy(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("folder", ["/proc/mauvecl", "/dev/null/mauvecl"])
-def test_unusable_cache_folder_is_replaced(filled: tuple[Path, str], folder: str) -> None:
-    found = run(folder)
+def test_unusable_cache_folder_is_replaced(filled: tuple[Path, str]) -> None:
+    found = run("/dev/null/mauvecl")
     assert found["digest"] == filled[1]
-    assert not found["work"].startswith(folder)
+    assert not found["work"].startswith("/dev/null")
 
 
 @pytest.mark.long
 def test_folder_of_killed_process_is_removed(filled: tuple[Path, str], tmp_path: Path) -> None:
+    shutil.copytree(filled[0], tmp_path, dirs_exist_ok=True)
     code = "import time; from mauvecl.device.engine import Engine; Engine(); print('up', flush=True); time.sleep(60)"
     child = subprocess.Popen(
         [sys.executable, "-c", code],

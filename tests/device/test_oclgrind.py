@@ -30,8 +30,11 @@ width = int(sys.argv[1])
 # Cross the counter's boundary with three work-items; at width 1, sixteen realisations suffice and take half the time.
 selftest.COUNT = 40 if width > 1 else 16
 engine = Engine("Oclgrind", width=width)
-# Four cases are left out, since they access the same memory as others, and their results are tested with PoCL.
-for name in [c for c in selftest.CASES if c not in ("one frame", "fourth power", "apart", "priors, fourth power")]:
+# Cases that access the same memory as others are left out: their results are tested with PoCL. At width 1 one case of
+# each draw and comparison remains.
+few = ("apart, tables", "estimated variances", "marginalised, the sky unknown")
+many = set(selftest.CASES) - {"one frame", "fourth power", "apart", "priors, fourth power"}
+for name in sorted(many) if width > 1 else few:
     assert selftest.digests(engine, name) == selftest.reference_digests(name), name
 probes = Probes(device=engine.open_device)
 words = np.arange(160, dtype=np.uint32) * np.uint32(0x9E3779B9)
@@ -75,7 +78,7 @@ def under_oclgrind(code: str, folder: Path, *arguments: str) -> tuple[subprocess
 def test_kernels_have_no_races_or_invalid_accesses_and_equal_reference(tmp_path: Path, width: str) -> None:
     run, log = under_oclgrind(KERNELS, tmp_path, width)
     assert run.returncode == 0, run.stderr
-    assert int(run.stdout.split()[-1]) >= 24
+    assert int(run.stdout.split()[-1]) >= (24 if width == "16" else 10)
     assert log == ""
 
 

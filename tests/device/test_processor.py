@@ -116,6 +116,7 @@ def test_record_at_invalid_address_is_ignored() -> None:
     assert not processor.give_name(device, "x86-64-v3")
 
 
+@pytest.mark.long
 def test_compiler_prints_nothing(tmp_path: Path) -> None:
     """Check file descriptor 2, to which PoCL's compiler writes the number of its warnings."""
     code = (

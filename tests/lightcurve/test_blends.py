@@ -57,10 +57,10 @@ def test_two_equal_flares_are_separated(known, apart):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("number", "seeds"), [(2, range(100, 110)), (3, range(200, 206))])
+@pytest.mark.parametrize(("number", "seeds"), [(2, range(100, 106)), (3, range(200, 203))])
 def test_random_pairs_and_triples_are_separated(known, number, seeds):
-    # S/N of 30 to 120, peaks one to five half-widths apart. Of 38 flares and three quantities one is beyond five
-    # errors in 1e-4 of the runs; a false alarm in 16 orbits: once in 30 of 1e3 runs at most.
+    # S/N of 30 to 120, peaks one to five half-widths apart. Of 21 flares and three quantities one is beyond five
+    # errors in 1e-4 of the runs; a false alarm in 9 orbits: once in 50 runs at most.
     for seed in seeds:
         rng = np.random.Generator(np.random.Philox(seed))
         peak, events = float(rng.uniform(1500, 3000)), []
@@ -76,6 +76,7 @@ def test_random_pairs_and_triples_are_separated(known, number, seeds):
             assert alarm.p_value > 1e-6
 
 
+@pytest.mark.long
 def test_flares_outside_of_stare_or_bank_are_not_measured(known):
     narrow, wide = known.survey.bank.half_widths_s[0], known.survey.bank.half_widths_s[-1]
     last = known.survey.stare.duration_s
@@ -129,21 +130,21 @@ def test_intervals_cover_near_the_threshold(known):
     # 68 % intervals at S/N 6. At a coverage of 65 % each quantity fails once in 1000 runs.
     names = ("peak_s", "half_width_s", "equivalent_duration_s")
     held, count = np.zeros(3, np.int64), 0
-    for seed in range(400, 430):
+    for seed in range(400, 420):
         event, near = one_flare(known, seed, 6.0)
         for alarm in near[:1]:
             count += 1
             ends = [alarm.intervals[name] for name in names]
             held += [low <= getattr(event, name) <= high for (low, high), name in zip(ends, names, strict=True)]
-    assert count >= 15
+    assert count >= 10
     assert (binom.cdf(held, count, 0.65) > 1e-3).all(), (held, count)
 
 
 @pytest.mark.long
 def test_intervals_cover_above_the_threshold(known):
-    # 68 % intervals of 24 stares at S/N 8 and 15. At 65 %, fewer than 9 hold the truth once in 400 runs of each.
+    # 68 % intervals of 16 stares at S/N 8 and 15. At 65 %, fewer than 5 hold the truth once in 700 runs of each.
     held = np.zeros(2)
-    for seed in range(12):
+    for seed in range(8):
         for snr in (8.0, 15.0):
             rng = np.random.Generator(np.random.Philox([300 + seed, int(snr)]))
             width, peak = 10 ** rng.uniform(np.log10(25), np.log10(250)), rng.uniform(2000, 3500)
@@ -153,7 +154,7 @@ def test_intervals_cover_above_the_threshold(known):
                 ends = [alarm.intervals[name] for name in ("half_width_s", "equivalent_duration_s")]
                 truths = (width, event.equivalent_duration_s)
                 held += [low <= truth <= high for (low, high), truth in zip(ends, truths, strict=True)]
-    assert (held >= 9).all(), held
+    assert (held >= 5).all(), held
 
 
 @pytest.mark.long

@@ -81,10 +81,11 @@ def test_sums_of_frames_with_hits_equal_independent_draws(engine: Engine, seed: 
     assert stats.chi2_contingency(np.array(counts)).pvalue > 1e-7
 
 
+@pytest.mark.long
 def test_stacks_are_drawn_only_if_no_frame_can_be_clipped() -> None:
     """Check random cases with the Poisson probability of the fewest hits that clip a frame."""
     stacked = 0
-    for seed in range(60):
+    for seed in range(25):
         case = Case.of(seed)
         x = case.x
         room = (x.highest_dn - x.mean_raw_dn) / x.gain_dn_per_electron
@@ -92,4 +93,4 @@ def test_stacks_are_drawn_only_if_no_frame_can_be_clipped() -> None:
         if not prepare([x], processes=Processes(cosmic_rays=case.rays)).frames:
             stacked += 1
             assert stats.poisson.sf(fitting, case.hits) < 1e-12, seed
-    assert stacked > 3
+    assert stacked > 1

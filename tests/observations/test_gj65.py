@@ -14,6 +14,8 @@ from mauvecl.observations.frames import Reason
 from mauvecl.observations.reading import read_frames
 from mauvecl.study.study import Study
 
+pytestmark = pytest.mark.long
+
 DATA = Path(__file__).parent.parent / "data" / "flares"
 
 
