@@ -6,12 +6,13 @@ import inspect
 import pickle
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
+from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
 import astropy.units as u
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 import mauvecl
 from mauvecl import bulk
@@ -65,14 +66,18 @@ def annotation(path: str, name: str) -> Any:
     return FUNCTIONS[path].__validated__[name].annotation()  # type: ignore[attr-defined]
 
 
+def is_array(hint: Any) -> bool:
+    return hint == ArrayLike or get_origin(hint) is get_origin(NDArray[np.float64])
+
+
 def parts(hint: Any) -> Iterator[Any]:
     """Yield an annotation and all that it consists of, metadata included."""
     yield hint
-    if get_origin(hint) is Union and type(None) in get_args(hint):
+    if get_origin(hint) in (Union, UnionType) and type(None) in get_args(hint):
         yield type(None)
         hint = Union[tuple(one for one in get_args(hint) if one is not type(None))]  # noqa: UP007
         yield hint
-    if hint == ArrayLike or get_origin(hint) is np.ndarray:
+    if is_array(hint):
         return
     for part in get_args(hint):
         yield from parts(part)
@@ -87,7 +92,7 @@ def anything(hint: Any) -> bool:
 
 
 def holds_arrays(hint: Any) -> bool:
-    return any(part == ArrayLike or get_origin(part) is np.ndarray for part in parts(hint))
+    return any(is_array(part) for part in parts(hint))
 
 
 def having(condition: Callable[[Any], bool]) -> list[tuple[str, str]]:

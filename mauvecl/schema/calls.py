@@ -11,8 +11,8 @@ from contextlib import suppress
 from functools import cache, wraps
 from itertools import chain, repeat
 from textwrap import dedent
-from types import CodeType, SimpleNamespace
-from typing import Any, TypeVar, cast, get_type_hints
+from types import CodeType
+from typing import Any, TypeVar, cast
 
 from pydantic_core import ValidationError
 
@@ -84,10 +84,11 @@ class _Parameter:
 
     def annotation(self) -> Any:
         """Return the resolved annotation; names that modules import for type checkers only are imported now."""
-        text = SimpleNamespace(__annotations__={self.name: self.text})
+        if not isinstance(self.text, str):
+            return self.text
         for module in self.modules:
             with suppress(NameError):
-                return get_type_hints(text, module, _TypeCheckingNames(module), include_extras=True)[self.name]
+                return eval(self.text, module, _TypeCheckingNames(module))
         raise TypeError(f"the annotation {self.text} of {self.name} names nothing known")
 
 

@@ -34,7 +34,7 @@ def validator(hint: Any) -> SchemaValidator:
 
 def schema_of(hint: Any) -> CoreSchema:
     """Return the core schema of an annotation; raises TypeError if it has none, so that no argument goes unchecked."""
-    origin, args = get_origin(hint) or hint, get_args(hint)
+    origin, args = _origin(hint), get_args(hint)
     if origin is Annotated:
         schema = schema_of(args[0])
         for metadata in args[1:]:
@@ -43,10 +43,11 @@ def schema_of(hint: Any) -> CoreSchema:
     if origin in (Union, UnionType) and NoneType in args:
         others = tuple(one for one in args if one is not NoneType)
         return core_schema.nullable_schema(schema_of(Union[others]))  # noqa: UP007
-    if _is_array(hint):
-        return _leaf(
-            _array if origin is Union else _real_array, "numbers" if origin is Union else "an array of numbers"
-        )
+    if numpy := sys.modules.get("numpy"):
+        if hint == numpy.typing.ArrayLike:
+            return _leaf(_array, "numbers")
+        if origin is numpy.ndarray:
+            return _leaf(_real_array, "an array of numbers")
     if origin in (Union, UnionType):
         choices: Any = [(schema_of(one), ALTERNATIVE) for one in args]
         return core_schema.union_schema(choices, mode="left_to_right")
@@ -176,10 +177,10 @@ def _instance(kind: type) -> CoreSchema:
     )
 
 
-def _is_array(hint: Any) -> bool:
-    """Return whether an annotation is NumPy's array or what NumPy makes one of."""
-    numpy = sys.modules.get("numpy")
-    return numpy is not None and ((get_origin(hint) or hint) is numpy.ndarray or hint == numpy.typing.ArrayLike)
+def _origin(hint: Any) -> Any:
+    """Return the class of an annotation without its arguments; NumPy 2.5 defines its own by `type` statements."""
+    origin = get_origin(hint) or hint
+    return _origin(origin.__value__) if hasattr(origin, "__value__") else origin
 
 
 def _kind(value: Any) -> str:
