@@ -33,7 +33,7 @@ lint: .venv/test.stamp .venv/lint.stamp
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/mypy
 
-# While editing: what can be known in two minutes on two cores. Types are checked beside the tests.
+# While editing: checks of two minutes on two cores. Types are checked while the tests run.
 check: .venv/test.stamp .venv/lint.stamp
 	@$(MAKE) --no-print-directory -j 2 lint quick
 

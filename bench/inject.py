@@ -3,7 +3,7 @@
     python bench/inject.py [--count 100000] [--device NAME] [--output bench/results/inject.ecsv]
 
 Each line is a map of `mauvecl inject`, with its thresholds, its null of 100 stares and 40 fits of each cell, on all
-processors; processor time beside wall time, for machines with other work.
+processors; processor time and wall time, for machines with other work.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from mauvecl.statistics.registry import STATISTICS
 CHANGES = 7
 #: What is changed, and what from and to; each change is another value between.
 FIELDS = {"amplitude_percent": (1.3, 2.9), "magnitude": (7.5, 9.0)}
-#: Tab in front, and statistic asked for.
+#: Visible tab, and requested statistic.
 CASES = (
     *((tab, "matched") for tab in ("spectrum", "noise", "limit", "unknowns")),
     *(("detection", statistic) for statistic in STATISTICS),

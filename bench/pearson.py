@@ -38,7 +38,7 @@ CASES = (
 
 
 def probabilities(mean: float, read: float, edges: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of counts between half-integer edges: Poisson, with Gaussian noise beside it."""
+    """Return the probabilities of counts between half-integer edges: Poisson with added Gaussian noise."""
     if read == 0.0:
         below, above = stats.poisson.cdf(edges, mean), stats.poisson.sf(edges, mean)
     else:

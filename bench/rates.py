@@ -1,4 +1,4 @@
-"""Rates of the engine beside its peers, in one run, as one table.
+"""Measure the rates of the engine and of its peers in one run, as one table.
 
     python bench/rates.py [--device NAME] [--output bench/results/rates.ecsv]
 
@@ -28,7 +28,7 @@ REPEATS = 9
 
 @dataclass
 class Line:
-    """One row: what is done, by whom, how often at once, and what was asked of it."""
+    """Row of the table: operation, program, number of realisations at once, and options."""
 
     work: str
     program: str
@@ -59,7 +59,7 @@ def ratio(a: Line, b: Line) -> str:
 
 
 def timed(work: Callable[[int], object]) -> Callable[[int], float]:
-    """Seconds that so many realisations take."""
+    """Return the seconds that a number of realisations takes."""
 
     def seconds(n: int) -> float:
         start = time.perf_counter()
@@ -161,8 +161,8 @@ def main() -> None:
             name
         ].info.description = f"pixel-realisations per second, counted per scenario, by the {which} of {REPEATS} times"
     table["slower"].info.description = "how many times slower than the engine's chi2 of one scenario"
-    told: dict[str, Any] = {"device": engine.device_name, "driver": engine.driver, "processor": processor()}
-    write(table, options.output, **told, pixels=pixels, versions=versions())
+    about: dict[str, Any] = {"device": engine.device_name, "driver": engine.driver, "processor": processor()}
+    write(table, options.output, **about, pixels=pixels, versions=versions())
     one, three, marginal = lines[1:4]
     print(f"three statistics at the rate of chi2 alone, quiescent and flare each: {ratio(three, one)}")
     print(f"the three marginalised at the rate of the plain three: {ratio(marginal, three)}")

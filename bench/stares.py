@@ -239,16 +239,16 @@ def main() -> None:
         name = f"AltaiPony {found['version']}"
         rows.append(("one light curve, injected and searched", name, "frames", per_s * FRAMES, own * FRAMES, own))
     table = Table(rows=rows, names=("work", "program", "counted", "rate", "rate_of_a_core", "stares_of_a_core"))
-    told = {
+    descriptions = {
         "rate": "what is counted, per second: pixels or sums of frames, of each scenario",
         "rate_of_a_core": "the same per second of processor time",
         "stares_of_a_core": "stares of 200 frames, each with a flare, per second of processor time",
     }
-    for column, text in told.items():
+    for column, text in descriptions.items():
         table[column].unit = "1 / s"
         table[column].info.format, table[column].info.description = ".3g", text
-    told: dict[str, Any] = {"device": stares.open_device.record.label, "processor": processor()}
-    write(table, options.output, **told, pixels=payload(1).quiet.wavelength_nm.size, versions=versions())
+    about: dict[str, Any] = {"device": stares.open_device.record.label, "processor": processor()}
+    write(table, options.output, **about, pixels=payload(1).quiet.wavelength_nm.size, versions=versions())
 
 
 if __name__ == "__main__":

@@ -39,8 +39,8 @@ def wall(*command: str) -> float:
     return time.perf_counter() - start
 
 
-def told(code: str, cache: str) -> float:
-    """Seconds that a process tells."""
+def measured(code: str, cache: str) -> float:
+    """Return the seconds that a child process prints."""
     environment = os.environ | {"MAUVECL_CACHE_DIR": cache}
     child = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, env=environment)
     return float(child.stdout)
@@ -58,8 +58,8 @@ def main() -> None:
         found.setdefault("import mauvecl", []).append(wall(sys.executable, "-c", "import mauvecl") - python)
         found.setdefault("mauvecl --help", []).append(wall(mauvecl, "--help"))
         with tempfile.TemporaryDirectory() as cache:
-            found.setdefault("three statistics, kernels built", []).append(told(DETECT, cache))
-            found.setdefault("three statistics, kernels from the cache", []).append(told(DETECT, cache))
+            found.setdefault("three statistics, kernels built", []).append(measured(DETECT, cache))
+            found.setdefault("three statistics, kernels from the cache", []).append(measured(DETECT, cache))
     wanted = (0.4, 0.5, 2.0, 0.2)
     table = Table(
         {"what": list(found), "seconds": [float(np.median(v)) for v in found.values()], "wanted": list(wanted)}

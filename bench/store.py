@@ -1,4 +1,4 @@
-"""Raw frames into a store, beside what the engine and the disk allow alone.
+"""Measure the rate of raw frames into a store, and the rates of engine and disk alone.
 
     python bench/store.py [--folder PLACE] [--realisations N] [--repeats K] [--output bench/results/store.ecsv]
 

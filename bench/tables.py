@@ -31,9 +31,9 @@ def versions() -> dict[str, str]:
     }
 
 
-def write(table: Table, path: Path, **told: object) -> None:
-    """Write a table, with what is told of it and the date, and print it."""
-    table.meta |= told | {"date_utc": time.strftime("%Y-%m-%d", time.gmtime())}
+def write(table: Table, path: Path, **about: object) -> None:
+    """Write a table with metadata and the date, and print it."""
+    table.meta |= about | {"date_utc": time.strftime("%Y-%m-%d", time.gmtime())}
     path.parent.mkdir(parents=True, exist_ok=True)
     table.write(path, format="ascii.ecsv", overwrite=True)
     table.pprint(max_lines=-1, max_width=-1, align="<")

@@ -4,8 +4,8 @@ python bench/verbs.py [--output bench/results/verbs.ecsv] [--repeats 3]
 
 Each verb runs in a process of its own with its kernels built. The seconds of its kernels are those between a request's
 beginning and its end on the device; what they alone would need is the CPU time of these requests over the cores,
-without what other threads of Python do beside them. Judge by ratios, and on an idle machine: others stretch wall time,
-and leave CPU time nearly alone; the table tells the machine's load.
+without the work of Python's other threads. Judge by ratios, and on an idle machine: others stretch wall time,
+and leave CPU time nearly alone; the table states the machine's load.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ CASES: dict[str, tuple[list[str], float, float]] = {
     "selftest": (["selftest"], 20.0, np.nan),
 }
 
-#: Runs a command line and notes the seconds of its requests to the device; told on the last line of standard error.
+#: Runs a command line and prints the seconds of its requests to the device on the last line of standard error.
 CHILD = """
 import json, sys, threading, time
 ended = []
@@ -96,8 +96,8 @@ def measured(words: list[str], folder: str) -> dict[str, float]:
         [sys.executable, "-c", CHILD, json.dumps(words)], capture_output=True, text=True, cwd=folder, check=False
     )
     wall = time.perf_counter() - start
-    told: dict[str, float] = json.loads(child.stderr.splitlines()[-1])
-    return told | {"wall": wall}
+    seconds: dict[str, float] = json.loads(child.stderr.splitlines()[-1])
+    return seconds | {"wall": wall}
 
 
 def write(rows: list[tuple[object, ...]], output: Path, repeats: int) -> None:

@@ -2,7 +2,7 @@
 
     python bench/visibility.py [--targets 100] [--days 365] [--step 60] [--output bench/results/visibility.ecsv]
 
-Processor seconds are beside those of the wall, which other work on the machine disturbs. Sockets are closed off first.
+Processor seconds accompany wall seconds, which other work on the machine disturbs. Sockets are closed off first.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from mauvecl.schema.tables import Column, table_of
 from ..drawable import Drawable
 from .content_equality import ContentEquality
 from .instrument.instrument import Instrument
-from .instrument.line_spread import Line
+from .instrument.line_spread import LineSpread
 from .measured_noise import negative_means_message
 from .response import Order, electrons_per_second
 from .sky import DEFAULT_SKY
@@ -158,11 +158,11 @@ class Expectation(Drawable, ContentEquality):
         return f"{self.name!r} on {self.instrument}, {exposure}"
 
     def _repr_html_(self) -> str:
-        messages = "".join(f"<br><small>{html.escape(text)}</small>" for text in self.messages)
+        remarks = "".join(f"<br><small>{html.escape(text)}</small>" for text in self.messages)
         name, where = html.escape(self.name), html.escape(self.instrument)
         return (
             f"<b>{name}</b> on {where}, {self.exposure_s:g} s in {self.n_frames} frames: best "
-            f"S/N {self.snr().max():.3g} a pixel, {self.snr_per_element().max():.3g} an element{messages}"
+            f"S/N {self.snr().max():.3g} per pixel, {self.snr_per_element().max():.3g} an element{remarks}"
         )
 
     def __post_init__(self) -> None:
@@ -330,7 +330,7 @@ class Expectation(Drawable, ContentEquality):
 
     @property
     def saturation_clause(self) -> str:
-        """End of a refusal's sentence, ``; N of M pixels of NAME saturate ...``, empty where none does."""
+        """End of an error message, ``; N of M pixels of NAME saturate ...``; empty if none does."""
         many = int(self.saturated.sum())
         if not many:
             return ""
@@ -562,7 +562,7 @@ def expect(
         )
     if any(note.startswith("dereddened") for note in source.notes) and not any("redden" in h for h in source.history):
         messages.append(
-            f"{source.name} was freed of its dust by its archive: brighter in the ultraviolet than it is seen, unless "
+            f"{source.name} was dereddened by its archive: it is brighter in the ultraviolet than as observed, unless "
             "it is reddened again (ebv)."
         )
     if instrument.notice:
@@ -578,7 +578,7 @@ def _continued_to_reach(source: Source, instrument: Instrument) -> Source:
     if nm[0] <= SPAN_NM[0] and nm[-1] >= SPAN_NM[1]:
         return source
     range_nm = (instrument.output_min_nm, instrument.output_max_nm)
-    nm, flux, messages = continued(source.name, nm, source.flux_flam, range_nm, Line.of(instrument))
+    nm, flux, messages = continued(source.name, nm, source.flux_flam, range_nm, LineSpread.of(instrument))
     return (
         replace(source, wavelength_nm=nm, flux_flam=flux, messages=(*source.messages, *messages))
         if messages
@@ -631,7 +631,7 @@ def _saturation(x: Expectation) -> tuple[str, ...]:
 
 
 def _faint_enough(electrons: Float, name: str) -> Float:
-    """Return mean electrons of a frame; raise InputError if a star is brighter than any pixel could take."""
+    """Return the mean electrons of a frame; raise InputError if a star is too bright for any pixel."""
     if (electrons > MAX_PER_FRAME).any():
         why = "; at 1 au it has V = -26.76 (Willmer 2018)" if name == "Sun" else ""
         raise InputError(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
 
-from .instrument.line_spread import Line
+from .instrument.line_spread import LineSpread
 from .response import Order, electrons_per_second
 from .spectra.point_noise import point_noise
 
@@ -34,7 +34,7 @@ def standard_error_per_second(source: Source, instrument: Instrument, order: Ord
     """
     nm = source.wavelength_nm
     variance = np.gradient(nm) * point_noise(source.flux_flam) ** 2
-    mean = Line.of(instrument).mean_density * electrons_per_second(instrument, nm, np.ones_like(nm), order)
+    mean = LineSpread.of(instrument).mean_density * electrons_per_second(instrument, nm, np.ones_like(nm), order)
     return np.sqrt(mean * electrons_per_second(instrument, nm, variance, order))
 
 
@@ -56,9 +56,9 @@ def negative_means_message(
     nm = instrument.wavelength_nm
     if electrons[worst] < -MAX_SIGMA_BELOW_ZERO * error[worst]:
         raise InputError(
-            f"the spectrum of {source.name} makes a mean of {electrons[worst]:.3g} electrons a frame at "
+            f"the spectrum of {source.name} gives a mean of {electrons[worst]:.3g} electrons per frame at "
             f"{nm[worst]:.1f} nm, beyond {MAX_SIGMA_BELOW_ZERO:g} times its error of {error[worst]:.2g}",
-            "light: bin the spectrum (`bin_nm`) or mend it",
+            "non-negative light: bin the spectrum (`bin_nm`) or correct it",
             key="bin_nm",
             value=source.name,
         )

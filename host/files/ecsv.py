@@ -1,4 +1,4 @@
-"""Read ECSV tables of users; header and cells are checked before astropy and YAML parse them."""
+"""Reader of ECSV tables, which checks header and cells before astropy and YAML parse them."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
     from astropy.table import Table
     from numpy.typing import NDArray
 
-#: Most values of a header with its aliases written out: a few KiB of aliases can stand for 1e9 values.
+#: Largest number of values of a header with expanded aliases; a few KiB of aliases can expand to 1e9 values.
 MOST_VALUES = 100_000
-#: Most characters of a header: YAML in plain Python parses a megabyte in half a minute.
+#: Largest number of characters of a header; YAML in pure Python takes half a minute for a megabyte.
 MOST_HEADER = 256 * 2**10
 
 
 def read_ecsv(path: str | Path, what: str, expected: str = "an ECSV table") -> Table:
-    """Return the table of an ECSV file.
+    """Read an ECSV file.
 
-    Raises InputError if the file is missing, is not such a table, or would expand to more than its size suggests.
+    Raises InputError if the file is missing, is not an ECSV table, or would expand far beyond its size.
     """
     path = Path(path)
     named = f"{what} {shortened(str(path))}"
@@ -35,32 +35,32 @@ def read_ecsv(path: str | Path, what: str, expected: str = "an ECSV table") -> T
 
 
 def parse_ecsv(text: str, what: str, expected: str = "an ECSV table") -> Table:
-    """Return the table in a text.
+    """Parse ECSV text.
 
     Parameters
     ----------
     text : str
     what : str
-        What holds it, with its name, for messages.
+        Description of the origin for messages, including its name.
     expected : str
-        What was expected instead, for messages.
+        Expected content, for messages.
     """
-    # Slow to import, and needed only here.
+    # The import is slow and only needed here.
     from astropy.table import Table
 
     lines = text.splitlines()
     check_header(lines, what)
     check_cells([line for line in lines if not line.startswith("#")], what)
     with parsing(what, expected), warnings.catch_warnings():
-        # astropy warns of much that it reads.
+        # astropy warns of many headers that it can read.
         warnings.simplefilter("ignore")
-        # As lines: astropy takes a text of one line for the name of a file.
+        # Passed as lines, because astropy takes a text of one line for a file name.
         return Table.read([*lines, ""], format="ascii.ecsv")
 
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """A table of numbers."""
+    """Table of numbers."""
 
     columns: dict[str, NDArray[np.float64]]  # shape (n,) each
     #: Units of the columns; empty for a column without one.
@@ -72,14 +72,14 @@ class Numbers:
 
 
 def read_numbers(path: str | Path, what: str) -> Numbers:
-    """Return an ECSV table of numbers; raise InputError if values are missing or not numeric, or as `read_ecsv`."""
+    """Read an ECSV table of numbers; raise InputError if values are missing or not numeric, or as `read_ecsv`."""
     path = Path(path)
     named = f"{what} {shortened(str(path))}"
     return parse_numbers(as_text(unpacked(read_bytes(path, what), named), named), named)
 
 
 def parse_numbers(text: str, what: str) -> Numbers:
-    """Return the table of numbers in a text, as `read_numbers`."""
+    """Parse a table of numbers from text, as `read_numbers`."""
     import numpy as np
 
     lines = text.splitlines()
@@ -127,9 +127,9 @@ def check_header(lines: list[str], what: str) -> None:
     sizes: dict[int, int] = {}
 
     def values(node: Any) -> int:
-        # An alias repeats one object, which is counted once and multiplied.
+        # An alias repeats an object, which is counted once and multiplied.
         if id(node) not in sizes:
-            # A node within itself would never end.
+            # A node that contains itself would never end.
             sizes[id(node)] = MOST_VALUES
             inner = node.value if isinstance(node.value, list) else []
             flat = [one for pair in inner for one in (pair if isinstance(pair, tuple) else (pair,))]
@@ -140,14 +140,16 @@ def check_header(lines: list[str], what: str) -> None:
         root = yaml.compose("\n".join(header[1:]), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
         unfolded = 0 if root is None else values(root)
     if unfolded >= MOST_VALUES:
-        raise InputError(f"{what} has a header that unfolds to more than {MOST_VALUES} values", "fewer", key="file")
+        raise InputError(
+            f"{what} has a header that expands to more than {MOST_VALUES} values", "fewer values", key="file"
+        )
 
 
 def check_cells(lines: list[str], what: str) -> None:
-    """Raise InputError for rows that take far more memory as a table than as text.
+    """Raise InputError for rows that would need far more memory as a table than as text.
 
-    Every cell of a column is as wide as the widest, so one long line among many is refused, and so are cells that
-    continue over several lines.
+    All cells of a column have the width of the widest, so one long line among many raises InputError, as do cells that
+    extend over several lines.
     """
     most = limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")
     widest = max(map(len, lines), default=0)
@@ -162,6 +164,4 @@ def check_cells(lines: list[str], what: str) -> None:
         raise InputError(f"{what} has a line of {widest} characters", f"at most {2**17}", key="file", value=widest)
     odd = next((number for number, line in enumerate(lines, 1) if line.count('"') % 2), None)
     if odd is not None:
-        raise InputError(
-            f"{what} has a cell that goes on beyond row {odd}", "each row on a line of its own", key="file", value=odd
-        )
+        raise InputError(f"{what} has a cell that extends beyond row {odd}", "one line per row", key="file", value=odd)

@@ -1,4 +1,4 @@
-"""Parse what files and flags hold: text, TOML, JSON, and numbers of a possible size; failures are InputError."""
+"""Parsers of text, TOML and JSON from files and flags, which raise InputError for invalid content."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ from mauvecl.schema.text import printable, shortened
 
 from .size_limits import read_bytes
 
-#: Sizes that a number of a user may have, apart from 0: products of several stay within double precision.
+#: Range of absolute values of numbers from users, apart from 0; products of several stay within double precision.
 SMALLEST, LARGEST = 1e-30, 1e30
-#: The same for energies in erg, up to 1e38 for flares: keys that end in this.
+#: Largest energy in erg, since flares reach 1e38, and the ending of keys of energies.
 ERG, LARGEST_ERG = "_erg", 1e45
-#: Other keys that hold energies.
+#: Other keys of energies.
 ENERGIES = ("injections.low", "injections.high")
 #: Range of integers of 64 bits, signed or unsigned.
 WHOLE = (-(2**63), 2**64 - 1)
 #: Longest text and deepest nesting of a study or an instrument.
 LONGEST, DEEPEST = 4096, 32
-#: Most dots of a TOML key.
+#: Largest number of parts of a dotted TOML key.
 MOST_PARTS = 512
 
 
 @contextlib.contextmanager
 def parsing(what: str, expected: str) -> Iterator[None]:
-    """Turn whatever a parser of foreign content raises into InputError with one sentence.
+    """Convert any exception of a parser of foreign content to InputError with a one-sentence message.
 
-    Parsers of TOML, YAML, FITS and tables raise dozens of kinds on damaged content: their own, those of Python
+    Parsers of TOML, YAML, FITS and tables raise many kinds of exceptions on damaged content: their own, those of Python
     (RecursionError, OverflowError) and of NumPy (MemoryError for sizes that a header claims).
 
     Parameters
     ----------
     what : str
-        What is read, with its name.
+        Description of the content, including its name.
     expected : str
-        What was expected instead.
+        Expected content.
     """
     try:
         yield
@@ -51,7 +51,7 @@ def parsing(what: str, expected: str) -> Iterator[None]:
     except RecursionError as error:
         raise InputError(f"{what} is nested too deeply", expected, key="file") from error
     except MemoryError as error:
-        raise InputError(f"{what} needs more memory than there is", expected, key="file") from error
+        raise InputError(f"{what} needs more memory than is available", expected, key="file") from error
     except Exception as error:
         reason = next((line.strip() for line in str(error).splitlines() if line.strip()), "") or type(error).__name__
         raise InputError(
@@ -60,22 +60,22 @@ def parsing(what: str, expected: str) -> Iterator[None]:
 
 
 def read_text(path: Path, what: str) -> str:
-    """Return the text of a regular file of bounded size, in UTF-8, with or without a byte-order mark."""
+    """Read a regular file of limited size as UTF-8 text, with or without a byte-order mark."""
     return as_text(read_bytes(path, what), f"{what} {shortened(str(path))}")
 
 
 def as_text(content: bytes, what: str) -> str:
-    """Return bytes as text in UTF-8; raise InputError that begins with `what` if they are not."""
+    """Decode UTF-8; raise InputError whose message begins with `what` if the bytes are not UTF-8."""
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{what} is not text (byte {error.start + 1} is no UTF-8)", "text in UTF-8", key="file"
+            f"{what} is not text (byte {error.start + 1} is not UTF-8)", "text in UTF-8", key="file"
         ) from error
 
 
 def is_file(path: Path) -> bool:
-    """Return whether there is something other than a folder at a path; False for impossible paths."""
+    """Return whether a path exists and is not a folder; False for impossible paths."""
     try:
         return path.exists() and not path.is_dir()
     except (OSError, ValueError):
@@ -83,10 +83,10 @@ def is_file(path: Path) -> bool:
 
 
 def toml(text: str, what: str) -> dict[str, Any]:
-    """Return a TOML document; raise InputError if it is not valid, or as `possible`."""
+    """Parse TOML; raise InputError if it is invalid, or as `possible`."""
     parts = max(part.count(".") for part in re.split(r"[=,{}\[\]\n#]", text))
     if parts > MOST_PARTS:
-        # Python's parser takes memory with the square of it.
+        # The memory of Python's parser grows with the square of this number.
         raise InputError(f"{what} has a key of {parts} parts", f"at most {MOST_PARTS}", key="file", value=parts)
     with parsing(what, "TOML"):
         try:
@@ -98,16 +98,16 @@ def toml(text: str, what: str) -> dict[str, Any]:
 
 
 def json_data(text: str, what: str) -> Any:
-    """Return a JSON document; raise InputError if it is not valid or nested too deeply."""
+    """Parse JSON; raise InputError if it is invalid or nested too deeply."""
     with parsing(what, "JSON"):
         return json.loads(text)
 
 
 def possible(data: Any, what: str) -> None:
-    """Check nested data for values that no study or instrument can mean.
+    """Check nested data for values that are impossible in any study or instrument.
 
-    Raises InputError that names the key, for a number beyond `SMALLEST` to `LARGEST` (energies in erg: `LARGEST_ERG`),
-    an integer beyond 64 bits, text that is too long or holds impossible characters, or nesting that is too deep.
+    Raises InputError for a number beyond `SMALLEST` to `LARGEST` (energies in erg: `LARGEST_ERG`),
+    an integer beyond 64 bits, text that is too long or contains impossible characters, or nesting that is too deep.
     """
     waiting: list[tuple[str, Any, int]] = [("", data, 0)]
     while waiting:
@@ -130,14 +130,14 @@ def possible(data: Any, what: str) -> None:
 
 
 def _fault(value: Any, largest: float = LARGEST) -> tuple[str, str] | None:
-    """Return why a single value is impossible and what is expected, or None."""
+    """Return the fault of a value and the expected range, or None if the value is possible."""
     if isinstance(value, bool):
         return None
     if isinstance(value, int):
         if not WHOLE[0] <= value <= WHOLE[1]:
             return f"is a whole number of {value.bit_length()} bits", "at most 64"
     elif isinstance(value, float):
-        # Whoever knows the value's meaning judges NaN and infinity.
+        # NaN and infinity are checked where the meaning of the value is known.
         if math.isfinite(value) and value and not SMALLEST <= abs(value) <= largest:
             return f"= {value!r}", f"0 or a size from {SMALLEST:g} to {largest:g}"
     elif isinstance(value, str | Path):

@@ -1,4 +1,4 @@
-"""Read files of users within limits: regular files only, and no more bytes than allowed, packed or unpacked."""
+"""Reading of user files within size limits: only regular files, with limits of compressed and unpacked size."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import IO, Any
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
-#: Largest file that is read, and largest content that it may unpack to, MiB; the environment can set others.
+#: Default limits of file size and unpacked size, MiB; environment variables of these names override them.
 LIMITS = {"MAUVECL_LARGEST_FILE_MIB": 256, "MAUVECL_LARGEST_CONTENT_MIB": 512}
 #: Bytes unpacked at a time.
 PIECE = 1 << 20
@@ -25,7 +25,7 @@ XZ_MEMORY = 128 << 20
 def limit_bytes(variable: str) -> int:
     """Return a limit in bytes, from the environment or `LIMITS`.
 
-    Raises InputError if the environment holds no whole number of MiB from 1 to 2**20.
+    Raises InputError if the environment variable is not an integer number of MiB from 1 to 2**20.
     """
     text = os.environ.get(variable, str(LIMITS[variable]))
     if not (text.isascii() and text.isdigit() and len(text) <= 7 and 1 <= int(text) <= 2**20):
@@ -40,13 +40,13 @@ def open_regular(path: Path, what: str) -> IO[bytes]:
     ----------
     path : Path
     what : str
-        What the file should be, for messages: "spectrum file", "study".
+        Expected kind of file, for messages: "spectrum file", "study".
 
-    Raises InputError if there is no such file, it is no regular file, or cannot be opened.
+    Raises InputError if the file does not exist, is not a regular file, or cannot be opened.
     """
     shown = shortened(str(path))
     try:
-        # Without waiting: a pipe that nobody writes to would never open.
+        # Non-blocking, because a pipe without a writer would never open.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError as error:
         raise InputError(f"{what} {shown} does not exist", "a file", key="file", value=str(path)) from error
@@ -55,8 +55,8 @@ def open_regular(path: Path, what: str) -> IO[bytes]:
             f"{what} {shown} cannot be opened ({error.strerror})", "a readable file", key="file", value=str(path)
         ) from error
     except ValueError as error:
-        # Null bytes, and characters that no file name can hold.
-        raise InputError(f"{what} {shown} is no path ({error})", "a file's name", key="file", value=path) from error
+        # Null bytes, and characters that file names cannot contain.
+        raise InputError(f"{what} {shown} is not a path ({error})", "a file name", key="file", value=path) from error
     mode = os.fstat(descriptor).st_mode
     if not stat.S_ISREG(mode):
         os.close(descriptor)
@@ -66,7 +66,7 @@ def open_regular(path: Path, what: str) -> IO[bytes]:
 
 
 def read_bytes(path: Path, what: str) -> bytes:
-    """Return the content of a regular file of bounded size, without unpacking it.
+    """Read a regular file of limited size, without unpacking it.
 
     Raises InputError as `open_regular`, or if the file is too large or cannot be read.
     """
@@ -91,13 +91,13 @@ def read_bytes(path: Path, what: str) -> bytes:
 
 
 def unpacked(content: bytes, what: str) -> bytes:
-    """Unpack content that gzip, bzip2 or xz packed; return any other unchanged.
+    """Unpack content that is compressed by gzip, bzip2 or xz; return other content unchanged.
 
     Parameters
     ----------
     content : bytes
     what : str
-        What holds it, with its name, for messages.
+        Description of the content for messages, including its name.
 
     Raises InputError if it unpacks to more than the limit or is damaged.
     """
@@ -111,7 +111,7 @@ def unpacked(content: bytes, what: str) -> bytes:
 
 
 def _unpack(content: bytes, start: Callable[[], Any], form: str, what: str) -> bytes:
-    """Unpack piece by piece, so that a bomb is noticed early; several streams may follow one another."""
+    """Unpack in pieces, to detect decompression bombs early; several streams may follow one another."""
     most = limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")
     pieces: list[bytes] = []
     size = 0
@@ -121,7 +121,7 @@ def _unpack(content: bytes, start: Callable[[], Any], form: str, what: str) -> b
             waiting = content
             while not stream.eof:
                 piece = stream.decompress(waiting, PIECE)
-                # zlib returns the input that it did not use; the others keep it.
+                # zlib returns unused input; the other decompressors keep it.
                 waiting = getattr(stream, "unconsumed_tail", b"")
                 size += len(piece)
                 if size > most:

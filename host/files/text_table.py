@@ -1,4 +1,4 @@
-"""Read small tables of users: CSV, ECSV, or columns separated by blanks."""
+"""Reader of small user tables: CSV, ECSV, or columns separated by blanks."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from .size_limits import read_bytes, unpacked
 if TYPE_CHECKING:
     from astropy.table import Table
 
-#: Most characters of a table whose format is known, and of one on which astropy tries some twenty formats.
+#: Largest number of characters of a table of known format, and of one for which astropy tries about twenty formats.
 MOST_TEXT, MOST_GUESSED = 64 * 2**20, 4 * 2**20
 
 
 def read_text_table(path: str | Path, what: str) -> Table:
-    """Return the table in a text file.
+    """Read a table from a text file.
 
     Parameters
     ----------
     path : str or Path
-        ECSV by its first line, CSV by its ending, else columns separated by blanks; packed or not.
+        ECSV if its first line says so, CSV by its extension, otherwise columns separated by blanks; may be compressed.
     what : str
-        What it should be, for messages.
+        Expected kind of file, for messages.
     """
     path = Path(path)
     named = f"{what} {shortened(str(path))}"
@@ -47,8 +47,8 @@ def _without_comments(lines: list[str]) -> list[str]:
 
 
 def text_table(text: str, named: str, commas: bool, expected: str = "CSV or ECSV") -> Table:
-    """Return the table in a text."""
-    # Slow to import, and needed only here.
+    """Parse a table from text."""
+    # The import is slow and only needed here.
     from astropy.table import Table
 
     most = MOST_TEXT if commas or text.startswith("# %ECSV") else MOST_GUESSED

@@ -1,4 +1,4 @@
-"""Parse units of wavelength and flux as archives, instruments and people spell them, for every file format."""
+"""Parser of units of wavelength and flux in the spellings of archives and users, for all file formats."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 #: Longest text that is parsed as a unit.
 MAX_UNIT_LENGTH = 100
-#: What a flux unit measures: per wavelength or frequency; per area only; per solid angle; or something else.
+#: Kinds of flux units: per wavelength or frequency, per area only, per solid angle, or other.
 FluxKind = Literal["density", "total", "surface brightness", "other"]
 
 _DENSITIES = {
@@ -26,7 +26,7 @@ _DENSITIES = {
     "jansky": "Jy",
     "janskys": "Jy",
 }
-# Lower-case spellings and astropy's names; astropy alone takes A for ampere.
+# Lower-case spellings and astropy's names; astropy parses A as ampere.
 _SPELLINGS = {
     "Angstrom": "a aa ang angs angstrom angstroms angstroem angstroems ångström ångströms å",
     "nm": "nm nanometer nanometers nanometre nanometres",
@@ -42,7 +42,7 @@ _TYPOGRAPHY = str.maketrans("µμ−–⁻⁺⁰¹²³⁴⁵⁶⁷⁸⁹·⋅×�
 SCALE = re.compile(
     r"(?:x\s*|\*\s*)?(?:10\s*(?:\^|\*\*)\s*\(?\s*([+-]?\d{1,3})\s*\)?|10([+-]\d{1,3})(?!\d)|(\d(?:\.\d*)?[eE][+-]?\d{1,3}))"
 )
-# Magnitudes with a zero point of their own; nanomaggies are linear, 22.5 mag (AB) each (SDSS DR18, "magnitudes").
+# Magnitudes with a defined zero point; nanomaggies are linear, 22.5 mag (AB) each (SDSS DR18, "magnitudes").
 _AB = re.compile(r"(?:m(?:ag)?s?[_ (]*)?ab[) ]*(?:[_ ]?mag(?:nitude)?s?)?", re.IGNORECASE)
 _ST = re.compile(r"(?:m(?:ag)?s?[_ (]*)?st[) ]*(?:[_ ]?mag(?:nitude)?s?)?", re.IGNORECASE)
 _NANOMAGGIES = re.compile(r"n(?:ano)?m(?:ag)?g(?:y|ies|ys)", re.IGNORECASE)
@@ -52,7 +52,7 @@ _NO_UNIT = {"", "none", "null", "n/a", "-", "--", "---"}
 
 
 def is_stated(text: object) -> bool:
-    """Return whether a unit field holds a unit, rather than nothing or a word for nothing."""
+    """Return whether a unit field contains a unit, instead of an empty text or a word for none."""
     return text is not None and str(text).strip().strip("'\"").lower() not in _NO_UNIT
 
 
@@ -60,8 +60,8 @@ def is_stated(text: object) -> bool:
 def unit_of(text: str) -> u.UnitBase | u.function.FunctionUnitBase:
     """Parse a unit in any usual spelling.
 
-    Capitals, plurals, powers of ten in front, ``A`` for Angstrom, ``FLAM``, typographic superscripts, ``log(...)``,
-    AB and ST magnitudes are understood. Raises InputError for an unknown unit, other magnitudes, and counts.
+    Accepted are capitals, plurals, leading powers of ten, ``A`` for Angstrom, ``FLAM``, typographic superscripts,
+    ``log(...)``, and AB and ST magnitudes. Raises InputError for an unknown unit, other magnitudes, and counts.
     """
     import astropy.units as u
 
@@ -74,11 +74,11 @@ def unit_of(text: str) -> u.UnitBase | u.function.FunctionUnitBase:
         return u.STmag
     if _NANOMAGGIES.fullmatch(name):
         return u.CompositeUnit(1e-9, [u.AB], [1])
-    expected = "one such as Angstrom, nm or erg / (s cm2 Angstrom)"
+    expected = "a unit such as Angstrom, nm or erg / (s cm2 Angstrom)"
     if match := _LOGARITHM.fullmatch(name):
         return u.dex(_linear_unit(balanced(match[1]), text, expected)) if match[1] else u.dex
     if _NO_FLUX.search(name):
-        raise InputError.of("unit", text.strip(), f"a flux density, no magnitude or count: {expected}")
+        raise InputError.of("unit", text.strip(), f"a flux density, not a magnitude or count: {expected}")
     return _linear_unit(name, text, expected)
 
 
@@ -86,7 +86,7 @@ def _linear_unit(name: str, text: str, expected: str) -> u.UnitBase:
     import astropy.units as u
 
     unknown = InputError.of("unit", text.strip(), f"a known unit: {expected}")
-    # To astropy a comma makes a structure of two units.
+    # astropy takes a comma for a structure of two units.
     if not name or len(name) > MAX_UNIT_LENGTH or "," in name:
         raise unknown
     scale = 1.0
@@ -104,12 +104,12 @@ def _linear_unit(name: str, text: str, expected: str) -> u.UnitBase:
     respelled = re.sub(r"[A-Za-zÅåö]+", lambda word: _WORDS.get(word[0].lower(), word[0]), name)
     known = u.get_current_unit_registry().registry
     for spelling in (respelled, name):
-        # astropy takes 20 ms to fail, for it looks for similar names.
+        # astropy takes 20 ms to fail, because it searches for similar names.
         if not all(word in known for word in re.findall(r"[^\W\d_]+", spelling)):
             continue
         try:
             with warnings.catch_warnings():
-                # Several slashes are discouraged, and common.
+                # Several slashes are discouraged but common.
                 warnings.simplefilter("ignore")
                 return u.CompositeUnit(scale, [u.Unit(spelling)], [1]) if scale != 1.0 else u.Unit(spelling)
         except (ValueError, TypeError, OverflowError, RecursionError):
@@ -127,7 +127,7 @@ def balanced(name: str) -> str:
 
 
 def linear(unit: Any) -> u.UnitBase:
-    """Return the unit that a logarithmic unit or a magnitude is about; others as they are."""
+    """Return the linear unit of a logarithmic unit or magnitude; others unchanged."""
     physical: u.UnitBase = getattr(unit, "physical_unit", unit)
     return physical
 

@@ -251,7 +251,7 @@ class Instrument(Record):
                 raise InputError.of(name, getattr(self, name), "0 (none) or at least 0.1")
         if (most := float(self.quantum_efficiency(self.wavelength_nm).max())) > 1:
             raise InputError(
-                f"quantum_efficiency_a_per_w stands for {most:.3g} electrons per photon",
+                f"quantum_efficiency_a_per_w corresponds to {most:.3g} electrons per photon",
                 "at most 1",
                 key="quantum_efficiency_a_per_w",
                 value=most,

@@ -21,7 +21,7 @@ PANEL_SIGMA = 0.5
 
 
 @dataclass(frozen=True)
-class Line:
+class LineSpread:
     """Line spread function, a top hat convolved with a Gaussian, and the pixels that sample it; all in nm."""
 
     centres: tuple[float, ...]  # of the pixels
@@ -30,7 +30,7 @@ class Line:
     sigma: float  # of the Gaussian
 
     @classmethod
-    def of(cls, instrument: Instrument) -> Line:
+    def of(cls, instrument: Instrument) -> LineSpread:
         """Return the line spread function of an instrument."""
         return cls(
             tuple(instrument.wavelength_nm.tolist()),

@@ -97,7 +97,7 @@ SOURCES = {
     "normal_cone_deg": "assumption: such a cone of 39.1 deg gives the field of regard of the talk of 2024",
     "eclipse": "assumption: observing is allowed in sunlight and shadow alike",
     "proton_flux": "assumption: no exposures above this flux of protons beyond 10 MeV (AP8 at solar maximum, 510 km)",
-    "anomaly": "a polygon of one's own in place of the map of protons",
+    "anomaly": "user-defined polygon that replaces the map of protons",
     "shortest_s": "assumption: no time is lost to pointing and acquisition",
     "duty_cycle": "assumption: the whole window is exposed; the share that Mauve reaches is not public",
 }

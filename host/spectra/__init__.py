@@ -1,1 +1,1 @@
-"""Read spectra of users and archives, check them, and continue their ends."""
+"""Readers of spectra of users and archives, checks of spectra, and continuation of their ends."""

@@ -1,4 +1,4 @@
-"""Take spectra out of tables whose cells hold arrays: a row to a spectrum, or to a part of one."""
+"""Extraction of spectra from tables whose cells contain arrays, with a row per spectrum or per segment."""
 
 from __future__ import annotations
 
@@ -14,48 +14,48 @@ from mauvecl.schema.errors import InputError
 from .column_choice import Choice, listed, plain
 from .file_table import FileTable
 
-#: Columns that divide one spectrum over several rows: detector segments and echelle orders.
+#: Columns whose presence shows that rows are parts of one spectrum: detector segments and echelle orders.
 SEGMENTS = ("segment", "sporder", "order", "stripe")
-#: Names of columns that say how arrays are meant: their step, their length, which points count.
+#: Names of columns that qualify arrays: their step, their length, and the validity of points.
 STEPS = ("deltaw", "delta_w", "delta_wavelength", "step", "dlam", "dlambda")
 LENGTHS = ("npoints", "n_points", "nelem", "npts")
-#: 0 for points to be left out (COS Data Handbook 5.1, section 2.4.3).
+#: Zero for invalid points (COS Data Handbook 5.1, section 2.4.3).
 WEIGHTS = ("dq_wgt",)
 
 
 def holds_arrays(cells: Any) -> bool:
-    """Return whether each cell of a column holds an array."""
+    """Return whether each cell of a column contains an array."""
     return np.ndim(cells) > 1 or (np.asarray(cells).dtype == object and len(cells) > 0 and np.ndim(cells[0]) > 0)
 
 
 def no_such(word: str, names: Sequence[str]) -> InputError:
-    """Return the error for a word that names nothing."""
+    """Return the error for a word that does not name anything in the file."""
     return InputError.of("columns", word, f"one of {listed(names)}")
 
 
 @dataclass(frozen=True)
 class Rows:
-    """The rows of one spectrum."""
+    """Rows of one spectrum."""
 
-    #: Arrays of wavelength, or of both edges, and of flux, for each row.
+    #: Arrays of wavelength, or of both edges, and of flux, per row.
     arrays: list[list[Any]]
-    #: What the only row is called; empty for several.
+    #: Name of the only row; empty for several.
     identifier: str = ""
     messages: tuple[str, ...] = ()
 
 
 def selected_rows(table: FileTable, choice: Choice, cells: list[Any], asked: Sequence[str]) -> Rows:
-    """Return the row that is meant, or all rows where they are segments of one spectrum.
+    """Return the selected row, or all rows if they are segments of one spectrum.
 
     Parameters
     ----------
     table : FileTable
     choice : Choice
-        Its columns of wavelength and flux.
+        Columns of wavelength and flux.
     cells : list
-        Their cells; wavelengths of shape (n,) serve all rows of fluxes of shape (n_row, n).
+        Cells of these columns; wavelengths of shape (n,) apply to all rows of fluxes of shape (n_row, n).
     asked : sequence of str
-        Words of the user that may name a row.
+        Words given by the user that may name a row.
     """
     n = len(cells[-1])
     if np.ndim(cells[-1]) == 2:
@@ -87,7 +87,7 @@ def selected_rows(table: FileTable, choice: Choice, cells: list[Any], asked: Seq
         if kept.any():
             found.append([array[kept] for array in arrays])
     if not found:
-        raise InputError("its rows hold no valid point", "some", key="rows")
+        raise InputError("its rows contain no valid point", "valid points", key="rows")
     return Rows(found, identifier, messages)
 
 
@@ -97,7 +97,7 @@ def _values_of(table: FileTable, names: Sequence[str], wanted: Sequence[str]) ->
 
 
 def _arrays(cells: list[Any], step: Any) -> list[Any]:
-    """Return a row's cells as arrays of equal length; a start and a step are written out."""
+    """Return a row's cells as arrays of equal length; a start and a step are expanded."""
     *axes, flux = (np.ma.asanyarray(cell).squeeze() for cell in cells)
     if flux.ndim != 1:
         raise InputError(f"its row: the flux has the shape {flux.shape}", "one spectrum", key="flux", value=flux.shape)
@@ -115,7 +115,7 @@ def _arrays(cells: list[Any], step: Any) -> list[Any]:
 
 
 def _identifiers(table: FileTable, without: set[int], n: int) -> list[list[str]]:
-    """Return what each row may be called: its short texts and whole numbers, the most telling first."""
+    """Return the possible names of each row: its short texts and integers, the most specific first."""
     columns = [list(table.row_names)] if len(table.row_names) == n else []
     for place, column in enumerate(table.columns):
         if place in without:
@@ -129,7 +129,7 @@ def _identifiers(table: FileTable, without: set[int], n: int) -> list[list[str]]
 
 
 def _row_asked(identifiers: Sequence[Sequence[str]], asked: Sequence[str], names: Sequence[str]) -> int:
-    """Return the one row that is meant: the only one, the one with an asked identifier, or ``row 3``."""
+    """Return the selected row: the only one, the one with the requested identifier, or ``row 3``."""
     fitting = list(range(len(identifiers)))
     for word in asked:
         if match := re.fullmatch(r"row\s+(\d{1,9})", word.strip(), re.IGNORECASE):

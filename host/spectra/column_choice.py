@@ -1,4 +1,4 @@
-"""Choose the columns of wavelength and flux by what they hold; where several fit equally, ask the user."""
+"""Choice of the columns of wavelength and flux by their roles; ambiguous choices raise InputError."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from mauvecl.schema.text import shortened
 
 from .column_roles import Role
 
-#: Most names that a message lists.
+#: Largest number of names in a message.
 MAX_LISTED = 12
 AXES = ("wavelength", "lower edge", "upper edge")
 
 
 def plain(name: str) -> str:
-    """Return a column's name as names are compared: case, quotes and repeated blanks do not count."""
+    """Normalise a column's name for comparison: lower case, without quotes and repeated blanks."""
     return " ".join(name.strip().strip("\"'").lower().split())
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return names for a message; the rest of a long list as a number."""
+    """Join names for a message; a long list ends with the number of omitted names."""
     shown = [name.strip()[:40] for name in names]
     return ", ".join(shown[:MAX_LISTED]) + (f" and {len(shown) - MAX_LISTED} more" if len(shown) > MAX_LISTED else "")
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The columns of a spectrum, by their places: one wavelength or the two edges of each bin, and the flux."""
+    """Indices of the columns of a spectrum: one wavelength or both edges of each bin, and the flux."""
 
     wavelength: tuple[int, ...]
     flux: int
@@ -41,9 +41,9 @@ def choose(names: Sequence[str], roles: Sequence[Role], asked: Sequence[str] = (
     ----------
     names : sequence of str
     roles : sequence of Role
-        What each of them holds.
+        Role of each column.
     asked : sequence of str
-        Columns that the user named: a flux, a wavelength, or both.
+        Columns named by the user: a flux, a wavelength, or both.
     """
     wanted = [_named(name, names) for name in asked]
     if len(wanted) > 2:

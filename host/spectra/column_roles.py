@@ -1,8 +1,8 @@
-"""Recognise what a column holds from its name, unit and UCD.
+"""Recognition of the role of a column from its name, unit and UCD.
 
-Names are divided into words (``FluxErr``, ``STATERROR``, ``wave_lo``), and words have meanings. A word such as "error"
-or "sky" excludes a column from being the flux, whatever else is in its name. The others get a score for how well name
-and unit fit, by which `choice` chooses.
+Names are divided into words (``FluxErr``, ``STATERROR``, ``wave_lo``) with known meanings. A word such as "error" or
+"sky" excludes a column from being the flux, regardless of the rest of its name. Other columns get a score for the match
+of name and unit, from which `column_choice` selects the best.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ _MEANINGS = {
     "label": "obs observed source dered dereddened corr rest norm normalized normalised bolo smooth smoothed raw star",
 }  # fmt: skip
 _WORDS = {word: meaning for meaning, words in _MEANINGS.items() for word in words.split()}
-# Words of a name that may be written together: FLUXERR, loglam, wavehi.
+# Words of a name that may be joined: FLUXERR, loglam, wavehi.
 _GLUED = sorted((w for w in _WORDS if len(w) > 2 or w in ("lo", "hi", "wl", "bg", "dq")), key=len, reverse=True)
 _LAMBDA, _NU = "(?:lambda|lam|λ)", "(?:nu|ν)"
-# Names of several words that mean one thing.
+# Names of several words with a single meaning.
 _PHRASES = tuple(
     (re.compile(rf"(?<![a-zλν])(?:{pattern})(?![a-zλν])"), word)
     for pattern, word in (
@@ -69,7 +69,7 @@ _PHRASES = tuple(
         (r"s[_/]n", "snr"),
     )
 )
-# A word of these meanings decides, whatever else is in a name.
+# A word with one of these meanings determines the role, regardless of the rest of the name.
 _DECIDING: tuple[Kind, ...] = (
     "error", "quality", "continuum", "background", "counts", "throughput", "luminosity",
 )  # fmt: skip
@@ -83,22 +83,22 @@ _UCD: dict[str, Kind] = {"em.wl": "wavelength", "em.freq": "wavelength", "em.ene
 
 @dataclass(frozen=True)
 class Role:
-    """What a column holds, as far as its name, unit and UCD tell."""
+    """Role of a column as inferred from its name, unit and UCD."""
 
     kind: Kind
-    #: How well the name fits the kind; comparable among columns of one kind.
+    #: Score of the name for the kind, comparable among columns of one kind.
     score: int = 0
-    #: The base of the logarithm that the column holds, or nothing: "10" or "e".
+    #: Base of the logarithm, "10" or "e", if the column contains logarithms; otherwise empty.
     logarithm: str = ""
-    #: Whether the name says that the flux is multiplied by its wavelength or frequency.
+    #: Whether the flux is multiplied by its wavelength or frequency according to the name.
     total: bool = False
-    #: The stated unit, or the one in the name, as in ``flux_W_m2_nm`` or ``wave [nm]``.
+    #: Stated unit, or the unit in the name, as in ``flux_W_m2_nm`` or ``wave [nm]``.
     unit: str | None = None
 
 
 @lru_cache(maxsize=1024)
 def role_of(name: str, unit: str | None = None, ucd: str = "") -> Role:
-    """Recognise a column."""
+    """Infer the role of a column."""
     base, unit_in_name = divided(name)
     words = words_of(base)
     kind, score = _kind_of(words)
@@ -118,7 +118,7 @@ def role_of(name: str, unit: str | None = None, ucd: str = "") -> Role:
         kind, score = ("wavelength", 3) if spectral else ("flux", 3) if flux != "other" else (kind, 0)
     if kind == "unknown" and is_stated(unit) and flux == "density":
         kind, score = "flux", 1
-    # A unit of another kind speaks against a name; an unknown one is refused where it is converted.
+    # A unit of another kind contradicts the name; an unknown unit raises InputError at conversion.
     if is_known and kind in ("flux", "model"):
         score += 1 if flux in ("density", "total") else -6
     if is_known and kind == "wavelength":
@@ -131,7 +131,7 @@ def role_of(name: str, unit: str | None = None, ucd: str = "") -> Role:
 
 
 def _kind_of(words: Sequence[str]) -> tuple[Kind, int]:
-    """Return the kind that a name's words tell, and how well they fit."""
+    """Return the kind of column that the words of a name indicate, and their score."""
     has = {_WORDS.get(word, "label") for word in words if _WORDS.get(word) != "logarithm"}
     if len(words) == 1 and len(words[0]) == 1:
         # An "e" may be an energy, a "d" a distance.
@@ -189,7 +189,7 @@ def _kinds_of_unit(unit: str | None) -> tuple[bool, bool, FluxKind]:
 
 
 def divided(name: str) -> tuple[str, str | None]:
-    """Divide a column's name into what it calls and the unit that it holds, if any."""
+    """Divide a column's name into the quantity and its unit, if any."""
     name = " ".join(name.strip().strip("\"'").split())
     if _is_unit(name, alone=True):
         return "", name
@@ -204,7 +204,7 @@ def divided(name: str) -> tuple[str, str | None]:
     elif (match := re.search(r"\s?/\s*(\S+)$|\sin\s+(\S+)$", name)) and _is_unit(match[1] or match[2]):
         base, unit = name[: match.start()], match[1] or match[2]
     elif (match := SCALE.search(name)) and match.start() > 0:
-        # A factor without a unit, as in "flux/10^-15", is no unit that anybody knows.
+        # A factor without a unit, as in "flux/10^-15", is not a unit.
         base, unit = re.sub(r"\s*[/*]\s*$|\s+x\s*$", "", name[: match.start()]), name[match.start() :]
     else:
         parts = name.split("_")
@@ -218,7 +218,7 @@ def divided(name: str) -> tuple[str, str | None]:
 
 
 def _fits(base: Sequence[str], unit: str) -> bool:
-    """Return whether a name may end in a unit: one of wavelength after a wavelength, of flux after a flux."""
+    """Return whether a unit at the end of a name matches the quantity: wavelength or flux."""
     _, spectral, flux = _kinds_of_unit(unit)
     if not spectral and flux == "other":
         return False
@@ -228,7 +228,7 @@ def _fits(base: Sequence[str], unit: str) -> bool:
 
 
 def _is_unit(text: str, alone: bool = False) -> bool:
-    """Return whether a text is a unit of wavelength or flux; alone, one that is not more likely a word."""
+    """Return whether a text is a unit of wavelength or flux; if alone, one that is unlikely to be a word."""
     if alone and text not in ("A", "Å") and (len(text) < 2 or text.lower() in ("ab", "st", "erg")):
         return False
     _, spectral, flux = _kinds_of_unit(text)
@@ -237,7 +237,7 @@ def _is_unit(text: str, alone: bool = False) -> bool:
 
 @lru_cache(maxsize=1024)
 def words_of(name: str) -> tuple[str, ...]:
-    """Divide a name into lower-case words: at marks, at capitals, at digits, and between words that are known."""
+    """Divide a name into lower-case words: at punctuation, capitals and digits, and between known words."""
     name = re.sub(r"(?<=[a-zµλν])(?=[A-Z])", " ", name.strip())
     lower = name.lower()
     for pattern, word in _PHRASES:

@@ -1,4 +1,4 @@
-"""Convert a spectrum from the units of its file to vacuum nm and erg s-1 cm-2 A-1, and report what was assumed."""
+"""Conversion of a spectrum from the units of its file to vacuum nm and erg s-1 cm-2 A-1, with messages."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from .wavelength_range import check_assumed_unit
 
 Float = NDArray[np.float64]
 
-#: Decimal logarithms of any wavelength in nm, Angstrom, um or Hz, and of any flux, lie within these.
+#: Range of decimal logarithms of any wavelength in nm, Angstrom, um or Hz, and of any flux.
 LOG_WAVELENGTHS, LOG_FLUXES = (-2.0, 20.0), (-60.0, 60.0)
-#: Fluxes between these and without a unit are more likely magnitudes.
+#: Range of values without a unit that are more likely magnitudes than fluxes.
 LIKELY_MAGNITUDES = (2.0, 40.0)
 _THROUGHPUT = re.compile(
     r"throughput|transmission|transmittance|passband|bandpass|filter\s+(?:curve|profile)", re.IGNORECASE
@@ -31,17 +31,17 @@ _THROUGHPUT = re.compile(
 
 @dataclass(frozen=True, eq=False)
 class ReadSpectrum:
-    """A spectrum as read: vacuum nm, erg s-1 cm-2 A-1, and what its file says about it."""
+    """Spectrum in vacuum nm and erg s-1 cm-2 A-1, with the metadata of its file."""
 
     wavelength_nm: Float  # shape (n,)
     flux_flam: Float  # shape (n,)
     name: str
     origin: str
-    #: For the record.
+    #: Remarks for run records.
     notes: tuple[str, ...] = ()
-    #: What an answer must report: what was assumed, converted or merged.
+    #: Assumptions, conversions and mergers, which answers must report.
     messages: tuple[str, ...] = ()
-    #: Why its flux is not that at the telescope, so that it needs a magnitude; empty where it is.
+    #: Reason why the flux is not that at the telescope, so that a magnitude is needed; otherwise empty.
     unscaled: str = ""
 
 
@@ -52,7 +52,7 @@ def converted(raw: RawSpectrum, wavelength_unit: Any = None, flux_unit: Any = No
     ----------
     raw : RawSpectrum
     wavelength_unit, flux_unit : str or Unit, optional
-        What the user says, which overrides the file. A wavelength's may end in "air" or "vacuum".
+        Units that override those of the file. A unit of wavelength may end in "air" or "vacuum".
     """
     messages = list(raw.messages)
     medium: str | None = None
@@ -89,7 +89,7 @@ def converted(raw: RawSpectrum, wavelength_unit: Any = None, flux_unit: Any = No
 
 @dataclass(frozen=True)
 class _Scale:
-    """The scale of a column's numbers: linear, logarithm or magnitude."""
+    """Scale of a column's numbers: linear, logarithmic or magnitudes."""
 
     unit: Any
     is_assumed: bool
@@ -102,7 +102,7 @@ class _Scale:
 
 
 def _scale(what: str, column: str, role: Role, asked: Any, implied: str | None) -> _Scale:
-    """Return the scale of a column: as the user says, as the file states, or as its format implies."""
+    """Return the scale of a column: as given by the user, stated by the file, or implied by its format."""
     unit, messages = _stated(what, column, role.unit, asked)
     is_bare_logarithm = unit is not None and str(unit) in ("dex", "dex(1)")
     is_assumed = unit is None or is_bare_logarithm
@@ -133,7 +133,7 @@ def _scale(what: str, column: str, role: Role, asked: Any, implied: str | None) 
 
 
 def _stated(what: str, column: str, stated: str | None, asked: Any) -> tuple[Any, list[str]]:
-    """Return the unit that the user says, else that of the file, else None; and messages."""
+    """Return the user's unit, else that of the file, else None; and messages."""
     try:
         if asked is None:
             return (unit_of(stated) if stated is not None and is_stated(stated) else None), []
@@ -173,7 +173,7 @@ def _check_flux_unit(unit: Any, role: Role) -> None:
     kind = flux_kind(unit)
     if kind == "total" and not role.total:
         raise InputError(
-            f"the unit {unit} is no flux density (nothing in it is per wavelength or frequency)",
+            f"the unit {unit} is not a flux density (it is not per wavelength or frequency)",
             "one such as erg / (s cm2 Angstrom), or a column whose name says lambda F_lambda, such as lamFlam",
             key="flux_unit",
             value=unit,
@@ -197,7 +197,7 @@ def _check_flux_unit(unit: Any, role: Role) -> None:
 
 
 def _in_nm(values: Float, flux: Float, scale: _Scale) -> tuple[Float, Float]:
-    """Return wavelengths in nm, and the fluxes of the points that have one."""
+    """Return wavelengths in nm, and the fluxes of points with a wavelength."""
     import astropy.units as u
 
     with np.errstate(all="ignore"):
@@ -206,7 +206,7 @@ def _in_nm(values: Float, flux: Float, scale: _Scale) -> tuple[Float, Float]:
     if bad.size == 0:
         return nm, flux
     if bad.size < nm.size and not np.isfinite(flux[bad]).any():
-        # A row without either is no point.
+        # A row without wavelength or flux is not a point.
         return np.delete(nm, bad), np.delete(flux, bad)
     raise InputError.of("wavelength", nm[bad[0]], "a finite number", where=f"point {bad[0] + 1}")
 
@@ -225,7 +225,7 @@ def _in_order(nm: Float, flux: Float) -> tuple[Float, Float]:
 
 
 def _joined(segments: list[tuple[Float, Float]], messages: list[str]) -> tuple[Float, Float]:
-    """Join segments in order of wavelength; where two overlap, each gives the half next to it."""
+    """Join segments in order of wavelength; overlaps are cut in the middle."""
     segments = sorted((s for s in segments if s[0].size), key=lambda segment: (segment[0][0], segment[0][-1]))
     nm, flux = segments[0]
     for more, added in segments[1:]:
@@ -278,5 +278,5 @@ def _merged(nm: Float, flux: Float, messages: list[str]) -> tuple[Float, Float]:
     with np.errstate(invalid="ignore"):
         unequal = int(np.count_nonzero(most - least > 1e-9 * np.abs(most)))
     shown = f"; {unequal} of them differ in flux and are averaged" if unequal else ", equal in flux"
-    messages.append(f"{int((count > 1).sum())} wavelengths that stand more than once are merged{shown}")
+    messages.append(f"{int((count > 1).sum())} wavelengths that occur more than once are merged{shown}")
     return kept, np.where(count > 1, total / count, flux[first])

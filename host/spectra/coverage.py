@@ -1,4 +1,4 @@
-"""Check a spectrum's points and range, and continue its ends at their level or by another star's spectrum."""
+"""Checks of a spectrum's points and range, and continuation of its ends, at their level or by another spectrum."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from .point_noise import point_noise
 from .wavelength_range import MIN_MEASURED, NEEDED_NM, SPAN_NM, is_gap, likely_unit, measured_part
 
 if TYPE_CHECKING:
-    from ..instrument.line_spread import Line
+    from ..instrument.line_spread import LineSpread
 
 Float = NDArray[np.float64]
 
-#: Largest part of the brightest pixel's light that a continuation may give the outermost pixel: a choice of ours.
+#: Largest fraction of the brightest pixel's light that a continuation may add to the outermost pixel (a choice).
 MAX_CONTINUED = 0.01
-#: Width over which a level is taken, at an end or at a join, nm; and of the brightest, a resolution element.
+#: Widths over which a level at an end or join, and the brightest flux (a resolution element), are averaged, nm.
 END_NM, JOIN_NM, ELEMENT_NM = 5.0, 10.0, 10.5
-#: Least ratio of a level to its error, so that another spectrum can be scaled to it.
+#: Smallest ratio of a level to its error for which another spectrum can be scaled to it.
 MIN_JOIN_SNR = 5.0
 
 
 def check_points(name: str, wavelength: Float, flux: Float) -> None:
-    """Raise InputError unless wavelengths and fluxes are equally long, and wavelengths finite and increasing."""
+    """Raise InputError unless wavelengths and fluxes have equal length, and wavelengths are finite and increasing."""
     if wavelength.ndim != 1 or wavelength.shape != flux.shape or wavelength.size < 2:
         raise InputError(
             f"spectrum {name} has {wavelength.shape} wavelengths and {flux.shape} fluxes",
@@ -54,7 +54,7 @@ def check_points(name: str, wavelength: Float, flux: Float) -> None:
 
 
 def check_measured(name: str, wavelength: Float) -> None:
-    """Raise InputError if a spectrum holds less than a third of 200-700 nm, whatever continues it."""
+    """Raise InputError if a spectrum itself covers less than a third of 200-700 nm."""
     part = measured_part(wavelength)
     if part >= MIN_MEASURED - 1e-9:
         return
@@ -83,14 +83,14 @@ def check_covers(
 
 
 def coverage(wavelength: Float) -> str:
-    """Return the message that reports which wavelengths a spectrum holds before anything continues it."""
+    """Return the message on the wavelengths that a spectrum covers before it is continued."""
     part = measured_part(wavelength)
     share = "" if part > 1 - 1e-9 else f", {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
     return f"its own points cover {wavelength[0]:g}-{wavelength[-1]:g} nm{share}"
 
 
 def without_undefined_ends(name: str, wavelength: Float, flux: Float) -> tuple[Float, Float, tuple[str, ...]]:
-    """Cut the ends outside 200-700 nm from their innermost undefined point on, and return a note of it."""
+    """Cut ends outside 200-700 nm at their innermost undefined point, and return a note."""
     bad = ~np.isfinite(flux)
     if not bad.any():
         return wavelength, flux, ()
@@ -110,7 +110,7 @@ def without_undefined_ends(name: str, wavelength: Float, flux: Float) -> tuple[F
 
 
 def check_flux(name: str, wavelength: Float, flux: Float) -> None:
-    """Raise InputError for fluxes that are not finite, hold no light, or marks of missing ones."""
+    """Raise InputError for fluxes that are not finite, are all zero, or contain marks of missing values."""
     bad = np.flatnonzero(~np.isfinite(flux))
     if bad.size:
         i = int(bad[0])
@@ -133,7 +133,7 @@ def check_flux(name: str, wavelength: Float, flux: Float) -> None:
         at = wavelength[inside][int(np.argmin(flux[inside]))]
         raise InputError(
             f"spectrum {name}: flux {least:g} at {at:g} nm lies farther below zero than any in 200-700 nm lies above",
-            "measured noise at most: it may stand for no measurement",
+            "at most measured noise: the value may mark a missing measurement",
             key="flux",
             value=least,
         )
@@ -151,7 +151,7 @@ def remarks(wavelength: Float, flux: Float) -> tuple[str, ...]:
             f"{negative} of its {nm.size} points in {SPAN_NM[0]:g}-{SPAN_NM[1]:g} nm have a negative flux, the lowest "
             f"{values[i]:.3g} at {nm[i]:.1f} nm: measured noise, kept; `bin_nm` bins it"
         )
-    # Runs of at least three zeros are no measurement of light.
+    # Runs of at least three zeros are not measurements.
     edges = np.flatnonzero(np.diff(np.concatenate([[0], (values == 0.0).astype(np.int8), [0]])))
     runs = [
         (a, b) for a, b in edges.reshape(-1, 2) if b - a >= 3 and nm[b - 1] >= NEEDED_NM[0] and nm[a] <= NEEDED_NM[1]
@@ -171,11 +171,11 @@ def remarks(wavelength: Float, flux: Float) -> tuple[str, ...]:
 
 
 @cache
-def _nominal_line() -> Line:
+def _nominal_line() -> LineSpread:
     from ..instrument.instrument import Instrument
-    from ..instrument.line_spread import Line
+    from ..instrument.line_spread import LineSpread
 
-    return Line.of(Instrument.load("mauve"))
+    return LineSpread.of(Instrument.load("mauve"))
 
 
 def continued(
@@ -183,22 +183,22 @@ def continued(
     wavelength: Float,
     flux: Float,
     needed_nm: tuple[float, float] = NEEDED_NM,
-    line: Line | None = None,
+    line: LineSpread | None = None,
     *,
     dark_only: bool = False,
 ) -> tuple[Float, Float, tuple[str, ...]]:
-    """Continue the ends of a spectrum that lie within the line function's reach, at their level.
+    """Continue the ends of a spectrum at their level, within the reach of the line spread function.
 
     Parameters
     ----------
     name : str
     wavelength, flux : ndarray, shape (n,)
     needed_nm : tuple of float
-        Range of the pixels; the reach beyond it is that of `SPAN_NM` beyond `NEEDED_NM`.
-    line : Line, optional
-        The line function; that of the nominal instrument by default.
+        Range of the pixels; the line spread function reaches beyond it as `SPAN_NM` beyond `NEEDED_NM`.
+    line : LineSpread, optional
+        Line spread function; that of the nominal instrument by default.
     dark_only : bool
-        Leave an end as it is that is too bright to be continued, or within the range of the pixels.
+        Whether to leave ends unchanged that are too bright, or within the range of the pixels.
 
     Returns
     -------
@@ -218,7 +218,7 @@ def continued(
             continue
         near = np.abs(wavelength - end) <= END_NM
         level = max(float(flux[near].mean()), 0.0)
-        # Light of the outermost pixel that comes from beyond the end.
+        # Light in the outermost pixel from beyond the end.
         beyond = end - needed_nm[0] if is_blue else needed_nm[1] - end
         share = float((line or _nominal_line()).below(np.array([beyond]))[0]) * level / brightest
         if dark_only and (beyond > 0 or share > MAX_CONTINUED):
@@ -227,7 +227,7 @@ def continued(
         if share > MAX_CONTINUED:
             raise InputError(
                 f"spectrum {name} {word} at {end:g} nm, where it is bright: {share:.1%} of the brightest "
-                "pixel's light would be made up",
+                "pixel's light would be invented",
                 f"a spectrum to {goal:g} nm: `extend` continues it by a library spectrum",
                 key="extend",
                 value=end,
@@ -245,13 +245,13 @@ def continued(
 
 
 def _brightest(wavelength: Float, flux: Float, needed_nm: tuple[float, float]) -> float:
-    """Return the highest mean over a resolution element in a range."""
+    """Return the largest mean flux of a resolution element in a range."""
     edges = np.arange(needed_nm[0], needed_nm[1] + 0.1, ELEMENT_NM)
     return max(float(means(wavelength, flux, edges).max()), np.finfo(float).tiny)
 
 
 def means(wavelength: Float, flux: Float, edges: Float) -> Float:
-    """Return the mean fluxes between edges, of a flux that is straight between its points; shape (n_edge - 1,)."""
+    """Return the mean fluxes between edges of a piecewise linear flux, shape (n_edge - 1,)."""
     grid = np.union1d(wavelength, edges)
     values = np.interp(grid, wavelength, flux)
     area = np.concatenate([[0.0], np.cumsum(np.diff(grid) * (values[1:] + values[:-1]) / 2)])
@@ -262,25 +262,25 @@ def means(wavelength: Float, flux: Float, edges: Float) -> Float:
 def extended(
     name: str, wavelength: Float, flux: Float, extension: str, beyond: Float, shape: Float
 ) -> tuple[Float, Float, tuple[str, ...]]:
-    """Continue a spectrum by another where that one reaches farther, scaled at the join, and return messages.
+    """Continue a spectrum by a longer one, scaled at the join, and return messages.
 
     Parameters
     ----------
     name : str
     wavelength, flux : ndarray, shape (n,)
     extension : str
-        The other's name.
+        Name of the other spectrum.
     beyond, shape : ndarray, shape (m,)
-        Its wavelengths, nm, and fluxes.
+        Wavelengths, nm, and fluxes of the other spectrum.
 
-    Raises InputError if less than a third of 200-700 nm is measured, or there is no light at a join to scale by.
+    Raises InputError if less than a third of 200-700 nm is measured, or a spectrum has no light at a join.
     """
     messages = []
-    # Zeros in a row at an end are no data.
+    # Consecutive zeros at an end are missing data.
     light = np.flatnonzero(flux != 0.0)
     if light.size > 1 and light[-1] - light[0] + 1 < flux.size:
         wavelength, flux = (array[light[0] : light[-1] + 1] for array in (wavelength, flux))
-        messages.append(f"its ends of zeros are cut: {wavelength[0]:g}-{wavelength[-1]:g} nm are left")
+        messages.append(f"its ends of zeros are cut: {wavelength[0]:g}-{wavelength[-1]:g} nm remain")
     check_measured(name, wavelength)
     for blue in (True, False):
         end = float(wavelength[0] if blue else wavelength[-1])
@@ -304,7 +304,7 @@ def extended(
 def _join(
     name: str, wavelength: Float, flux: Float, extension: str, beyond: Float, shape: Float, blue: bool
 ) -> tuple[Float, float, float]:
-    """Return the range in which two spectra are compared, as wide as the first one's noise needs, and their means."""
+    """Return the range in which two spectra are compared, widened by the noise of the first, and their means."""
     low, high = max(wavelength[0], beyond[0]), min(wavelength[-1], beyond[-1])
     if not low < high:
         raise InputError(

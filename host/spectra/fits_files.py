@@ -1,4 +1,4 @@
-"""Read the tables of FITS files: binary and ASCII tables, and images of spectra."""
+"""Reader of spectra in FITS files: binary and ASCII tables, and images."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from .column_roles import role_of
 from .file_table import Column, FileTable
 from .fits_images import axis_of, is_spectrum_image, paired_images, rows_of
 
-#: Units that the archives' tables imply: CALSPEC's.
+#: Units implied by the archives' tables, those of CALSPEC.
 IMPLIED_UNITS = ("Angstrom", "erg / (s cm2 Angstrom)")
-#: Bytes of a block (FITS standard 4.0, section 3.1); most cards of a header and extensions of a file that are read.
+#: Bytes of a block (FITS standard 4.0, section 3.1), and largest numbers of cards of a header and of extensions.
 BLOCK, MAX_CARDS, MAX_EXTENSIONS = 2880, 100_000, 1000
-#: Keywords whose text may speak of air, vacuum, the star's surface or its dust.
+#: Keywords whose text may mention air, vacuum, the star's surface or its dust.
 _REMARKS = ("AIRORVAC", "VACUUM", "WAVEMED", "WAVETYPE", "VACWAVE", "COMMENT", "HISTORY", "DESCRIP")
 WHOLE = "a whole FITS file"
 
 
 def fits_tables(content: bytes, name: str, origin: str, asked: Sequence[str]) -> list[FileTable]:
-    """Return the tables of a FITS file, images of spectra among them.
+    """Read the tables of a FITS file, including images of spectra.
 
-    Raises InputError if it is no such file, is cut short, differs from its checksums, or holds neither.
+    Raises InputError if the content is not FITS, is truncated, contradicts its checksums, or has no tables or images.
     """
     from astropy.io import fits
 
     check_sizes(content)
     with parsing("it", WHOLE), warnings.catch_warnings():
-        # astropy warns of the headers of old archive files, and reads them.
+        # astropy warns of the headers of old archive files that it can read.
         warnings.simplefilter("ignore")
         hdus = fits.open(io.BytesIO(content), memmap=False, lazy_load_hdus=False, disable_image_compression=True)
         check_sums(hdus)
@@ -53,7 +53,7 @@ class Content(Protocol):
 def check_sizes(content: Content) -> None:
     """Raise InputError for headers whose sizes are impossible or larger than the file.
 
-    astropy's reader would loop for ever on a negative size.
+    astropy's reader would never end for a negative size.
     """
     place = 0
     for number in range(MAX_EXTENSIONS + 1):
@@ -77,7 +77,7 @@ def check_sizes(content: Content) -> None:
             )
         except (KeyError, ValueError) as error:
             raise InputError(
-                f"has a header {number} whose sizes are no numbers", WHOLE, key="file", value=number
+                f"has a header {number} whose sizes are not numbers", WHOLE, key="file", value=number
             ) from error
         if axes[:1] == [0] and len(axes) > 1:
             # Random groups.
@@ -87,8 +87,8 @@ def check_sizes(content: Content) -> None:
         size = abs(bits) // 8 * groups * (extra + math.prod(axes) if axes else 0)
         if start + size > len(content):
             raise InputError(
-                f"is cut short: its extension {number} is to hold {size} bytes, of which "
-                f"{max(0, len(content) - start)} are there",
+                f"is truncated: its extension {number} should have {size} bytes, of which "
+                f"{max(0, len(content) - start)} are present",
                 "a whole file",
                 key="file",
                 value=len(content),
@@ -98,7 +98,7 @@ def check_sizes(content: Content) -> None:
 
 
 def check_sums(hdus: Any) -> None:
-    """Raise InputError where DATASUM or CHECKSUM (FITS standard 4.0, section 4.4.2.7) do not fit what is there."""
+    """Raise InputError if DATASUM or CHECKSUM (FITS standard 4.0, section 4.4.2.7) contradict the content."""
     for number, hdu in enumerate(hdus):
         for key, verify in (("DATASUM", hdu.verify_datasum), ("CHECKSUM", hdu.verify_checksum)):
             if hdu.header.get(key) not in (None, "") and verify() == 0:
@@ -112,7 +112,7 @@ def check_sums(hdus: Any) -> None:
 
 
 class _Reader:
-    """The extensions of one open file."""
+    """Reader of the extensions of an open file."""
 
     def __init__(self, hdus: Any, name: str, origin: str, asked: Sequence[str]) -> None:
         self.hdus, self.name, self.origin, self.asked = hdus, name, origin, asked
@@ -141,7 +141,7 @@ class _Reader:
         return [*tables, *images]
 
     def _label(self, number: int, hdu: Any) -> str:
-        """Return what a user calls an extension: its number where that is asked for, else its name."""
+        """Return the name by which users select an extension: its number if requested, else its name."""
         return str(number) if str(number) in self.asked else text_at(hdu.header, "EXTNAME") or str(number)
 
     def _table(self, header: Any, columns: Sequence[Column], label: str, **more: Any) -> FileTable:
@@ -184,7 +184,7 @@ class _Reader:
         header = hdu.header
         if text_at(header, "ZIMAGE") == "True":
             raise InputError("holds a compressed image", "a table with WAVELENGTH and FLUX", key="table", value=number)
-        # The unit of the whole file is that of the flux where its column states none (SDSS).
+        # The unit of the file applies to the flux if its column states none (SDSS).
         whole = text_at(self.primary, "BUNIT") or text_at(header, "BUNIT") or None
         columns = []
         for k, column in enumerate(hdu.columns):
@@ -205,7 +205,7 @@ class _Reader:
         return self._table(header, columns, self._label(number, hdu), remarks=f"\n{ucds}")
 
     def _images(self) -> tuple[list[FileTable], list[InputError]]:
-        """Return the images that have an axis of wavelengths, and why others have none."""
+        """Return the images with an axis of wavelengths, and the faults of others."""
         images, errors = [], []
         for number, hdu in enumerate(self.hdus):
             if is_spectrum_image(hdu, text_at(hdu.header, "EXTNAME")):
@@ -230,7 +230,7 @@ class _Reader:
         )
 
     def _of_pair(self, arm: str, axis: Any, flux: Any, rows: Sequence[str]) -> FileTable:
-        """Return the table of an image of fluxes whose wavelengths are another image (DESI, PFS, APOGEE)."""
+        """Return the table of an image of fluxes whose wavelengths are in another image (DESI, PFS, APOGEE)."""
         name = text_at(axis.header, "EXTNAME").removeprefix(f"{arm}_")
         columns = [
             Column(name, _reader(axis), text_at(axis.header, "BUNIT") or None),
@@ -248,7 +248,7 @@ class _Reader:
 
 
 def text_at(header: Any, key: str) -> str:
-    """Return a keyword's value as text, empty where there is none or it cannot be parsed."""
+    """Return a keyword's value as text; empty if it is missing or cannot be parsed."""
     try:
         return str(header.get(key, "")).strip()
     except Exception:  # unparsable cards
@@ -256,7 +256,7 @@ def text_at(header: Any, key: str) -> str:
 
 
 def _reader(hdu: Any, column: int | None = None) -> Callable[[], Any]:
-    """Return a reader of an extension's data or column, whose failures on damaged content are InputError."""
+    """Return a reader of an extension's data or column that raises InputError for damaged content."""
 
     def values() -> Any:
         with parsing("it", WHOLE), warnings.catch_warnings():

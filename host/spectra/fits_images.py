@@ -1,4 +1,4 @@
-"""Read spectra in FITS images: their rows, and the wavelengths of their pixels."""
+"""Rows of spectra in FITS images, and the wavelengths of their pixels."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ import numpy as np
 
 from mauvecl.schema.errors import InputError
 
-#: Images that hold no fluxes, by the name of their extension.
+#: Names of extensions with images that are not fluxes.
 _NO_FLUX = re.compile(r"err|sig|var|ivar|qual|mask|dq|snr|cont|sky|back|wave|lambda|lam$", re.IGNORECASE)
 _AXIS_NAME = re.compile(r"(?:(.+)_)?(?:WAVELENGTH|WAVE|WAVELEN|LAMBDA|LOGLAM)", re.IGNORECASE)
 _FLUX_NAMES = ("FLUX", "SCI", "SPECTRUM", "SPEC")
-#: Most rows of one spectrum and its errors and masks, as SDSS (spSpec) and LAMOST store them.
+#: Largest number of rows of a single spectrum with its errors and masks, as in SDSS (spSpec) and LAMOST.
 MAX_PLANES = 6
 
 
 def is_spectrum_image(hdu: Any, label: str) -> bool:
-    """Return whether an extension is an image that may hold fluxes."""
+    """Return whether an extension is an image that may contain fluxes."""
     return bool(getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0) and not _NO_FLUX.search(label))
 
 
 def paired_images(hdus: Any) -> list[tuple[str, Any, Any]]:
-    """Return images of wavelengths with those of their fluxes, and what is before their names.
+    """Return pairs of images of wavelengths and fluxes, and the common prefix of their names.
 
     DESI's B_WAVELENGTH and B_FLUX (https://desidatamodel.readthedocs.io, coadd-SURVEY-PROGRAM-PIXNUM.fits).
     """
@@ -40,7 +40,7 @@ def paired_images(hdus: Any) -> list[tuple[str, Any, Any]]:
 
 
 def rows_of(hdu: Any, telescope: str) -> tuple[Any, tuple[str, ...], tuple[str, ...]]:
-    """Return the fluxes of an image, names of its rows where it has several, and a note.
+    """Return the fluxes of an image, the names of its rows if it has several, and a note.
 
     Raises InputError for an image of more dimensions than rows and wavelengths.
     """
@@ -87,7 +87,7 @@ def axis_of(header: Any, primary: Any, n: int) -> tuple[Any, str | None, str, tu
         )
     if number("CDELT1") is not None and number("CD1_1") is None and (scale := number("PC1_1")) is not None:
         step *= scale
-    # By the FITS standard a missing CRPIX1 is 0; the archives' spectra without it begin at their first pixel.
+    # A missing CRPIX1 is 0 by the FITS standard, but archives' spectra without it start at their first pixel.
     reference = number("CRPIX1")
     pixel = np.arange(1, n + 1) - (1.0 if reference is None else reference)
     kind = text("CTYPE1").upper()

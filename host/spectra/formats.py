@@ -1,4 +1,4 @@
-"""Read a spectrum from the files that users bring; content decides what a file is, not its name."""
+"""Reader of spectra in any supported file format, which is recognised by content instead of name."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 
 def without_columns(path: str | Path) -> tuple[Path, tuple[str, ...]]:
-    """Divide ``grid.fits[g45]`` into the file and the words in brackets, which name what is meant in it.
+    """Divide ``grid.fits[g45]`` into the file and the words in brackets, which select a part of it.
 
-    A file whose own name ends so is that file.
+    If a file of this full name exists, it is returned.
     """
     text = str(path)
     match = re.fullmatch(r"(?s)(.+?)\[([^\[\]]*)\]", text)
@@ -34,17 +34,17 @@ def without_columns(path: str | Path) -> tuple[Path, tuple[str, ...]]:
 def read_spectrum(
     path: Path, *, wavelength_unit: str | u.UnitBase | None = None, flux_unit: str | u.UnitBase | None = None
 ) -> ReadSpectrum:
-    """Read text, ECSV, VOTable or FITS, packed by gzip, bzip2 or xz or not.
+    """Read a spectrum from text, ECSV, VOTable or FITS, which may be compressed by gzip, bzip2 or xz.
 
     Parameters
     ----------
     path : Path
-        May end in words that say what is meant where several fit: a column, ``grid.fits[g45]``, two columns, an
-        extension, the identifier of a row, ``row 3``. Text without a stated unit is in nm and erg s-1 cm-2 A-1 (the
-        paper's rule), FITS in Angstrom and erg s-1 cm-2 A-1, which `ReadSpectrum.messages` report; ECSV and VOTable
-        must name their units.
+        May end in words that select one of several spectra: a column, ``grid.fits[g45]``, two columns, an extension,
+        the identifier of a row, or ``row 3``. Text without stated units is in nm and erg s-1 cm-2 A-1 (the paper's
+        rule), FITS in Angstrom and erg s-1 cm-2 A-1, which `ReadSpectrum.messages` reports. ECSV and VOTable must
+        state their units.
     wavelength_unit, flux_unit : str or Unit, optional
-        Override what the file states; a wavelength's may end in " air" or " vacuum".
+        Units that override those of the file; a unit of wavelength may end in " air" or " vacuum".
     """
     import numpy as np
 
@@ -54,13 +54,13 @@ def read_spectrum(
     try:
         place, asked = without_columns(path)
     except (OSError, ValueError):
-        # `read_bytes` says what is wrong with the name.
+        # `read_bytes` reports what is wrong with the name.
         place, asked = Path(path), ()
     content = read_bytes(place, "spectrum file")
     shown = place.name if len(place.name) <= 80 else shortened(place.name)
     try:
         tables = _tables(unpacked(content, "it"), _stem(place.name), f"file {shown}", asked, wavelength_unit, flux_unit)
-        # Overflows become infinities, which are refused where points are checked.
+        # Overflows become infinities, which the check of points rejects.
         with np.errstate(all="ignore"):
             return converted(spectrum_in(tables, asked), wavelength_unit, flux_unit)
     except InputError as error:
@@ -68,7 +68,7 @@ def read_spectrum(
 
 
 def _stem(name: str) -> str:
-    """Return a file's name without the endings of its packing and its format."""
+    """Return a file's name without the extensions of compression and format."""
     return re.sub(r"\.(gz|bz2|xz)$", "", name, flags=re.I).rsplit(".", 1)[0][:80] or name
 
 

@@ -1,4 +1,4 @@
-"""Find units of wavelength and flux in the free text of a header."""
+"""Search for units of wavelength and flux in the free text of a header."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from mauvecl.schema.errors import InputError
 
 from ..files.units import balanced, is_spectral, unit_of
 
-#: Longest header whose text is searched.
+#: Length of the longest header that is searched.
 MAX_HEADER = 20_000
 
 _LENGTH = (
     r"Angstroe?ms?|ANGSTROMS?|angstroe?ms?|Å[Nn]gstr[öo]ms?|Angs?|ang|AA|Å|nm|NM|[Nn]anomet(?:er|re)s?|um|[µμ]m|[Mm]icrons?"
     r"|[Mm]icromet(?:er|re)s?|[GT]?Hz|k?eV|cm\s?\^?\s?[-−⁻][1¹]|1/cm"
 )
-# A blank or none, in one line.
+# An optional blank on the same line.
 _B = r"[^\S\n]?"
 _EXPONENT = rf"(?:{_B}(?:\^|\*\*)?{_B}\(?[-+−]?\d\)?|[⁻⁺]?[¹²³])?"
 _PER = r"sr|ster(?:adian)?s?|arcsec(?:ond)?s?|pix(?:el)?s?|beam"
@@ -32,7 +32,7 @@ _FLUX = re.compile(
     rf"|(?<![A-Za-z])(?:FLAM|flam|FNU|fnu|PHOTLAM|photlam|[mun]?Jy)(?![A-Za-z])(?:{_B}/{_B}[A-Za-z]\w*)*"
 )
 _WAVE_WORD = r"(?:wavelengths?|waves?|wav|lambda|lam|wl|wlen|λ|frequency|freq|wavenumbers?)"
-# What follows a word for wavelength, as a unit would.
+# A unit after a word for wavelength.
 _NEXT_TO = re.compile(
     rf"{_WAVE_WORD}[\s_:=,]*(?:\(?\b(?:air|vac(?:uum)?)\b\)?)?[\s_:=,]*(?:is|are)?\s*(?:in|units?)?\s*[\[(<:=]?\s*({_LENGTH}|A)"
     r"(?![A-Za-z])",
@@ -40,7 +40,7 @@ _NEXT_TO = re.compile(
 )
 _ANYWHERE = re.compile(rf"(?<![\w.])(?<!\d )(?:{_LENGTH})(?![\w/])")
 _LIST = re.compile(rf"^\W*(?:units?\W+)?({_LENGTH}|A)[\s,;|]+(?=$|\W*FLUXUNIT)")
-# "wavelength (pc)", "wavelengths in furlongs": some unit, even where none is known.
+# "wavelength (pc)", "wavelengths in furlongs": an unknown unit.
 _STATED = re.compile(
     rf"(?:{_WAVE_WORD}\s*[\[(]\s*|{_WAVE_WORD}(?:\s+units?)?\s*(?:\bin\b|:|=)\s*)([A-Za-zÅµ][\w/^*-]*)(?=\s*(?:[\])\n.,;|&]|and\b|$))",
     re.IGNORECASE,
@@ -59,10 +59,10 @@ _NO_FLUX = re.compile(
 def stated_units(
     header: str, *, wavelength: bool = True, flux: bool = True, is_named: bool = False
 ) -> tuple[str | None, str | None]:
-    """Return the units of wavelength and of flux that a header states, as text, where they are asked for.
+    """Return the requested units of wavelength and flux that a header states, as text.
 
-    Without names of columns (`is_named`), a header that speaks of counts or magnitudes says that there is no flux.
-    Raises InputError if it states several units, an unknown one, or that there is no flux.
+    Without names of columns (`is_named`), a header that mentions counts or magnitudes implies that there is no flux.
+    Raises InputError if it states several units, an unknown unit, or implies that there is no flux.
     """
     text = header[:MAX_HEADER]
     found = [_spelt(match[0].strip()) for match in _FLUX.finditer(text)]
@@ -87,7 +87,7 @@ def stated_units(
 
 
 def _lengths(text: str) -> list[str]:
-    """Return the distinct units of wavelength in a text without those of flux."""
+    """Return the distinct units of wavelength in a text, without those within units of flux."""
     listed = [match[1] for line in text.splitlines() if (match := _LIST.match(line.strip().lstrip("#!%;").strip()))]
     if lengths := _distinct([match[1] for match in _NEXT_TO.finditer(text)]) or _distinct(listed):
         return lengths
@@ -104,13 +104,13 @@ def _lengths(text: str) -> list[str]:
 
 
 def _spelt(name: str) -> str:
-    """Return a unit in the name of a column as a unit: erg_s_cm2_A is erg/s/cm2/A."""
+    """Convert a unit in the name of a column to the form of a unit: erg_s_cm2_A is erg/s/cm2/A."""
     name = balanced(name)
     return name.replace("_", "/") if "_" in name and not re.search(r"[/\-−]|per", name) else name.replace("_", " ")
 
 
 def _distinct(names: list[str]) -> list[str]:
-    """Return each unit once, however it is spelt; "W s" in prose is an energy, and neither."""
+    """Return distinct units regardless of spelling; "W s" in prose is an energy and dropped."""
     units: dict[object, str] = {}
     for name in names:
         unit = unit_of(name)

@@ -1,4 +1,4 @@
-"""Check that a spectrum's numbers can be told apart and multiplied in double precision."""
+"""Check that a spectrum's wavelengths are distinct and its numbers are in range for double precision."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
 
-#: Range of wavelengths, nm, from gamma rays to metre waves: their products stay within double precision.
+#: Range of wavelengths, nm, from gamma rays to metre waves, whose products stay within double precision.
 NEAREST_NM, FARTHEST_NM = 1e-6, 1e9
-#: Least relative distance of two wavelengths: conversions round by some 1e-16 each.
+#: Smallest relative distance of two wavelengths; each conversion rounds by about 1e-16.
 CLOSEST = 1e-12
-#: Range of a spectrum's largest flux, erg s-1 cm-2 A-1; the faintest stars have 1e-21, a white dwarf's surface 1e10.
+#: Range of a spectrum's largest flux, erg s-1 cm-2 A-1, from 1e-21 for the faintest stars to 1e10 at a white dwarf's
+#: surface, with margins.
 FAINTEST, BRIGHTEST = 1e-40, 1e30
 
 
@@ -39,11 +40,11 @@ def check_values(name: str, wavelength: NDArray[np.float64], flux: NDArray[np.fl
         raise InputError(
             f"spectrum {name}: wavelengths {float(wavelength[i])!r} and {float(wavelength[i + 1])!r} nm at "
             f"points {i + 1} and {i + 2} are the same to within rounding",
-            f"them apart by {CLOSEST:g} of their value",
+            f"wavelengths that differ by {CLOSEST:g} of their value",
             key="wavelength",
             value=float(wavelength[i]),
         )
-    # Undefined ends are cut afterwards.
+    # Undefined ends are cut later.
     largest = float(np.abs(flux[np.isfinite(flux)]).max(initial=0.0))
     if largest and not FAINTEST <= largest <= BRIGHTEST:
         raise InputError.of("flux", largest, f"{FAINTEST:g} to {BRIGHTEST:g}", where=f"spectrum {name}, largest value")

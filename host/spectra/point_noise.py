@@ -1,4 +1,4 @@
-"""Estimate the noise of a measured spectrum from its own scatter."""
+"""Estimate of the noise of a measured spectrum from its scatter."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 
-#: Number of points whose scatter gives the noise of the one in the middle.
+#: Number of neighbouring points from whose scatter the noise of a point is estimated.
 WINDOW = 51
 
 
@@ -15,7 +15,7 @@ def point_noise(flux_flam: Float) -> Float:
     """Return the standard deviation of each point from the scatter around it, shape (n,).
 
     The median of |2 F_i - F_(i-2) - F_(i+2)| is 1.4826^-1 sqrt(6) of a point's error (Stoehr et al. 2008, ASP
-    Conf. Ser. 394, 505); adjacent points, whose errors are correlated, are left out.
+    Conf. Ser. 394, 505). Adjacent points are not used, since their errors are correlated.
     """
     from scipy.ndimage import median_filter
 

@@ -1,6 +1,6 @@
-"""Take the one spectrum that is meant out of the tables of a file.
+"""Selection of one spectrum from the tables of a file.
 
-A table is chosen among several, columns in the table, and a row where cells hold whole spectra. A user chooses with
+The selection is of a table, of its columns, and of a row if cells contain whole spectra. Users select with
 ``FILE[word, ...]``: a table's label, a column's name or a row's identifier.
 """
 
@@ -24,7 +24,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class RawSpectrum:
-    """A spectrum in the units of its file."""
+    """Spectrum in the units of its file."""
 
     #: Wavelengths and fluxes of each segment, shape (n,) each.
     segments: list[tuple[Float, Float]]
@@ -37,7 +37,7 @@ class RawSpectrum:
 
 
 def spectrum_in(tables: Sequence[FileTable], asked: Sequence[str]) -> RawSpectrum:
-    """Return the spectrum that a file holds, or the one of several that is asked for."""
+    """Return the spectrum of a file, or the selected one of several."""
     if not tables:
         raise InputError("has no table", "one with a wavelength and a flux", key="table")
     labels = [table.label.strip().lower() for table in tables]
@@ -52,10 +52,10 @@ def spectrum_in(tables: Sequence[FileTable], asked: Sequence[str]) -> RawSpectru
         except InputError as error:
             errors.append(error)
     if errors and any(one.table.group for one in found):
-        # A part that is missing would go unnoticed.
+        # A missing part would go unnoticed.
         raise errors[0]
     if not found:
-        # The sentence that offers a choice helps most.
+        # The message that offers a choice is the most helpful.
         raise next((error for error in errors if "FILE[" in str(error)), errors[0])
     if len(found) > 1 and not named:
         # SDSS: the sum of all exposures, next to each of them.
@@ -79,7 +79,7 @@ def _spectrum_of(table: FileTable, asked: Sequence[str]) -> RawSpectrum:
     names = [column.name for column in table.columns]
     roles = [column.known_role for column in table.columns]
     known = {plain(name) for name in names}
-    # What names no column may name a row.
+    # Words that do not name a column may name a row.
     rest = [word for word in asked if plain(word) not in known]
     try:
         choice = choose(names, roles, [word for word in asked if plain(word) in known])
@@ -122,7 +122,7 @@ def _spectrum_of(table: FileTable, asked: Sequence[str]) -> RawSpectrum:
                 f"{axes[0].size} wavelengths for {flux.size} fluxes", "as many", key="flux", value=flux.size
             )
     if sum(flux.size for _, flux in segments) < 2:
-        raise InputError("holds less than two points", "a spectrum", key="flux", value=flux.size)
+        raise InputError("has fewer than two points", "a spectrum", key="flux", value=flux.size)
     axis, flux_role = roles[choice.wavelength[0]], roles[choice.flux]
     return RawSpectrum(
         segments, table, chosen[0].name, chosen[-1].name, axis, flux_role, (*table.messages, *messages),

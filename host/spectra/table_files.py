@@ -1,4 +1,4 @@
-"""Read the tables of ECSV and VOTable files."""
+"""Readers of ECSV and VOTable files."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from mauvecl.schema.text import shortened
 from ..files.ecsv import parse_ecsv
 from .file_table import Column, FileTable
 
-#: Most messages of a star kept earlier that its table may carry, and their length.
+#: Largest number and length of messages in the table of a kept star.
 MAX_NOTES, MAX_NOTE_LENGTH = 20, 400
 
 
 def ecsv_tables(text: str, name: str, origin: str) -> list[FileTable]:
-    """Return the table of an ECSV file."""
+    """Read the table of an ECSV file."""
     table = parse_ecsv(text, "it")
     meta = table.meta if isinstance(table.meta, dict) else {}
     own = meta.get("name")
     return [
         FileTable(
             [
-                # As text: astropy keeps units that it does not know as objects without a dimension.
+                # As text, because astropy keeps unknown units as objects without a dimension.
                 Column(
                     one, partial(_ecsv_values, table, one), None if table[one].unit is None else str(table[one].unit)
                 )
@@ -45,14 +45,14 @@ def _ecsv_values(table: Any, name: str) -> Any:
 
 
 def _texts(given: Any) -> tuple[str, ...]:
-    """Return the short texts of a list; nothing for anything else."""
+    """Return the short texts of a list; an empty tuple for anything else."""
     if not isinstance(given, list):
         return ()
     return tuple(one for one in given[:MAX_NOTES] if isinstance(one, str) and len(one) <= MAX_NOTE_LENGTH)
 
 
 def votable_tables(content: bytes, name: str, origin: str) -> list[FileTable]:
-    """Return the tables of a VOTable file."""
+    """Read the tables of a VOTable file."""
     from astropy.io import votable
 
     if b"<!ENTITY" in content or b"<!DOCTYPE" in content:
@@ -63,7 +63,7 @@ def votable_tables(content: bytes, name: str, origin: str) -> list[FileTable]:
             tables = list(votable.parse(io.BytesIO(content), verify="ignore").iter_tables())
     except Exception as error:  # the parser raises many kinds
         raise InputError(
-            f"cannot be read as a VOTable ({shortened(str(error))})", "a whole one", key="file", value=str(error)
+            f"cannot be read as a VOTable ({shortened(str(error))})", "a complete VOTable", key="file", value=str(error)
         ) from error
     return [
         FileTable(

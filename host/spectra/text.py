@@ -1,4 +1,4 @@
-"""Read the tables of text files: columns of numbers, with or without a header of names and units."""
+"""Reader of text files: columns of numbers, with or without a header of names and units."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .file_table import Column, FileTable
 from .header_units import stated_units
 from .text_header import Header, Split, names_of
 
-#: Units of a text file that states none: the paper's rule.
+#: Units of a text file without stated units (the paper's rule).
 IMPLIED_UNITS = ("nm", "erg / (s cm2 Angstrom)")
 #: Gaia DR3's sampled mean spectra: 343 fluxes at 336 + 2 i nm (documentation of gaiadr3.xp_sampled_mean_spectrum).
 GAIA_NM, GAIA_FLUX = 336.0 + 2.0 * np.arange(343), "W m-2 nm-1"
@@ -31,7 +31,7 @@ _NOT_FINITE = {"nan", "inf", "-inf"}
 
 
 def text_of(content: bytes) -> str:
-    """Return bytes as text in UTF-8 or, with a byte-order mark, UTF-16."""
+    """Decode UTF-8 or, with a byte-order mark, UTF-16."""
     # Editors on Windows start a file with a byte-order mark.
     code = "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
     try:
@@ -54,19 +54,19 @@ def text_of(content: bytes) -> str:
 def text_tables(
     text: str, name: str, origin: str, asked: Sequence[str], wavelength: bool, flux: bool
 ) -> list[FileTable]:
-    """Return the table of a text file.
+    """Read the table of a text file.
 
     Parameters
     ----------
     text, name, origin : str
     asked : sequence of str
-        Words that the user gave; for columns without names these are their numbers.
+        Words given by the user; for columns without names, their numbers.
     wavelength, flux : bool
-        Whether the units of wavelength and flux are to be found in the header.
+        Whether to search the header for the units of wavelength and flux.
     """
     header, lines = _divided(text.splitlines())
     if not lines:
-        raise InputError("holds no numbers", "two columns: wavelength and flux", key="columns")
+        raise InputError("does not contain numbers", "two columns: wavelength and flux", key="columns")
     split, messages = _splitter([line for _, line in lines])
     rows = [(number, line, split(line)) for number, line in lines]
     n = len(rows[0][2])
@@ -90,12 +90,12 @@ def _column(rows: Sequence[Row], place: int, name: str, unit: str | None = None,
 
 
 def _unnamed(rows: Sequence[Row], n: int, asked: Sequence[str], messages: list[str]) -> list[Column]:
-    """Return columns by their numbers: the first two, or those that the user names."""
+    """Return columns by number: the first two, or those selected by the user."""
     places = [int(one) - 1 for one in asked if one.isascii() and one.isdigit() and 1 <= int(one[:6]) <= n]
     if len(places) != len(asked) or len(places) > 2:
         raise InputError.of("columns", asked, f"their numbers, 1 to {n}")
     if not asked and n > 2:
-        messages.append(f"the first two of its {n} columns are taken, which have no names")
+        messages.append(f"the first two of its {n} columns are used, which have no names")
     wave, value = (0, 1) if not places else (0, places[0]) if len(places) == 1 else (places[0], places[1])
     roles = {wave: Role("wavelength", 1), value: Role("flux", 1)}
     return [_column(rows, k, str(k + 1), role=roles.get(k, Role("unknown"))) for k in range(max(n, 2))]
@@ -104,9 +104,9 @@ def _unnamed(rows: Sequence[Row], n: int, asked: Sequence[str], messages: list[s
 def _with_units_of(
     remarks: str, columns: Sequence[Column], wavelength: bool, flux: bool, is_named: bool
 ) -> list[Column]:
-    """Return columns with the units that remarks state, where their own names and units state none."""
+    """Return columns with units from remarks if their names and headers state none."""
     roles = [column.known_role for column in columns]
-    # A column of an unknown name may be the flux where none is recognised.
+    # A column with an unknown name may be the flux if none is recognised.
     fluxes = ("flux", "model") if any(role.kind in ("flux", "model") for role in roles) else ("unknown",)
     has_axis = any(role.kind in AXES and role.unit for role in roles)
     has_flux = any(role.kind in fluxes and role.unit for role in roles)
@@ -121,7 +121,7 @@ def _with_units_of(
 
 
 def _divided(lines: Sequence[str]) -> tuple[Header, list[tuple[int, str]]]:
-    """Divide a text into its header, with all remarks, and its numbered lines of data."""
+    """Divide a text into its header, including all remarks, and its numbered lines of data."""
     numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
     remarks = {number for number, line in numbered if _REMARK.match(line)}
     start = _first_of_data([(number, line) for number, line in numbered if number not in remarks])
@@ -140,12 +140,12 @@ def _divided(lines: Sequence[str]) -> tuple[Header, list[tuple[int, str]]]:
 
 
 def _first_of_data(lines: Sequence[tuple[int, str]]) -> float:
-    """Return the number of the line where the data begin: the first that starts with two numbers, else with one."""
+    """Return the number of the first line of data, which starts with two numbers or, if there is none, with one."""
     starting = [(number, line) for number, line in lines if _starts_with_number(line)]
     for number, line in starting:
         cells = re.split(r"[\s;|]+", line.strip())
         cells = line.split(",") if len(cells) == 1 else cells
-        # A line of a preamble, as "2 columns" or "912 s", has no second one.
+        # A line of a preamble, such as "2 columns" or "912 s", has no second number.
         if sum(bool(_NUMBER.match(cell)) or cell.lower() in _MISSING | _NOT_FINITE for cell in cells) > 1:
             return number
     return starting[0][0] if starting else float("inf")
@@ -157,7 +157,7 @@ def _starts_with_number(line: str) -> bool:
 
 
 def _splitter(lines: list[str]) -> tuple[Split, list[str]]:
-    """Return how lines are divided into cells, and messages; decimal commas become points."""
+    """Return a function that divides lines into cells, and messages; decimal commas become points."""
     sample = lines[:50] + lines[-5:]
     messages: list[str] = []
     commas = any("," in line for line in sample)
@@ -202,7 +202,7 @@ def _cells(line: str, mark: str | None, decimal: bool) -> list[str]:
 
 
 def _values(rows: Sequence[Row], place: int) -> Any:
-    """Return the numbers of a column."""
+    """Parse the numbers of a column."""
     return np.array([_value(row, place) for row in rows])
 
 
@@ -231,20 +231,22 @@ def number_in(cell: str) -> float:
     except ValueError:
         if cell.lower() in _MISSING:
             return float("nan")
-        # Fortran's double precision.
+        # Exponents of Fortran's double precision.
         return float(re.sub(r"(?<=[\d.])[dD](?=[+-]?\d)", "e", cell))
 
 
 def _table_of_arrays(
     names: Sequence[str], units: Sequence[str], rows: Sequence[Row], name: str, origin: str, header: Header
 ) -> FileTable:
-    """Return a table whose cells hold arrays, a spectrum to a row, as Gaia's."""
+    """Return a table whose cells contain arrays, with a spectrum per row, as in Gaia's files."""
     n = len(rows[0][2])
     if not names:
-        # Gaia's has no column of wavelengths.
+        # Gaia's files have no column of wavelengths.
         names = next((cells for line, _ in header if len(cells := line.split(",")) == n), [])
     if not names:
-        raise InputError("holds arrays in its cells and no names of columns", "names in its first line", key="columns")
+        raise InputError(
+            "contains arrays in its cells and no names of columns", "names in its first line", key="columns"
+        )
     columns = [Column(names[k].strip(), _array_reader(rows, k), units[k] if units else None) for k in range(n)]
     known = {column.name.lower(): column for column in columns}
     if "source_id" in known and "wavelength" not in known and "flux" in known:

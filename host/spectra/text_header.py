@@ -1,7 +1,7 @@
-"""Find the names of columns, and the units under them, in the header of a text file.
+"""Names and units of columns in the header of a text file.
 
-A header mixes prose with names. A line names columns if it has as many cells as the data have columns and calls one of
-them a wavelength and another something that a spectrum's table holds; "vacuum wavelengths" over two columns is prose.
+A header mixes prose with names. A line names columns if it has as many cells as the data have columns, and names a
+wavelength and another known column; "vacuum wavelengths" over two columns is prose.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from ..files.units import flux_kind, is_spectral, is_stated, unit_of
 from .column_choice import AXES, listed
 from .column_roles import divided, role_of, words_of
 
-#: Lines of a header, and whether each was a remark.
+#: Lines of a header, and whether each is a remark.
 Header = list[tuple[str, bool]]
 Split = Callable[[str], list[str]]
 
-#: Words that prose has and names of columns have not.
+#: Words that occur in prose but not in names of columns.
 _PROSE = re.compile(
     r"\b(?:and|at|is|are|the|for|with|vs|versus|from|by|on|was|were|this|that|has|have)\b", re.IGNORECASE
 )
@@ -27,7 +27,7 @@ _NUMBERED = re.compile(r"(?:col(?:umn)?s?\.?\s*)?[(\[]?(\d{1,3})[)\]]?\s*[:=.)\-
 
 
 def names_of(header: Header, n: int, split: Split) -> tuple[list[str], list[str]]:
-    """Return the names of `n` columns, and the units that stand under them; empty where there are none."""
+    """Return the names of `n` columns and the units below them; empty if there are none."""
     if numbered := _numbered(header, n):
         return numbered, []
     rows = [(k, cells) for k, (line, _) in enumerate(header) if (cells := _cells(line, n, split))]
@@ -44,7 +44,7 @@ def names_of(header: Header, n: int, split: Split) -> tuple[list[str], list[str]
 
 
 def _may_name(line: str, cells: Sequence[str]) -> bool:
-    """Return whether the only line that is no remark names columns, though not all of its names are known."""
+    """Return whether the only line that is not a remark names columns, some of them unknown."""
     is_marked = bool(re.search(r"[,;|\t]", line.strip()))
     kinds = {role_of(cell).kind for cell in cells}
     if len(cells) == 2:
@@ -53,7 +53,7 @@ def _may_name(line: str, cells: Sequence[str]) -> bool:
 
 
 def _cells(line: str, n: int, split: Split) -> list[str]:
-    """Divide a line of a header into `n` cells, or return nothing."""
+    """Divide a line of a header into `n` cells; return an empty list if it has another number."""
     if n < 2 or _PROSE.search(line):
         return []
     line = re.sub(r"^\s*(?:units?(?:\s*[:=]|\s)|(?:columns?|names?)\s*[:=])\s*", "", line, flags=re.IGNORECASE)
@@ -68,25 +68,25 @@ def _cells(line: str, n: int, split: Split) -> list[str]:
 
 
 def _bracketed(line: str) -> list[str]:
-    """Divide at blanks and commas, a unit in brackets kept with the name before it."""
+    """Divide at blanks and commas, but keep a unit in brackets with the preceding name."""
     brackets = r"[\[(](?:[^\[\]()]|\([^()]*\))*[\])]"
     return re.findall(rf"[^\s\[(,]+(?:\s+in\s+[^\s,]+|(?:\s*{brackets})+[^\s,]*)?|{brackets}", line)
 
 
 def _wide(line: str) -> list[str]:
-    """Divide at two blanks and more."""
+    """Divide at two or more blanks."""
     return re.split(r"\s{2,}", line.strip())
 
 
 def _recognised(cells: Sequence[str]) -> int:
-    """Return how many cells are names of a spectrum's columns; 0 without a wavelength and another one."""
+    """Count the cells that name a spectrum's columns; 0 without a wavelength and another column."""
     kinds = [role_of(cell).kind for cell in cells]
     is_named = any(kind in AXES and not _is_unit(cell) for cell, kind in zip(cells, kinds, strict=True))
-    # "resolution 5 nm" names no columns, "nm error flux" does.
+    # "resolution 5 nm" does not name columns; "nm error flux" does.
     others = {*kinds} - {*AXES, "unknown"} if is_named else {*kinds} & {"flux", "model", "magnitude", "counts"}
     if not others or not {*kinds} & {*AXES}:
         return 0
-    # Names count more than units, which stand under them.
+    # Names have precedence over the units below them.
     return sum(1 if _is_unit(cell) else 2 for cell, kind in zip(cells, kinds, strict=True) if kind != "unknown")
 
 
@@ -100,11 +100,11 @@ def _is_unit(cell: str) -> bool:
 
 
 def _units(header: Header, names_at: int, n: int, split: Split) -> list[str]:
-    """Return the cells of a line under the names, if they are units; IPAC has types between the two."""
+    """Return the cells of the line of units below the names, if any; IPAC tables have types in between."""
     for k, (line, _) in enumerate(header[names_at + 1 : names_at + 3]):
         cells = _cells(line, n, split)
         is_all = any(_is_unit(cell) for cell in cells) and all(_is_unit(c) or not is_stated(c) for c in cells)
-        # "A star" is no unit, and "nm banana" holds an unknown one.
+        # "A star" is not a unit, and "nm banana" contains an unknown unit.
         is_some = any(len(cell) > 1 and _is_unit(cell) for cell in cells) and not any(c.endswith(":") for c in cells)
         if is_all or (k == 0 and is_some):
             return cells
@@ -112,7 +112,7 @@ def _units(header: Header, names_at: int, n: int, split: Split) -> list[str]:
 
 
 def _numbered(header: Header, n: int) -> list[str]:
-    """Return names from lines such as "column 2: flux"; columns without such a line are called by their number."""
+    """Return names from lines such as "column 2: flux"; columns without such a line are named by number."""
     found: dict[int, str] = {}
     for line, _ in header:
         if (match := _NUMBERED.fullmatch(line.strip())) and 1 <= int(match[1]) <= n:
@@ -122,9 +122,9 @@ def _numbered(header: Header, n: int) -> list[str]:
 
 
 def _of_another_length(header: Header, n: int) -> list[str]:
-    """Return the names of a line that is shorter than the rows, for the columns from the left.
+    """Return the names of a line with fewer cells than the rows, for the columns from the left.
 
-    Raises InputError if names of another number than the columns are no remark, so that nobody knows which is which.
+    Raises InputError if a line that is not a remark has another number of names than columns.
     """
     for line, is_remark in reversed(header):
         cells = [cell.strip("\"' ") for cell in re.split(r"[,;\t|]", line)]

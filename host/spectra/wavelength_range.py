@@ -1,4 +1,4 @@
-"""The wavelengths that a star's spectrum must hold, and which unit numbers without one are likely in."""
+"""Required wavelength range of a star's spectrum, and the likely unit of wavelengths without one."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from mauvecl.schema.errors import InputError
 
 Float = NDArray[np.float64]
 
-#: What the nominal instrument reads, nm (the paper's abstract).
+#: Range of the nominal instrument, nm (the paper's abstract).
 NEEDED_NM = (200.0, 700.0)
-#: The same with the reach of the line function (the paper, section "Preparing the input spectrum").
+#: The same, extended by the reach of the line spread function (the paper, section "Preparing the input spectrum").
 SPAN_NM = (180.0, 750.0)
-#: Part of `NEEDED_NM` that a spectrum must hold; with less, nearly all of the light would be another star's.
+#: Fraction of `NEEDED_NM` that a spectrum must cover; with less, nearly all of the light would be another star's.
 MIN_MEASURED = 1 / 3
-#: Wavelengths, nm, beyond which an assumed unit is less likely than another.
+#: Range of wavelengths, nm, outside which an assumed unit is unlikely.
 PLAUSIBLE_NM = (50.0, 10_000.0)
-#: A gap between points is no measurement beyond this width, nm, and this multiple of the usual spacing.
+#: A step between points is a gap if it exceeds this width, nm, and this multiple of the usual spacing.
 GAP_NM, GAP_TIMES = 10.5, 10.0
-#: Units in which wavelengths come without one, in nm.
+#: Likely units of wavelengths without a stated unit, in nm.
 _USUAL_UNITS = {"nm": 1.0, "Angstrom": 0.1, "um": 1000.0}
 
 
 def measured_part(nm: Float) -> float:
-    """Return the part of `NEEDED_NM` that wavelengths cover, gaps left out."""
+    """Return the fraction of `NEEDED_NM` that wavelengths cover, without gaps."""
     if nm.size < 2:
         return 0.0
     inside = np.clip(nm, *NEEDED_NM)
@@ -44,17 +44,17 @@ def _part(low: float, high: float) -> float:
 
 
 def likely_unit(low: float, high: float, unit: str) -> str | None:
-    """Return the one unit other than `unit` in which numbers hold what a spectrum must, or None."""
+    """Return the only unit other than `unit` in which the numbers cover the required range, or None."""
     parts = {other: _part(low * factor, high * factor) for other, factor in _USUAL_UNITS.items() if other != unit}
     fitting = [other for other, part in parts.items() if part >= MIN_MEASURED and low > 0.0]
-    # Short ultraviolet spectra: in Angstrom they hold something, in nm they would begin in the infrared.
+    # Short ultraviolet spectra cover part of the range in Angstrom, but would start in the infrared in nm.
     if not fitting and parts.get("Angstrom", 0.0) > 0.0 and low > 900.0:
         fitting = ["Angstrom"]
     return fitting[0] if len(fitting) == 1 else None
 
 
 def check_assumed_unit(values: Float, unit: str) -> None:
-    """Raise InputError if wavelengths of an assumed unit are as likely in another."""
+    """Raise InputError if another unit of the wavelengths is as likely as the assumed one."""
     finite = values[np.isfinite(values)]
     factor = _USUAL_UNITS.get(unit)
     if not finite.size or factor is None:
@@ -87,7 +87,7 @@ def check_assumed_unit(values: Float, unit: str) -> None:
         )
     if low * factor < PLAUSIBLE_NM[0] or high * factor > PLAUSIBLE_NM[1]:
         raise InputError(
-            f"{numbers} would go beyond {PLAUSIBLE_NM[0]:g}-{PLAUSIBLE_NM[1]:g} nm in {unit}",
+            f"{numbers} would extend beyond {PLAUSIBLE_NM[0]:g}-{PLAUSIBLE_NM[1]:g} nm in {unit}",
             "their unit: `wavelength_unit` names it",
             key="wavelength_unit",
             value=unit,

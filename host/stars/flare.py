@@ -96,14 +96,14 @@ def with_flare(
 
 
 def _on_grid(wavelength_nm: Float, flux_flam: Float, spectrum: FlareSpectrum) -> tuple[Float, Float]:
-    """Return wavelengths that hold all that a flare's spectrum needs, and the star's flux there."""
+    """Return wavelengths that resolve both star and flare, and the star's flux there."""
     grid = spectrum.grid(wavelength_nm)
     return grid, flux_flam if grid is wavelength_nm else np.interp(grid, wavelength_nm, flux_flam)
 
 
 @dataclass(frozen=True)
 class AddedLight:
-    """The light that a flare of amplitude 1 adds to a star: `hot` times its spectrum less `lost` of the star."""
+    """Light that a flare of amplitude 1 adds to a star: `hot` times its spectrum less `lost` of the star."""
 
     hot: float  # multiple of the flare spectrum's flux
     lost: float  # share of the star's own light
@@ -146,7 +146,7 @@ class _Photons:
 
     star: float
     hot: float  # of the flare's spectrum
-    ratio: float | None  # flare's surface to photosphere's; None where the flare replaces nothing
+    ratio: float | None  # surface flux of flare over photosphere; None if the flare does not replace photosphere
 
 
 def _photons_in_band(
@@ -161,7 +161,7 @@ def _photons_in_band(
     star = photons(grid, quiescent, band)
     if not star > 0.0:
         raise InputError(
-            f"the star has no light in the band {band}", "some to measure the flare against", key="band", value=band
+            f"the star has no light in the band {band}", "a star with light in the band", key="band", value=band
         )
     hot = photons(grid, spectrum.flux(grid), band)
     if not hot > 0.0:

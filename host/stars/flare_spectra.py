@@ -37,13 +37,13 @@ HC_OVER_K_NM_K, STEFAN_BOLTZMANN = 1.438776877e7, 5.670374419e-5
 SUN_CM, PARSEC_CM = 6.957e10, 3.0856775814913674e18
 #: Balmer edge, nm, and electron temperature of the recombination below it, K (assumed: optically thin hydrogen).
 BALMER_EDGE_NM, ELECTRON_TEMPERATURE_K = 364.6, 10_000.0
-#: Wavelengths closer to each other than this are one, nm.
+#: Distance below which two wavelengths count as equal, nm.
 SAME_NM = 1e-6
 #: Steps across the Balmer edge are this wide, nm.
 EDGE_WIDTH_NM = 1e-3
 #: Full width at half maximum of the triangular profile of a line, nm: far below the resolution, 10.5 nm.
 LINE_WIDTH_NM = 0.1
-#: The range whose continuum a relative line flux is a fraction of, nm.
+#: Range of the continuum to which relative line fluxes refer, nm.
 LINE_RANGE_NM = (200.0, 700.0)
 #: Points of the integral over that range.
 RANGE_POINTS = 5001
@@ -74,18 +74,18 @@ JOIN_NM, GAP_NM = 20.0, 5.0
 
 @validated
 class FlareSpectrum:
-    """The light of a flare against wavelength, up to a factor.
+    """Spectrum of a flare, up to a factor.
 
     Attributes
     ----------
     temperature_k : float, optional
-        Of the hottest blackbody of the flare; None for an observed flare.
+        Temperature of the hottest blackbody of the flare; None for an observed flare.
     nodes_nm : ndarray, shape (n,)
-        Wavelengths that a grid must hold so that straight lines between its points conserve the flux.
+        Wavelengths that a grid must contain so that linear interpolation conserves the flux.
     surface : bool
-        Whether `flux` is that of the flare's surface, so that an area follows from it.
+        Whether `flux` is that of the flare's surface, from which an area follows.
     fixed_lines : bool
-        Whether some lines have a flux of their own at the telescope, whatever the amplitude.
+        Whether some lines have a fixed flux at the telescope, independent of the amplitude.
     messages : tuple of str
         Assumptions that every answer must report.
     """
@@ -97,7 +97,7 @@ class FlareSpectrum:
     messages: tuple[str, ...] = ()
 
     def flux(self, wavelength_nm: Float) -> Float:
-        """Return the flux, erg s-1 cm-2 A-1, shape (n,): of the flare's surface, or of an observed flare as seen."""
+        """Return the flux, erg s-1 cm-2 A-1, shape (n,), at the flare's surface or as observed."""
         raise NotImplementedError
 
     def bolometric_flux(self) -> float:
@@ -109,10 +109,10 @@ class FlareSpectrum:
         return np.zeros(np.shape(wavelength_nm))
 
     def grid(self, wavelength_nm: Float) -> Float:
-        """Return wavelengths with those that the spectrum needs in between, nm."""
+        """Return wavelengths supplemented by the nodes of the spectrum, nm."""
         nodes = self.nodes_nm
         inside = nodes[(nodes > wavelength_nm[0]) & (nodes < wavelength_nm[-1])]
-        # A node next to one of the wavelengths adds nothing but rounding.
+        # A node next to a wavelength would only add rounding errors.
         after = np.searchsorted(wavelength_nm, inside)
         alone = np.minimum(wavelength_nm[after] - inside, inside - wavelength_nm[after - 1]) > SAME_NM
         return np.union1d(wavelength_nm, inside[alone]) if alone.any() else wavelength_nm
@@ -125,7 +125,7 @@ class FlareSpectrum:
 @validated
 @dataclass(frozen=True)
 class Blackbody(FlareSpectrum):
-    """A flare that shines as one blackbody."""
+    """Flare with the spectrum of a blackbody."""
 
     temperature_k: Temperature = 10_000.0
 
@@ -145,7 +145,7 @@ class Blackbody(FlareSpectrum):
 @validated
 @dataclass(frozen=True)
 class TwoBlackbodies(FlareSpectrum):
-    """A flare of two temperatures.
+    """Flare of two temperatures.
 
     Attributes
     ----------
@@ -159,7 +159,7 @@ class TwoBlackbodies(FlareSpectrum):
     second_area: AreaRatio = 0.05
 
     def flux(self, wavelength_nm: Wavelengths) -> Float:
-        """Return the surface flux of the first blackbody and its share of the second, erg s-1 cm-2 A-1."""
+        """Return the surface flux of the first blackbody plus `second_area` times that of the second."""
         second = blackbody(wavelength_nm, self.second_temperature_k)
         return np.asarray(blackbody(wavelength_nm, self.temperature_k) + self.second_area * second)
 
@@ -175,13 +175,13 @@ class TwoBlackbodies(FlareSpectrum):
 @validated
 @dataclass(frozen=True)
 class BalmerFlare(FlareSpectrum):
-    """A blackbody with a Balmer continuum of optically thin hydrogen below 364.6 nm.
+    """Blackbody with a Balmer continuum of optically thin hydrogen below 364.6 nm.
 
     Attributes
     ----------
     temperature_k : float
     jump : float
-        Flux just below the Balmer edge over that just above; 1 is no jump.
+        Ratio of the flux just below the Balmer edge to that just above; 1 means no jump.
     electron_temperature_k : float
     """
 
@@ -224,13 +224,13 @@ def balmer_continuum(wavelength_nm: Float, electron_temperature_k: float = ELECT
 
 @dataclass(frozen=True)
 class EmissionLine:
-    """An unresolved emission line, or several that share one flux equally.
+    """Unresolved emission line, or several lines that share a flux equally.
 
     Attributes
     ----------
     name : str
     wavelengths_nm : tuple of float
-        Vacuum.
+        Vacuum wavelengths.
     """
 
     name: str
@@ -238,7 +238,7 @@ class EmissionLine:
 
     @classmethod
     def named(cls, name: str) -> Self:
-        """Return a line or group of lines by name, or one at a wavelength in nm.
+        """Return a line or group of lines by name, or a line at a wavelength in nm.
 
         Raises
         ------
@@ -271,7 +271,7 @@ class EmissionLine:
 @validated
 @dataclass(frozen=True)
 class FlareWithLines(FlareSpectrum):
-    """A continuum with emission lines.
+    """Continuum with emission lines.
 
     Attributes
     ----------
@@ -279,7 +279,7 @@ class FlareWithLines(FlareSpectrum):
     fractions : mapping of str to float
         Flux of each line as a fraction of the continuum's in 200-700 nm.
     fluxes_cgs : mapping of str to float
-        Flux of each line at the telescope, erg s-1 cm-2, whatever the amplitude of the flare.
+        Flux of each line at the telescope, erg s-1 cm-2, independent of the flare's amplitude.
     """
 
     continuum: FlareSpectrum

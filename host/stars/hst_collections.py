@@ -128,7 +128,7 @@ def fetch(
         )
     star = star if colon else word
     if not _file_name(star):
-        raise InputError(f"star {name!r} has no name to look for", "one such as ngsl:HD 37202", key="name", value=name)
+        raise InputError(f"star {name!r} has an empty name", "a name such as ngsl:HD 37202", key="name", value=name)
     for collection in chosen:
         address = base or collection.base
         try:
@@ -145,7 +145,7 @@ def fetch(
             return add(local, star, origin=title, replace=replace, extend=extend)
         except InputError as error:
             raise InputError(
-                f"{url} came, and is no usable spectrum ({str(error).replace(local.name, file)})",
+                f"{url} was downloaded but is not a usable spectrum ({str(error).replace(local.name, file)})",
                 "a whole file",
                 key="base",
                 value=url,
@@ -230,7 +230,7 @@ def _receive(url: str, file: IO[bytes], max_bytes: int, show_progress: bool) -> 
                     size = got
                 if time.monotonic() > latest:
                     raise InputError(
-                        f"{url} takes more than {MAX_DOWNLOAD_S:.0f} s to come",
+                        f"the download of {url} takes more than {MAX_DOWNLOAD_S:.0f} s",
                         "less: try again later",
                         key="base",
                         value=url,
@@ -244,7 +244,10 @@ def _receive(url: str, file: IO[bytes], max_bytes: int, show_progress: bool) -> 
         )
     if size is not None and got < size:
         raise InputError(
-            f"{url} broke off ({got} of {size} bytes came)", "the whole file: try again", key="base", value=url
+            f"the download of {url} ended early ({got} of {size} bytes received)",
+            "the whole file: try again",
+            key="base",
+            value=url,
         )
 
 

@@ -87,8 +87,8 @@ def spectrum(star: OwnStar) -> tuple[np.ndarray, np.ndarray]:
     wavelength, flux = (np.asarray(table[name], float) for name in ("wavelength", "flux"))
     if _digest(wavelength, flux) != table.meta["spectrum_sha256"]:
         raise InputError(
-            f"kept star {star.name!r} is not as it was kept (its digest differs)",
-            "it unchanged: add or fetch it again",
+            f"kept star {star.name!r} was changed after it was kept (its digest differs)",
+            "the unchanged file: add or fetch it again",
             key="name",
             value=star.name,
         )
@@ -192,7 +192,7 @@ def remove(name: str) -> None:
         if path.stem.casefold() == re.sub(r"[^a-z0-9.+-]", "_", wanted) or _named(path) == wanted:
             path.unlink()
             return
-    names = ", ".join(star.name for star in kept()) or "none is kept"
+    names = ", ".join(star.name for star in kept()) or "no star is kept"
     raise InputError.of("name", name, f"one of: {names}")
 
 

@@ -166,7 +166,7 @@ class Source(Drawable, ContentEquality):
         path : str or Path
             May end in a column, ``grid.fits[g45]``; see `formats.read_spectrum`.
         wavelength_unit, flux_unit : str or Unit, optional
-            Override what the file states; a wavelength's may end in " air" or " vacuum".
+            Units that override those of the file; a unit of wavelength may end in " air" or " vacuum".
         extend : str or Source, optional
             Library spectrum that continues the file's beyond its end, scaled to match at the join.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 
-#: Sources by system and machine, as Python's `platform` spells them; "" stands for every other machine.
+#: Sources by system and machine, as Python's `platform` spells them; "" is any other machine.
 SOURCES = {
     ("Linux", "x86_64"): (
         "`pip install 'pyopencl[pocl]'` (PoCL, for processors)",

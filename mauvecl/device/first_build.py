@@ -74,7 +74,7 @@ class Outcome:
         return not any(why for _, why in self.tried) or 0 <= time.time() - self.time_s < OUTCOME_LIFETIME_S
 
 
-def settle(device: Any, others: Callable[[], Sequence[Any]]) -> str | None:
+def choose_processor_level(device: Any, others: Callable[[], Sequence[Any]]) -> str | None:
     """Set the highest processor level at which the driver works, and return its name.
 
     Parameters
@@ -103,7 +103,7 @@ def settle(device: Any, others: Callable[[], Sequence[Any]]) -> str | None:
                     raise DeviceError(_failure_message(device, outcome))
                 name = outcome.tried[-1][0]
                 if name is not None:
-                    processor.give_name(device, name)
+                    processor.set_processor_name(device, name)
                 _settled[place] = name
     return _settled[place]
 
@@ -279,7 +279,7 @@ def _build(request: dict[str, Any]) -> str:
     if record.label != request["label"]:
         return f"device {request['number']} is {record.label} in a new process, expected {request['label']}"
     name = request["name"]
-    if name is not None and not processor.give_name(handle, name):
+    if name is not None and not processor.set_processor_name(handle, name):
         return "PoCL's record of the device is not understood"
     _settled[int(handle.int_ptr)] = name
     engine, quiet, flare = Engine(str(request["number"])), toy(), toy(flare=0.3)

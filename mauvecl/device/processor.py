@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 #: Processor names, lowest first, and the instructions that each adds, as /proc/cpuinfo spells them. "sandybridge"
-#: stands for processors with AVX but without AVX2: PoCL has a library for them, the psABI has no level.
+#: denotes processors with AVX but without AVX2, for which PoCL has a library but the psABI has no level.
 LEVELS = {
     "x86-64": (),
     "x86-64-v2": ("cx16", "lahf_lm", "popcnt", "sse4_1", "sse4_2", "ssse3"),
@@ -71,12 +71,12 @@ def target(device: Any) -> tuple[str, str] | None:
 
 def names(device: Any) -> tuple[str | None, ...]:
     """Return the names to compile for, best first; ``(None,)`` leaves the choice to PoCL."""
-    return levels(flags()) if flags() and _place(device) is not None else (None,)
+    return levels(flags()) if flags() and _name_address(device) is not None else (None,)
 
 
-def give_name(device: Any, name: str) -> bool:
+def set_processor_name(device: Any, name: str) -> bool:
     """Make PoCL compile for a processor name known to LLVM; return False if the record's layout is unknown."""
-    place = _place(device)
+    place = _name_address(device)
     if place is None:
         return False
     text = _names.setdefault(name, ctypes.create_string_buffer(name.encode()))
@@ -84,7 +84,7 @@ def give_name(device: Any, name: str) -> bool:
     return True
 
 
-def _place(device: Any) -> int | None:
+def _name_address(device: Any) -> int | None:
     """Return the address of the pointer to the processor's name in PoCL's record, or None if it is not found."""
     found = target(device)
     if found is None:

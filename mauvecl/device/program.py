@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from mauvecl.device import vendors
 from mauvecl.device.drivers import driver_sources
 from mauvecl.device.errors import BuildError, DeviceError
-from mauvecl.device.first_build import settle
+from mauvecl.device.first_build import choose_processor_level
 from mauvecl.device.kernel_cache import kernel_cache
 from mauvecl.host.version import VERSION
 from mauvecl.noise import layout
@@ -264,7 +264,13 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
     kept = kernel_cache()
     # The key contains the processor level, since machines with the same device name, such as "AMD EPYC", may share the
     # store, and the installation, since PoCL compiles a program of another installation again at every start.
-    target = (device.name, device.version, device.driver_version, str(settle(device, _devices)), sys.prefix)
+    target = (
+        device.name,
+        device.version,
+        device.driver_version,
+        str(choose_processor_level(device, _devices)),
+        sys.prefix,
+    )
     key = hashlib.sha256("\0".join((source, *options, *target)).encode()).hexdigest()[:32]
     restored = kept.restore(key)
     try:

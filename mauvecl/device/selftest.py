@@ -151,9 +151,9 @@ def digests(engine: Engine, name: str) -> dict[str, str]:
     seen = engine.snr(quiet, realisations=COUNT, **place, **_drawing(how))
     values, fast = (
         engine.statistic_values(quiet, [flare], count=COUNT, statistics=names, **place, **how)
-        for names in (_asked(how), _asked(how, FAST))
+        for names in (_statistics_of(how), _statistics_of(how, FAST))
     )
-    detection = engine.detect(quiet, [flare], realisations=COUNT, statistics=_asked(how, FAST), **place, **how)
+    detection = engine.detect(quiet, [flare], realisations=COUNT, statistics=_statistics_of(how, FAST), **place, **how)
     null = detection.distribution("chi2")
     return {
         "raw": _digest(raw.astype(np.int64), clipped),
@@ -168,8 +168,8 @@ def reference_digests(name: str) -> dict[str, str]:
     """Return the digests that the NumPy reference gives for a case."""
     options, how = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
-    scene, index = prepare([quiet], **_laid_out(how)), np.arange(START, START + COUNT, dtype=np.uint64)
-    both = prepare([quiet, flare], **_laid_out(how))
+    scene, index = prepare([quiet], **_scene_options(how)), np.arange(START, START + COUNT, dtype=np.uint64)
+    both = prepare([quiet, flare], **_scene_options(how))
     raw = reference.realise(scene, index, SEED)
     clipped = reference.clipped(scene, index, SEED)
     seen = numpy_kernels.histograms(scene, observers(quiet, scene), elements(quiet), index, SEED)
@@ -193,11 +193,11 @@ def _statistics(name: str, scene: Scene) -> tuple[NDArray[np.float32], ChannelPl
     options, how = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
     unknown = as_nuisances(how.get("nuisances"), quiet)
-    hypotheses = Hypotheses(quiet, (flare,), _asked(how), scene, nuisances=unknown)
+    hypotheses = Hypotheses(quiet, (flare,), _statistics_of(how), scene, nuisances=unknown)
     plan = plan_channels(hypotheses, range(1), first=True)
     index = np.arange(START, START + COUNT, dtype=np.uint64)
     smoothed = numpy_kernels.Smoothed.of(hypotheses, plan) if len(plan.scales) else None
-    paired = "chi2_pair" in _asked(how)
+    paired = "chi2_pair" in _statistics_of(how)
     sums = numpy_kernels.statistics(scene, index, SEED, plan, pair=paired, smoothed=smoothed)
     return numpy_kernels.marginalise(sums, plan.subtractions), plan
 
@@ -207,12 +207,12 @@ def _drawing(how: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in how.items() if key not in ("comparison", "nuisances")}
 
 
-def _laid_out(how: dict[str, Any]) -> dict[str, Any]:
+def _scene_options(how: dict[str, Any]) -> dict[str, Any]:
     """Return the options that `prepare` accepts."""
     return {key: value for key, value in how.items() if key != "nuisances"}
 
 
-def _asked(how: dict[str, Any], names: tuple[str, ...] = tuple(STATISTICS)) -> tuple[str, ...]:
+def _statistics_of(how: dict[str, Any], names: tuple[str, ...] = tuple(STATISTICS)) -> tuple[str, ...]:
     """Return the statistics of a case; if it marginalises, only those that support this."""
     return tuple(n for n in names if STATISTICS[n].marginal) if "nuisances" in how else names
 
@@ -254,11 +254,11 @@ def check_against_reference(engine: Engine) -> Iterator[Check]:
         elif engine.device.promise == SAME_BITS:
             passed, text = False, f"{', '.join(differ)} differ from the reference's"
         else:
-            passed, text = _nearly(engine, name)
+            passed, text = _check_weaker_promise(engine, name)
         yield Check(f"same bits as the NumPy reference: {name}", passed, text)
 
 
-def _nearly(engine: Engine, name: str) -> tuple[bool, str]:
+def _check_weaker_promise(engine: Engine, name: str) -> tuple[bool, str]:
     """Check the weaker promise of devices without strict arithmetic.
 
     Fewer than 1 % of the counts differ from the reference's, by 1 DN, and statistics by less than 0.2 of their standard
@@ -268,10 +268,12 @@ def _nearly(engine: Engine, name: str) -> tuple[bool, str]:
     quiet, flare = toy(**options), toy(flare=0.3, **options)
     index = np.arange(START, START + COUNT, dtype=np.uint64)
     raw = engine.realise(quiet, start=START, count=COUNT, seed=SEED, **_drawing(how)).astype(np.int64)
-    off = np.abs(raw - reference.realise(prepare([quiet], **_laid_out(how)), index, SEED))
+    off = np.abs(raw - reference.realise(prepare([quiet], **_scene_options(how)), index, SEED))
     share = float(np.mean(off > 0))
-    ours = engine.statistic_values(quiet, [flare], start=START, count=COUNT, seed=SEED, statistics=_asked(how), **how)
-    slow = _statistics(name, prepare([quiet, flare], **_laid_out(how)))[0]
+    ours = engine.statistic_values(
+        quiet, [flare], start=START, count=COUNT, seed=SEED, statistics=_statistics_of(how), **how
+    )
+    slow = _statistics(name, prepare([quiet, flare], **_scene_options(how)))[0]
     apart = float(np.max(np.abs(ours - slow).max(axis=1) / np.maximum(slow.std(axis=1), 1e-3)))
     return (
         bool(off.max() <= 1 and share < 1e-2 and apart < 0.2),

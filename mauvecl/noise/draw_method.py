@@ -58,7 +58,7 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: F
     if modulations and not joint:
         raise InputError(
             f"{modulations[0][0]} varies within a run, and the noise of {quiet.name} cannot be drawn jointly",
-            "Gaussian noise of 1.5 Poisson counts and more in each pixel, more where counts are few, or none such",
+            "Gaussian noise of at least 1.5 Poisson counts in each pixel and more for few counts, or no such process",
             key=modulations[0][0],
         )
     return DrawMethod(

@@ -1,1 +1,1 @@
-"""Pictures with matplotlib (the extra ``plot``): of answers, of plans, of what goes in. Nothing is computed here."""
+"""Pictures of answers, plans and inputs with matplotlib (the extra ``plot``), which compute nothing."""

@@ -87,7 +87,7 @@ def zodiacal(plt: Any, source: Source, sky: Sky, instrument: Instrument) -> Any:
 def convolved(plt: Any, source: Source, instrument: Instrument) -> Any:
     """Plot a spectrum and its convolution with the line spread function, as the paper's figure.
 
-    Light alone is shown: the line function acts on what the optics and the detector would see all of.
+    The efficiencies of optics and detector are not applied.
     """
     from mauvecl.host.response import electrons_per_second
 

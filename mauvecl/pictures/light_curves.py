@@ -65,7 +65,7 @@ def compare_light_curves(plt: Any, answers: Sequence[tuple[str, StareAnswer]], b
     Parameters
     ----------
     answers : sequence of (str, StareAnswer)
-        With the title of each.
+        Title and answer of each column.
     band : int
         Number of the band, 0 the whole range.
     """

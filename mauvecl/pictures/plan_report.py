@@ -206,11 +206,11 @@ def _target(plt: Any, answer: PlanAnswer, k: int) -> Any:
     figure.text(1 - margin, 0.96, heading(answer), fontsize=8, va="top", ha="right", color=NULL)
     y = 0.925
     for name, value, where in target_lines(answer, k):
-        told = textwrap.wrap(value, 48) or [""]
+        lines = textwrap.wrap(value, 48) or [""]
         figure.text(margin, y, name, fontsize=8, va="top")
-        figure.text(0.33, y, "\n".join(told), fontsize=8, va="top", parse_math=False)
+        figure.text(0.33, y, "\n".join(lines), fontsize=8, va="top", parse_math=False)
         figure.text(1 - margin, y, where, fontsize=6.5, va="top", ha="right", color=NULL)
-        y -= 0.018 * len(told)
+        y -= 0.018 * len(lines)
     if answer.planned[k].seen_h > 0:
         _panels(pictures, answer, k)
     return figure

@@ -241,7 +241,7 @@ def gaussian(plt: Any, answer: GaussianAnswer) -> Any:
         axis.grid(axis="y", linewidth=0.3)
     axes[0].set_yticks(rows, [full_label(s.label, s.at) for s in answer.signal.stars])
     axes[0].invert_yaxis()
-    headline(figure, "The root-of-N formula beside the simulation; grey: as promised; nominal throughput")
+    headline(figure, "The root-of-N formula and the simulation; grey: as promised; nominal throughput")
     return figure
 
 

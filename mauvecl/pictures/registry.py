@@ -67,7 +67,7 @@ def picture_of(kind: str, name: str, **how: Any) -> Callable[[F], F]:
     name : str
         Name of the picture's file without its ending.
     **how
-        `given`, `each` and `when` as `Entry` has them.
+        `given`, `each` and `when`; see `Entry`.
     """
     return _registers(PICTURES, kind, name, how)
 

@@ -110,12 +110,12 @@ class Within:
         Raises
         ------
         InputError
-            If they are not of a grid.
+            If the axes are not part of a grid.
         """
         spec = self._ax.get_subplotspec()
         if spec is None:
             raise InputError(
-                "ax is not of a grid", "axes as plt.subplots makes, for a picture of several panels", key="ax"
+                "ax is not part of a grid", "axes from plt.subplots, for a picture of several panels", key="ax"
             )
         self._ax.set_axis_off()
         return self._ax.figure.add_subfigure(spec)

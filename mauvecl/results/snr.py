@@ -147,7 +147,7 @@ class Counts:
         if outside.size:
             self.far[kind].count(which * (2 * MAX_BIN) + MAX_BIN + outside)
 
-    def spread_out(self, kind: str) -> NDArray[np.int64]:
+    def outlying(self, kind: str) -> NDArray[np.int64]:
         """Return the pixels or elements with values outside the dense bins."""
         return np.unique(self.far[kind].keys // (2 * MAX_BIN))
 
@@ -248,12 +248,12 @@ class SnrResult(Drawable, ContentEquality):
         mean = np.sum(share * centres, axis=1)
         std = np.sqrt(np.sum(share * (centres - mean[:, None]) ** 2, axis=1))
         cumulative = np.concatenate([np.zeros((len(counts), 1)), np.cumsum(counts, axis=1)], axis=1) / self.counts.n
-        spread_out = self.counts.spread_out(kind)
+        outlying = self.counts.outlying(kind)
         quantiles = np.array([
-            np.zeros(len(PERCENTAGES)) if i in spread_out else _quantiles(c, e)
+            np.zeros(len(PERCENTAGES)) if i in outlying else _quantiles(c, e)
             for i, (c, e) in enumerate(zip(cumulative, edges, strict=True))
         ])  # fmt: skip
-        for i in spread_out:
+        for i in outlying:
             filled, held = self.counts.filled(kind, i)
             middle = snr(i, filled + 0.5)
             mean[i] = held @ middle / self.counts.n

@@ -44,7 +44,7 @@ DIGEST_BYTES = 32
 
 
 class Question(Protocol):
-    """What a checkpoint needs of a study."""
+    """Interface of a study for checkpoints."""
 
     def toml(self) -> str:
         """Return the study as TOML."""
@@ -133,7 +133,7 @@ class Checkpoint:
         if not self._resume:
             raise InputError(
                 f"{str(self.folder)!r} holds an unfinished run",
-                "`resume=True` to continue it or `restart=True` to forget it",
+                "`resume=True` to continue it or `restart=True` to discard it",
                 key="resume",
                 value=str(self.folder),
             )
@@ -153,8 +153,8 @@ class Checkpoint:
             return
         if form != FORM:
             raise InputError(
-                f"the unfinished run in {str(self.folder)!r} keeps its counts in form {form}",
-                f"form {FORM} as this version writes: `restart=True` to forget it",
+                f"the unfinished run in {str(self.folder)!r} has counts in the format {form}",
+                f"format {FORM} of this version: `restart=True` to discard it",
                 key="restart",
                 value=form,
             )
@@ -163,7 +163,7 @@ class Checkpoint:
         if differing:
             raise InputError(
                 f"the unfinished run in {str(self.folder)!r} differs in {', '.join(differing)}",
-                "the same study, or `restart=True` to forget it",
+                "the same study, or `restart=True` to discard it",
                 key="restart",
                 value=differing,
             )
@@ -253,14 +253,14 @@ class Checkpoint:
 
 
 def kept(checkpoint: Checkpoint | None, question: object, compute: Callable[[], Arrays]) -> Arrays:
-    """Return the arrays of a computation, from the checkpoint where an earlier run has finished it.
+    """Return the arrays of a computation, from the checkpoint if an earlier run has finished it.
 
     Parameters
     ----------
     checkpoint : Checkpoint, optional
-        Without one, everything is computed.
+        If omitted, the arrays are computed.
     question : object
-        Everything that the answer depends on, as `fingerprint` takes it.
+        Everything on which the result depends, as for `fingerprint`.
     compute : callable
     """
     if checkpoint is None:

@@ -67,13 +67,13 @@ class DaskWorkers:
             import distributed
         except ImportError as error:
             raise InputError(
-                "Dask is missing", "it for Dask workers: pip install 'mauvecl[cluster]'", key="dask"
+                "Dask is missing", "the package for Dask workers: pip install 'mauvecl[cluster]'", key="dask"
             ) from error
         self._where, self._device, self.retries = where, device, 0
         self._lock = threading.Lock()
         self._closing = False
         self._given: dict[str, DaskFuture[Any]] = {}
-        # Who waits for what was sent out.
+        # Futures of submitted tasks.
         self._sent: dict[DaskFuture[Any], Future[Arrays]] = {}
         self._open = contextlib.ExitStack()
         try:
@@ -160,8 +160,8 @@ class DaskWorkers:
             error = sent.exception() if sent.status == "error" else None
             known = isinstance(error, InputError | DeviceError)
             if known or tried == MAX_TRIES:
-                told = error if known else f"{error or 'the scheduler is gone'}"
-                awaited.set_exception(DeviceError(f"cluster {self._where} failed at {task.shard}: {told}"))
+                reason = error if known else f"{error or 'the scheduler is gone'}"
+                awaited.set_exception(DeviceError(f"cluster {self._where} failed at {task.shard}: {reason}"))
             elif sent.status in ("cancelled", "lost") and self._client.status != "running":
                 awaited.set_exception(self._gone())
             else:
@@ -280,7 +280,9 @@ def _private(distributed: Any) -> Any:
         return distributed.Security.temporary()
     except ImportError as error:
         raise InputError(
-            "cryptography is missing", "it for workers on local:N: pip install 'mauvecl[cluster]'", key="cryptography"
+            "cryptography is missing",
+            "the package for workers on local:N: pip install 'mauvecl[cluster]'",
+            key="cryptography",
         ) from error
 
 

@@ -51,8 +51,8 @@ class UvExcess(LinearStatistic):
         super().check(setting)
         if not self._inside(setting).any():
             raise InputError(
-                f"no pixel of {setting.quiet.name} that counts lies at {UV_NM[0]:g}-{UV_NM[1]:g} nm",
-                "some for the statistic 'uv_excess'",
+                f"{setting.quiet.name} has no used pixel at {UV_NM[0]:g}-{UV_NM[1]:g} nm",
+                "used pixels there for the statistic 'uv_excess'",
                 key="statistic",
                 value="uv_excess",
             )
@@ -81,7 +81,7 @@ class Linear(ContentEquality, LinearStatistic):
     name: str
     weights: NDArray[np.float64]
 
-    definition: ClassVar[str] = "a weighted sum of one's own"
+    definition: ClassVar[str] = "user-defined weighted sum"
     label: ClassVar[str] = ""
     normalised: ClassVar[bool] = False
 
@@ -91,7 +91,7 @@ class Linear(ContentEquality, LinearStatistic):
         if weights.ndim != 1 or not np.isfinite(weights).all() or not weights.any():
             bad = int((~np.isfinite(weights)).sum())
             raise InputError(
-                f"statistic {self.name!r} has weights of the shape {weights.shape}, {bad} of them no numbers",
+                f"statistic {self.name!r} has weights of the shape {weights.shape}, {bad} of them not finite",
                 "one finite value per pixel, not all zero",
                 key="weights",
                 value=weights.shape,
@@ -107,7 +107,9 @@ class Linear(ContentEquality, LinearStatistic):
                 value=self.weights.size,
             )
         if not (self.weights * setting.used).any():
-            raise InputError(f"statistic {self.name!r} weighs only saturated pixels", "others", key="weights")
+            raise InputError(
+                f"statistic {self.name!r} weights only saturated pixels", "weights of other pixels", key="weights"
+            )
 
     def plain_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
         return np.asarray(self.weights * setting.used)

@@ -103,7 +103,10 @@ class Nuisances(ContentEquality):
                 spectrum = spectrum_of(name, quiet)
             if not spectrum.any():
                 raise InputError(
-                    f"the unknown {name!r} changes no pixel of {quiet.name}", "one that does", key="own", value=name
+                    f"the unknown {name!r} changes no pixel of {quiet.name}",
+                    "a spectrum that changes pixels",
+                    key="own",
+                    value=name,
                 )
             spectra.append(spectrum)
         shape = len(spectra), quiet.wavelength_nm.size
@@ -154,7 +157,7 @@ class Nuisances(ContentEquality):
         eigenvalues = np.linalg.eigvalsh(information / np.outer(scale, scale))
         if eigenvalues[0] < 1e-10:
             raise InputError(
-                f"the unknowns {', '.join(self.names)} cannot be told apart in these pixels",
+                f"the unknowns {', '.join(self.names)} cannot be distinguished in these pixels",
                 "fewer of them or standard deviations instead of 'free'",
                 key="nuisances",
                 value=self.names,

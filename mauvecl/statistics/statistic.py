@@ -141,7 +141,7 @@ class Statistic(ABC):
         """
         delta = np.where(setting.used, observed.recorded_light_dn - setting.quiet.recorded_light_dn, 0.0)
         true = observed.variance_dn2 + self.added_variance(setting) * setting.quiet.variance_dn2
-        return self.as_drawn(setting, observed, Differences(delta, true, setting.comparison.estimated), flare)
+        return self.integrate_drawn(setting, observed, Differences(delta, true, setting.comparison.estimated), flare)
 
     def detection_forms(self, setting: Setting, flare: Expectation, fap: float) -> DetectionForms:
         """Return the closed forms without and with a flare, and the threshold at a false-alarm probability."""
@@ -157,7 +157,7 @@ class Statistic(ABC):
             null, threshold = setting.cached(f"null of {self.name} at {fap!r}", null_and_threshold)
         return DetectionForms(null, self.closed_form(setting, flare, template), threshold)
 
-    def as_drawn(
+    def integrate_drawn(
         self,
         setting: Setting,
         observed: Expectation,
@@ -240,7 +240,7 @@ class LinearStatistic(Statistic):
         power = float(left @ sought)
         if power <= 1e-10 * float(weights @ sought):
             raise InputError(
-                f"statistic {self.name!r} looks for what cannot be told from {join_names(setting.nuisances.names)}",
+                f"statistic {self.name!r} cannot be distinguished from {join_names(setting.nuisances.names)}",
                 "fewer unknowns or smaller standard deviations",
                 key="statistic",
                 value=self.name,

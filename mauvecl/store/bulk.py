@@ -318,12 +318,12 @@ def verify(
     Raises
     ------
     InputError
-        If the folder is no store, is being written, or cannot be written for a repair; if copies of its study
+        If the folder is not a store, is being written, or cannot be written for a repair; if copies of its study
         contradict each other, or the study does not draw what was written; or if more than `MAX_MISSING` chunks are
         missing.
     """
     if engine is None and (repair or redraw):
-        raise InputError("no engine is given", "one to repair or redraw", key="engine")
+        raise InputError("no engine is given", "an engine to repair or redraw", key="engine")
     Store.open(path)
     with locked(Path(path), "store"):
         store = Store.open(path)
@@ -334,7 +334,7 @@ def verify(
         total, there = store.count(first, last), sum(store.owns(key) for key, _ in files)
         if total - there > MAX_MISSING:
             raise InputError(
-                f"store {str(store.path)!r} holds {there} chunks where its study asks for {total}",
+                f"store {str(store.path)!r} holds {there} chunks of the {total} of its study",
                 f"at most {MAX_MISSING} missing: choose `rows`, or `mauvecl realise --resume` draws them",
                 key="rows",
                 value=(there, total),

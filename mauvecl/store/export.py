@@ -73,7 +73,7 @@ class Selection:
             if any(chunk.scene is s for s in chosen) and not store.has(chunk):
                 raise InputError(
                     f"{chunk.key} is missing",
-                    "a whole store: `mauvecl realise --resume` draws it",
+                    "a complete store: `mauvecl realise --resume` completes it",
                     key="store",
                     value=chunk.key,
                 )
@@ -219,7 +219,7 @@ def _hdf5(selection: Selection, place: io.BytesIO) -> None:
     try:
         import h5py
     except ImportError as error:
-        raise InputError("h5py is missing", "it for HDF5: pip install 'mauvecl[bulk]'", key="h5py") from error
+        raise InputError("h5py is missing", "the package for HDF5: pip install 'mauvecl[bulk]'", key="h5py") from error
 
     store = selection.store
     with h5py.File(place, "w") as file:

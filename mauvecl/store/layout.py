@@ -124,7 +124,9 @@ class Store:
     def __post_init__(self) -> None:
         missing = [name for name in ("zarr", "xxhash", "google_crc32c") if find_spec(name) is None]
         if missing:
-            raise InputError(f"{missing[0]} is missing", "it for stores: pip install 'mauvecl[bulk]'", key=missing[0])
+            raise InputError(
+                f"{missing[0]} is missing", "the packages for stores: pip install 'mauvecl[bulk]'", key=missing[0]
+            )
 
     @classmethod
     def open(cls, path: str | Path) -> Store:
@@ -133,7 +135,7 @@ class Store:
         Raises
         ------
         InputError
-            If the folder is no store, no copy of its study is intact, or intact copies contradict each other.
+            If the folder is not a store, no copy of its study is intact, or intact copies contradict each other.
         """
         path = Path(path)
         copies: dict[str, Path] = {}
@@ -143,7 +145,7 @@ class Store:
                 copies.setdefault(text, place.relative_to(path))
         if not copies:
             raise InputError(
-                f"{str(path)!r} is no store of spectra",
+                f"{str(path)!r} is not a store of spectra",
                 "a folder that `mauvecl realise` wrote, with an intact copy of its study",
                 key="store",
                 value=str(path),
@@ -154,7 +156,7 @@ class Store:
             keys = ", ".join(differing_keys(toml(text, path.name), toml(other, path.name)))
             raise InputError(
                 f"store {str(path)!r} holds two studies, {str(first)!r} and {str(second)!r} differ in {keys}",
-                "one study: put the right one's file back",
+                "one study: restore the file of the correct one",
                 key="store",
                 value=keys,
             )
@@ -259,7 +261,7 @@ class Store:
         differing = differing_keys(self.study.model_dump(mode="json"), there.model_dump(mode="json"))
         if differing:
             raise InputError(
-                f"store {str(self.path)!r} was begun by another study, which differs in {', '.join(differing)}",
+                f"store {str(self.path)!r} was started by another study, which differs in {', '.join(differing)}",
                 "the same study or another place",
                 key="store",
                 value=differing,
@@ -350,8 +352,8 @@ class Store:
         other = [key for key, own in files if not own]
         if other:
             raise InputError(
-                f"store {str(self.path)!r} holds {other[0]!r}, which is not of it",
-                "nothing else where a store is to be removed",
+                f"store {str(self.path)!r} holds {other[0]!r}, which does not belong to it",
+                "no other files in a store that is removed",
                 key="store",
                 value=other[0],
             )

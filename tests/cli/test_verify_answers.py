@@ -62,7 +62,7 @@ def test_study_of_the_user_is_not_an_answer(tmp_path: Path) -> None:
     (tmp_path / "study.toml").write_text("[run]\nfap = 0.01\n", encoding="utf-8")
     header = "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: amplitude, datatype: float64}\n"
     (tmp_path / "flares.ecsv").write_text(f"{header}amplitude\n0.1\n", encoding="utf-8")
-    assert "'.' is no store of spectra" in run("verify", ".", folder=tmp_path, code=2).stderr
+    assert "'.' is not a store of spectra" in run("verify", ".", folder=tmp_path, code=2).stderr
     with refused("folder"):
         verify_answer(tmp_path)
 

@@ -87,7 +87,7 @@ def test_processor_is_named_after_level(own: str) -> None:
     device = Record(own)
     before = device.words.copy()
     for name in ("x86-64-v4", "x86-64-v3", "x86-64-v3"):
-        assert processor.give_name(device, name)
+        assert processor.set_processor_name(device, name)
         assert device.cpu.decode() == name
     # The rest of the record is unchanged.
     assert np.flatnonzero(device.words != before).tolist() == [5]
@@ -106,14 +106,14 @@ def test_processor_is_named_after_level(own: str) -> None:
 def test_other_devices_are_unchanged(device: Record) -> None:
     before = device.words.copy()
     assert processor.names(device) == (None,)
-    assert not processor.give_name(device, "x86-64-v3")
+    assert not processor.set_processor_name(device, "x86-64-v3")
     assert (device.words == before).all()
 
 
 def test_record_at_invalid_address_is_ignored() -> None:
     device = Record("generic")
     device.int_ptr = 2**46
-    assert not processor.give_name(device, "x86-64-v3")
+    assert not processor.set_processor_name(device, "x86-64-v3")
 
 
 @pytest.mark.long

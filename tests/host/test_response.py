@@ -12,7 +12,7 @@ from scipy.special import erf
 
 from mauvecl.host import response
 from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.host.instrument.line_spread import Line
+from mauvecl.host.instrument.line_spread import LineSpread
 from mauvecl.host.response import Order, electrons_per_second, response_matrix
 
 Float = NDArray[np.float64]
@@ -74,7 +74,7 @@ def brute(instrument: Instrument, wavelength: Float, flux: Float, pixel: int, or
 
 @pytest.mark.parametrize(("top_hat", "fwhm"), KERNELS)
 def test_line_function(mauve: Instrument, top_hat: float, fwhm: float) -> None:
-    line = Line.of(mauve.with_(top_hat_width_nm=top_hat, gaussian_fwhm_nm=fwhm))
+    line = LineSpread.of(mauve.with_(top_hat_width_nm=top_hat, gaussian_fwhm_nm=fwhm))
     x = np.array([-30.0, -7.0, -5.0, -0.3, 0.0, 1.0, 5.2, 11.0])
     np.testing.assert_allclose(line.density(x), line_function(x, top_hat, fwhm), rtol=1e-9, atol=1e-15)
     edges = [-60.0, -top_hat / 2, 0.0, top_hat / 2, 60.0]
@@ -88,10 +88,10 @@ def test_line_function_is_the_convolution(mauve: Instrument) -> None:
         smoothed, _ = quad(
             lambda y, x=x: np.exp(-((x - y) ** 2) / (2 * sigma**2)) / (sigma * np.sqrt(2 * np.pi)) / 10.8, -5.4, 5.4
         )
-        assert Line.of(mauve).density(x) == pytest.approx(smoothed, rel=1e-10)
+        assert LineSpread.of(mauve).density(x) == pytest.approx(smoothed, rel=1e-10)
     # The whole profile's width, quoted in the paper as that of the Gaussian alone.
     offset = np.linspace(0, 15, 15_001)
-    density = Line.of(mauve).density(offset)
+    density = LineSpread.of(mauve).density(offset)
     assert 2 * np.interp(-density[0] / 2, -density, offset) == pytest.approx(13.3, abs=0.05)
 
 
@@ -141,7 +141,7 @@ def test_column_sums(mauve: Instrument) -> None:
     landed = per_efficiency(mauve, np.ones(1643)) @ matrix.toarray()
     width = np.diff(wavelength)
     area = (np.append(width, 0) + np.append(0, width)) / 2  # of the nodes' hat functions
-    reach = Line.of(mauve).reach
+    reach = LineSpread.of(mauve).reach
     inside = np.flatnonzero((wavelength > 200 + reach) & (wavelength < 700 - reach))[1:-1]
     np.testing.assert_allclose(landed[inside], area[inside], rtol=1e-9)
     assert (landed < area * (1 + 1e-9)).all()
@@ -207,7 +207,7 @@ def test_order_matters_where_the_efficiency_is_steep(mauve: Instrument) -> None:
 
 def test_light_out_of_reach_is_not_detected(mauve: Instrument) -> None:
     assert not electrons_per_second(mauve, [900.0, 1000.0], [1.0, 1.0]).any()
-    beyond = Line.of(mauve).reach + 1
+    beyond = LineSpread.of(mauve).reach + 1
     assert electrons_per_second(mauve, [500.0, 501.0], [1.0, 1.0])[mauve.wavelength_nm > 501 + beyond].max() == 0
 
 

@@ -202,7 +202,7 @@ def _shifted_fap(
     one, used = detection.statistic(statistic), detection.scene.used
     added = one.added_variance(detection.setting)
     moved = Differences(np.where(used, (1.0 - (added > 0)) * shift, 0.0), (1.0 + added) * variance)
-    return one.as_drawn(detection.setting, detection.quiet, moved, detection.shape(statistic, template)).sf(cut)
+    return one.integrate_drawn(detection.setting, detection.quiet, moved, detection.shape(statistic, template)).sf(cut)
 
 
 def _adc_moments(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Float]]:

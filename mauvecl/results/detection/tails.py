@@ -2,8 +2,8 @@
 
 The normals behind each pixel are drawn from a distribution under which an alarm is common, and each realisation counts
 with the ratio of the two densities (exponential tilting; Siegmund 1976, doi 10.1214/aos/1176343541). Everything after
-the normals (skew of the dark, rounding, clipping, the statistic itself) is the engine's. Unknowns that are drawn come
-from their priors in one half of the realisations and from where alarms come from in the other.
+the normals (skew of the dark, rounding, clipping, the statistic itself) is the engine's. Drawn unknowns
+follow their priors in one half of the realisations, and their distribution in alarms in the other half.
 """
 
 from __future__ import annotations
@@ -80,14 +80,14 @@ def tail(detection: Detection, fap: float, statistic: str, *, template: int = 0,
     if not SMALLEST_FAP <= fap <= 0.1:
         raise InputError.of("fap", fap, f"{SMALLEST_FAP:g} to 0.1 for importance sampling")
     _check(detection)
-    how = _Tilt.towards(fap, detection, statistic, template)
+    how = _Tilt.for_alarms(fap, detection, statistic, template)
     values, logs = np.empty(0), np.empty(0)
     goal = FIRST_REALISATIONS
     while True:
         more = _tilted(detection, statistic, template, how, seed, values.size, goal)
         values, logs = (np.concatenate(pair) for pair in zip((values, logs), more, strict=True))
         cut, low, high, error = _threshold(values, logs, fap)
-        beyond, at = _around(values, logs, cut)
+        beyond, at = _probabilities_at(values, logs, cut)
         check_atom(f"{statistic} of {detection.quiet.name}", fap, beyond, at)
         if error <= WANTED_ERROR:
             return Tail(Interval(cut, low, high), fap, error, values.size)
@@ -140,8 +140,8 @@ def _threshold(values: Float, logs: Float, fap: float) -> tuple[float, float, fl
     return float(ordered[at]), low, high, relative
 
 
-def _around(values: Float, logs: Float, cut: float) -> tuple[float, float]:
-    """Return the probability of larger values than a threshold, and what the one at it has for certain."""
+def _probabilities_at(values: Float, logs: Float, cut: float) -> tuple[float, float]:
+    """Return the probability of values above a threshold, and a lower limit of that of the threshold itself."""
     weight, n = np.exp(logs), values.size
     same = weight[values == cut]
     mean = float(same.sum() / n)
@@ -161,13 +161,13 @@ class _Tilt:
     scores: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @classmethod
-    def towards(cls, fap: float, detection: Detection, statistic: str, template: int) -> _Tilt:
+    def for_alarms(cls, fap: float, detection: Detection, statistic: str, template: int) -> _Tilt:
         """Choose a tilt that makes alarms of a given probability common."""
         one, setting, flare = detection.statistic(statistic), detection.setting, detection.shape(statistic, template)
         tilt = one.tilt(setting, flare)
         nothing = Differences(np.zeros(setting.used.size), one.variance(setting), setting.comparison.estimated)
         # Nuisance parameters that are not drawn do not scatter.
-        null = one.as_drawn(setting, detection.quiet, nothing, flare, priors=False)
+        null = one.integrate_drawn(setting, detection.quiet, nothing, flare, priors=False)
         goal = null.isf(fap)
         parts, chance, scores = null.parts if isinstance(null, Mixture) else (null,), np.ones(1), {}
         if isinstance(null, Mixture):
@@ -190,7 +190,7 @@ class _Tilt:
         # Quadratic statistic: exponential tilting of each independent square increases the spread.
         return cls(tilt.directions, _stretch(tilt.square, goal), scores=scores)
 
-    def moved(self, difference: Float) -> tuple[Float, Float]:
+    def apply(self, difference: Float) -> tuple[Float, Float]:
         """Return the change of differences, shape (n, n_pixel), and the logarithms of the draws' weights."""
         along = difference @ self.directions.T
         if self.shift:
@@ -246,7 +246,7 @@ def _block(
     # Only the difference is tilted; orthogonal combinations remain as drawn.
     root = np.sqrt(1.0 + added)
     difference = (z - added * sum(others)) / root
-    move, logs = tilt.moved(difference)
+    move, logs = tilt.apply(difference)
     if scene.modulations:
         factors, more = _factors(scene, tilt.scores, seed, block)
         excess, logs = _responding(scene, z + move / root, factors), logs + more
@@ -319,7 +319,7 @@ def _responding(scene: Scene, z: Float, factors: dict[str, Float]) -> Float:
     if scene.quartic:
         even = fifth * (z**4 - 6 * z**2 + 3) / 120 - skew * fourth * (z**4 - 5 * z**2 + 2) / 24
         v += (even + skew**2 * third * (12 * z**4 - 53 * z**2 + 17) / 324) / variance**2
-    return _counted(scene, v + scene.levels["c0"][0, :n] + more * r["light"] + warmer * r["dark"])
+    return _digitised(scene, v + scene.levels["c0"][0, :n] + more * r["light"] + warmer * r["dark"])
 
 
 def _excess(scene: Scene, z: Float) -> Float:
@@ -329,10 +329,10 @@ def _excess(scene: Scene, z: Float) -> Float:
     drawn = level["c4"].astype(np.float64) if scene.quartic else np.zeros(n)
     for name in ("c3", "c2", "c1", "c0"):
         drawn = drawn * z + level[name]
-    return _counted(scene, drawn)
+    return _digitised(scene, drawn)
 
 
-def _counted(scene: Scene, drawn: Float) -> Float:
+def _digitised(scene: Scene, drawn: Float) -> Float:
     """Digitise counts above the base and subtract the reference."""
     n, edge = scene.n_pixel, scene.edges[0, : scene.n_pixel]
     counts = np.rint(drawn)

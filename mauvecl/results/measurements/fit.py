@@ -1,4 +1,4 @@
-"""Fits of flares to observed frames, with intervals by profile likelihood; and forecasts of their errors."""
+"""Fits of flares to observed frames with intervals from the profile likelihood, and forecasts of errors."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ Float = NDArray[np.float64]
 
 #: Probabilities of the intervals: one and two standard deviations of a normal variable, about.
 LEVELS = (0.6827, 0.95)
-#: Fits after the first one; the variance is that of the flare fitted before.
+#: Number of fits after the first; each uses the variance of the previously fitted flare.
 REFITS = 2
-#: Frames share a variance if their flares change its logarithm alike, to this step in each of some ranges of pixels.
+#: Frames share a variance if the changes of its logarithm agree to this step in each of some ranges of pixels.
 VARIANCE_STEP, VARIANCE_RANGES = 0.03, 12
 #: Frames that are fitted together, which bounds the memory.
 BATCH = 2048
@@ -49,18 +49,18 @@ class Measurement:
     bounds : tuple of float
         Smallest possible values: 1 of a jump, 0 of light.
     estimates : ndarray, shape (n, n_derived)
-        Of maximum likelihood.
+        Maximum-likelihood estimates.
     covariance : ndarray, shape (n, n_derived, n_derived)
-        From the Fisher information at the fit.
+        Covariance from the Fisher information at the fit.
     levels : tuple of float
         Nominal coverage of the intervals.
     low, high : ndarray, shape (n_level, n, n_derived)
-        Ends of the intervals; infinite, or at the bound, where there is none, so that the other is a one-sided limit.
+        Ends of the intervals. If one is infinite or at a bound, the other is a one-sided limit.
     chi2, p_value : ndarray, shape (n,)
-        Goodness of fit, and the probability of a worse one if the model is right.
+        Goodness of fit, and the probability of a larger chi-squared if the model is correct.
     dof : int
     snr : ndarray, shape (n,)
-        Root of what the flare lowers chi-squared by.
+        Root of the decrease of chi-squared by the flare.
     log_k : ndarray, shape (n,), or (n, 2) of two temperatures
     amplitudes : ndarray, shape (n, n_linear)
         Parameters of the model's `counts`.
@@ -88,7 +88,7 @@ class Measurement:
 
     @property
     def one_sided(self) -> NDArray[np.bool_]:
-        """Intervals with one end, shape (n_level, n, n_derived); the other is infinite, or a bound of the quantity."""
+        """Which intervals have one end, shape (n_level, n, n_derived); the other is infinite or a bound."""
         return np.asarray((self.low <= self.bounds) != np.isinf(self.high))
 
     @classmethod
@@ -102,7 +102,7 @@ class Measurement:
         return cls(**values)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return everything that depends on the frames, for files; `of_arrays` reads it."""
+        """Return all arrays that depend on the frames, for files; the inverse of `of_arrays`."""
         values = {one.name: np.asarray(getattr(self, one.name)) for one in fields(self)}
         return {name: value for name, value in values.items() if name not in ("names", "units", "bounds", "levels")}
 
@@ -110,7 +110,7 @@ class Measurement:
     def of_arrays(
         cls, model: FlareModel | TwoTemperatures, levels: Sequence[float], arrays: Mapping[str, NDArray[Any]]
     ) -> Self:
-        """Return the measurement of a model's flares that `arrays` gave."""
+        """Return the measurement of a model's flares from its `arrays`."""
         given: dict[str, Any] = {**arrays, "dof": int(arrays["dof"])}
         return cls(model.names, model.units, model.bounds, levels=tuple(levels), **given)
 
@@ -124,7 +124,7 @@ class Measurement:
         return replace(self, **kept)
 
     def column(self, name: str) -> int:
-        """Return the place of a quantity.
+        """Return the index of a quantity.
 
         Raises
         ------
@@ -160,25 +160,25 @@ def fit(
     levels: Sequence[Probability] = LEVELS,
     skipped_nm: Sequence[tuple[Wavelength, Wavelength]] = (),
 ) -> Measurement:
-    """Fit one flare to each of some exposures.
+    """Fit one flare to each exposure.
 
-    The likelihood is Gaussian with the variance of the fitted flare and star. Intervals are those of the profile
-    likelihood, with Wilks' thresholds. Light is never negative and a jump at least 1: an interval that reaches that
-    bound, or the end of the model's temperatures, has one end, and is a limit.
+    The likelihood is Gaussian with the variance of the fitted flare and star. Intervals are from the profile likelihood
+    with Wilks' thresholds. Light is at least 0 and a jump at least 1. An interval that reaches this bound, or an end of
+    the model's temperatures, is a one-sided limit.
 
     Parameters
     ----------
     frames : array_like, shape (n, n_pixel)
-        Raw DN of the exposures, as `Engine.realise` gives them.
+        Raw DN of the exposures, as returned by `Engine.realise`.
     expectation : Expectation
         The exposure of the quiescent star.
     model : FlareModel
     nuisances : Nuisances, optional
-        Unknown amplitudes of known spectra, which are marginalised over.
+        Unknown amplitudes of known spectra, over which the fit marginalises.
     levels : sequence of float
         Nominal coverage of the intervals.
     skipped_nm : sequence of tuple
-        Wavelengths between which pixels do not count, such as gaps of an observation.
+        Wavelength ranges of pixels that are not used, such as gaps of an observation.
 
     Raises
     ------
@@ -226,12 +226,12 @@ def fit(
 def checked_excess(
     frames: ArrayLike, expectation: Expectation, levels: Sequence[float], skipped_nm: Sequence[tuple[float, float]]
 ) -> tuple[Float, NDArray[np.bool_]]:
-    """Return frames less the quiescent mean, and pixels that are left out; raises InputError as `fit`."""
+    """Return frames less the quiescent mean, and the pixels that are not used; raises InputError as `fit` does."""
     raw = np.atleast_2d(np.asarray(frames, np.float64))
     if raw.ndim != 2 or not len(raw) or raw.shape[1] != expectation.wavelength_nm.size:
         raise InputError(
             f"frames of the shape {raw.shape}",
-            f"{expectation.wavelength_nm.size} pixels in each of some",
+            f"(n, {expectation.wavelength_nm.size})",
             key="frames",
             value=raw.shape,
         )
@@ -247,7 +247,7 @@ def checked_excess(
 
 
 def _pilot(excess: Float, model: FlareModel, reduction: Reduction) -> tuple[Float, Float]:
-    """Return fits with one variance for all frames, that of the quiescent star."""
+    """Fit all frames with the variance of the quiescent star."""
     log_k, linear = np.empty(len(excess)), np.empty((len(excess), len(model.linear)))
     for start in range(0, len(excess), BATCH):
         some = slice(start, start + BATCH)
@@ -263,7 +263,7 @@ def variance_groups(
     linear: Float,
     reduction_of: Callable[[Float], Reduction],
 ) -> Iterator[tuple[NDArray[np.intp], Reduction]]:
-    """Yield frames whose fitted flares have nearly the same variance, with their reduction."""
+    """Yield groups of frames whose fitted flares have nearly the same variance, with their reduction."""
     n_pixel = quiet.wavelength_nm.size
     edges = np.linspace(0, n_pixel, VARIANCE_RANGES + 1).astype(np.intp)[:-1]
     relative = quiet.gain_dn_per_electron / quiet.unsaturated_variance_dn2
@@ -293,7 +293,7 @@ def _fitted(excess: Float, model: FlareModel, reduction: Reduction, levels: Sequ
     allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
     ends = [intervals(model, profile, best, at_nodes, one) for one in allowed]
     low, high = (np.stack([one[side] for one in ends]) for side in (0, 1))
-    # Only intervals that reach a bound differ from those without bounds.
+    # Intervals differ from unbounded ones only if they reach a bound.
     reaches = (low <= np.array(model.bounds)) & np.isfinite(model.bounds)
     near = np.flatnonzero(reaches.any(axis=(0, 2)) | (best.linear < 0.0).any(axis=1))
     if near.size:
@@ -319,21 +319,21 @@ def _fitted(excess: Float, model: FlareModel, reduction: Reduction, levels: Sequ
 
 
 def fit_sums(sums: Float, model: FlareModel, reduction: Reduction) -> tuple[Float, Float]:
-    """Fit sums of exposures that one reduction made, without intervals: some 1e5 fits in a second of one processor.
+    """Fit the sums of exposures, without intervals; a processor core fits about 1e5 exposures per second.
 
     Parameters
     ----------
     sums : ndarray, shape (n, n_sum)
     model : FlareModel
     reduction : Reduction
-        Its variance is taken for that of every exposure.
+        Its variance is assumed for every exposure.
 
     Returns
     -------
     estimates : ndarray, shape (n, n_derived)
-        The model's quantities.
+        Quantities of the model.
     covariance : ndarray, shape (n, n_derived, n_derived)
-        From the Fisher information at the fit.
+        Covariance from the Fisher information at the fit.
     """
     estimates, spreads = [], []
     for start in range(0, len(sums), BATCH):
@@ -346,7 +346,7 @@ def fit_sums(sums: Float, model: FlareModel, reduction: Reduction) -> tuple[Floa
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """Errors that a measurement will have, from the Fisher information.
+    """Expected errors of a measurement, from the Fisher information.
 
     Attributes
     ----------
@@ -354,7 +354,7 @@ class Forecast:
     values, errors : ndarray, shape (n_derived,)
     covariance : ndarray, shape (n_derived, n_derived)
     snr : float
-        Of the flare.
+        S/N of the flare.
     """
 
     names: tuple[str, ...]
@@ -378,7 +378,7 @@ def forecast(
     amplitudes: Sequence[float] | Float,
     nuisances: Nuisances | None = None,
 ) -> Forecast:
-    """Return the errors with which a flare will be measured, from the Fisher information of one exposure.
+    """Forecast the errors of the measurement of a flare from the Fisher information of one exposure.
 
     Parameters
     ----------
@@ -386,14 +386,14 @@ def forecast(
         The exposure of the quiescent star.
     model : FlareModel
     temperature_k, amplitudes
-        The flare, as `FlareModel.counts` takes it.
+        Flare, as for `FlareModel.counts`.
     nuisances : Nuisances, optional
         Unknown amplitudes of known spectra.
 
     Raises
     ------
     InputError
-        If the flare is not of the model, or is degenerate with the unknowns.
+        If the model cannot describe the flare, or the flare is degenerate with the unknowns.
     """
     counts = model.counts(temperature_k, amplitudes)
     log_k, linear = np.array([np.log(temperature_k)]), np.asarray(amplitudes, np.float64)[None]

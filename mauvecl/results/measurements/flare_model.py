@@ -40,19 +40,19 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Temperatures that are fitted, K: those that a flare may have, but for cool ones without ultraviolet light.
+#: Range of fitted temperatures, K: that of flares, without cool ones that emit no ultraviolet light.
 TEMPERATURES_K = (3_000.0, float(range_of(Temperature).high))
-#: Temperatures at which spectra are computed, evenly spaced in log T; splines run through them.
+#: Number of temperatures at which spectra are computed, evenly spaced in log T; splines interpolate between them.
 NODES = 225
-#: Grid of the spectra, nm: beyond the reach of the line function, in steps far below the resolution.
+#: Grid of the spectra, nm: it exceeds the instrument's range by the line spread, with steps far below the resolution.
 GRID_NM = np.linspace(170.0, 760.0, 2361)
-#: Bands in which light is reported unless others are named, nm.
+#: Bands in which light is reported by default, nm.
 BANDS_NM = ((200.0, 320.0), (200.0, 700.0))
 
 
 @dataclass(frozen=True, eq=False)
 class Derived:
-    """A quantity that follows from temperature and amplitudes.
+    """Quantity that follows from temperature and amplitudes.
 
     Attributes
     ----------
@@ -73,14 +73,14 @@ class Derived:
 
     @property
     def bound(self) -> float:
-        """Smallest value, that of amplitudes of zero."""
+        """Smallest value, for amplitudes of zero."""
         return self.offset if self.ratio is not None else 0.0 if self.factors is not None else -np.inf
 
 
 @validated
 @dataclass(frozen=True, eq=False)
 class FlareModel:
-    """The mean counts that a flare adds to an exposure.
+    """Mean counts that a flare adds to an exposure.
 
     Attributes
     ----------
@@ -92,9 +92,9 @@ class FlareModel:
         DN of the exposure for the other components: a Balmer continuum of 1 erg s-1 cm-2 A-1 at its edge, and lines of
         1 erg s-1 cm-2.
     linear : tuple of str
-        Names of the amplitudes, that of the blackbody first.
+        Names of the amplitudes, the blackbody's first.
     derived : tuple of Derived
-        What fits report, the temperature first.
+        Quantities that fits report, the temperature first.
     """
 
     log_k: Float
@@ -119,7 +119,7 @@ class FlareModel:
         bands_nm: Sequence[tuple[Wavelength, Wavelength]] = BANDS_NM,
         order: Order = "paper",
     ) -> Self:
-        """Return the model of a blackbody at a star, with a Balmer continuum and lines if they are asked for.
+        """Build the model of a blackbody at a star, optionally with a Balmer continuum and lines.
 
         Parameters
         ----------
@@ -133,21 +133,21 @@ class FlareModel:
         lines : sequence of str
             Lines whose fluxes are fitted; names as in `FlareWithLines`, or vacuum wavelengths in nm.
         band : str
-            In which the amplitude is the relative rise of the photons.
+            Band in which the amplitude is the relative rise of the photons.
         electron_temperature_k : float
-            Of the Balmer continuum.
+            Electron temperature of the Balmer continuum.
         distance_pc, radius_rsun : float, optional
-            Of the star: areas, luminosities and energies need the distance, the filling factor both. Light is taken to
-            leave alike in all directions.
+            Distance and radius of the star. Areas, luminosities and energies require the distance, the filling factor
+            both. Isotropic emission is assumed.
         bands_nm : sequence of tuple
-            Wavelengths between which the light is reported.
+            Wavelength ranges in which the light is reported.
         order : {"paper", "physical"}
             As in `expect`.
 
         Raises
         ------
         InputError
-            For a name or value that cannot be, or a spectrum that does not cover the band.
+            For an unknown name, an impossible value, or a spectrum that does not cover the band.
         """
         chosen = [EmissionLine.named(name) for name in lines]
         for low, high in bands_nm:
@@ -164,9 +164,9 @@ class FlareModel:
         light = photons(nm, star.flux_flam, band)
         if not light > 0.0:
             raise InputError(
-                f"the star has no light in the band {band}", "some to measure the flare against", key="band", value=band
+                f"the star has no light in the band {band}", "a star with light in the band", key="band", value=band
             )
-        # Flux at the telescope over that of the flare's surface, for an amplitude of one.
+        # Ratio of the flux at the telescope to that at the flare's surface, for an amplitude of one.
         scale = np.array([light / photons(nm, blackbody(nm, float(k)), band) for k in kelvin])
         extra = ([balmer_continuum(grid, electron_temperature_k)] if jump else []) + [
             one.profile(grid) for one in chosen
@@ -176,7 +176,7 @@ class FlareModel:
         dn = quiet.exposure_s * instrument.per_pixel("response", 1.0) * quiet.gain_dn_per_electron
         fluxes = np.vstack([scale[:, None] * bodies, *extra]) if extra else scale[:, None] * bodies
         counts = np.asarray((matrix @ fluxes.T).T) * dn
-        # Flux of each component between two wavelengths, and over all of them, for an amplitude of one.
+        # Flux of each component in each range, and over all wavelengths, for an amplitude of one.
         parts = np.array([_between(grid, fluxes, low, high) for low, high in bands_nm]).reshape(-1, len(fluxes))
         balmer = BalmerFlare(10_000.0, 2.0, electron_temperature_k)
         whole = [(balmer.bolometric_flux() - STEFAN_BOLTZMANN * 1e16) / float(balmer.edge_flux)] if jump else []
@@ -187,7 +187,7 @@ class FlareModel:
         return cls(np.log(kelvin), counts[:NODES], counts[NODES:], names, derived)
 
     def stacked(self, n: int, light: float = 1.0) -> Self:
-        """Return the model of exposures that are n times as long, with a factor on all light that is known.
+        """Return the model of exposures that are n times as long, with a known factor on all light.
 
         Parameters
         ----------
@@ -203,17 +203,17 @@ class FlareModel:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of what fits report."""
+        """Names of the reported quantities."""
         return tuple(one.name for one in self.derived)
 
     @property
     def bounds(self) -> tuple[float, ...]:
-        """Smallest possible values."""
+        """Smallest possible values of the reported quantities."""
         return tuple(one.bound for one in self.derived)
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Their units."""
+        """Units of the reported quantities."""
         return tuple(one.unit for one in self.derived)
 
     @cached_property
@@ -297,7 +297,7 @@ def _derived(
     distance_pc: float | None,
     radius_rsun: float | None,
 ) -> tuple[Derived, ...]:
-    """List what a model reports; `parts` and `every` hold fluxes per amplitude, blackbodies' first."""
+    """Return the quantities of a model; `parts` and `every` hold fluxes per amplitude, those of blackbodies first."""
     n, m = kelvin.size, len(names)
 
     def summed(fluxes: Float) -> Float:

@@ -1,9 +1,9 @@
 """Fits with amplitudes of at least zero, for flares near that boundary.
 
-Light of a blackbody, a Balmer continuum or a line only adds. At a given temperature the best fit with non-negative
-amplitudes is the best fit of one face of the orthant, that is of some of the components, without bounds; and so are the
-ends of a profile interval, because the likelihood is convex there. All faces are tried: those whose solution is
-negative somewhere do not count. Only the blackbody depends on the temperature, so that each face has constant matrices.
+The light of a blackbody, a Balmer continuum or a line is never negative. At a given temperature, the best fit with
+non-negative amplitudes is the unbounded fit of a face of the orthant, a subset of the components. The same holds for
+the ends of a profile interval, because the likelihood is convex. All faces are tried, and those with a negative
+amplitude are rejected. Only the blackbody depends on the temperature, so each face has constant matrices.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.results.measurements.profile import Best, Profile, extreme, temperature_samples
+from mauvecl.results.measurements.profile import BestFit, Profile, extreme, temperature_samples
 
 if TYPE_CHECKING:
     from mauvecl.results.measurements.flare_model import FlareModel
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Amplitudes below minus this many of their standard errors are negative; rounding is not.
+#: Amplitudes below minus this many standard errors are negative; smaller deviations are due to rounding.
 ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Products:
-    """Inner products of components and sums at temperatures (n, ...), or (1, ...) for all frames alike."""
+    """Inner products of components and sums at temperatures (n, ...), or (1, ...) if common to all frames."""
 
     along: Float  # of the blackbody with the sums, shape (n, ...)
     power: Float  # of the blackbody with itself, shape (n or 1, ...)
@@ -40,7 +40,7 @@ class Products:
     gram: Float  # of the fixed components with each other, shape (n_fixed, n_fixed)
 
     def face(self, some: tuple[int, ...], hot: bool) -> Face:
-        """Return the fit without bounds of some of the fixed components, and of the blackbody."""
+        """Fit some of the fixed components and, if `hot`, the blackbody, without bounds."""
         which = list(some)
         inverse = np.asarray(np.linalg.inv(self.gram[np.ix_(which, which)]), np.float64)
         alone, share = (np.tensordot(inverse, each[which], 1) for each in (self.fixed, self.cross))
@@ -54,19 +54,19 @@ class Products:
 
 @dataclass(frozen=True, eq=False)
 class Face:
-    """The fit of some of the components, without bounds."""
+    """Unbounded fit of a subset of the components."""
 
     some: tuple[int, ...]  # fixed components
     inverse: Float  # of their information, shape (n_some, n_some)
     others: Float  # their amplitudes, shape (n_some, n, ...)
-    gain: Float  # what the components lower chi-squared by, shape (n, ...)
+    gain: Float  # decrease of chi-squared by the components, shape (n, ...)
     amplitude: Float | None  # of the blackbody, shape (n, ...); None without it
     power: Float  # inverse of its variance, shape (n or 1, ...)
-    share: Float  # by how much the others fall where it rises by one, shape (n_some, n or 1, ...)
+    share: Float  # decrease of the others per unit of the blackbody's, shape (n_some, n or 1, ...)
 
     @cached_property
     def rounding(self) -> tuple[Float, Float]:
-        """How negative the blackbody's amplitude and the others may be."""
+        """Smallest amplitudes of the blackbody and of the others that count as zero despite rounding."""
         variance = np.diag(self.inverse).reshape(-1, *(1,) * (self.others.ndim - 1))
         if self.amplitude is not None:
             variance = variance + self.share**2 / self.power
@@ -79,7 +79,7 @@ class Face:
         return positive if amplitude is None else positive & (amplitude >= least)
 
     def change(self, factors: Float) -> tuple[Float | None, Float, Float]:
-        """Return by how much amplitudes change per change of a quantity that is linear in them, and its variance.
+        """Return the changes of amplitudes per change of a linear quantity, and the quantity's variance.
 
         The factors of the quantity have the shape (n_linear, n, ...).
         """
@@ -94,10 +94,10 @@ class Face:
 
 
 class BoundedProfile(Profile):
-    """The profile likelihood of some frames' sums over the temperature, with amplitudes of at least zero."""
+    """Profile likelihood of the temperature for the sums of some frames, with amplitudes of at least zero."""
 
     def products(self, log_k: Float) -> Products:
-        """Return the inner products at temperatures (n, ...), or (1, ...) for all frames alike."""
+        """Return the inner products at temperatures (n, ...), or (1, ...) if common to all frames."""
         hot, fixed = self.hot(log_k), self.reduction.fixed
         one = (1,) * (log_k.ndim - 1)
         if log_k.shape[0] == 1:
@@ -113,7 +113,7 @@ class BoundedProfile(Profile):
         )
 
     def solutions(self, log_k: Float) -> Iterator[Face]:
-        """Yield the fit without bounds of each face at temperatures (n, ...), or (1, ...) for all frames alike."""
+        """Yield the unbounded fit of each face at temperatures (n, ...), or (1, ...) if common to all frames."""
         products, every = self.products(log_k), range(len(self.reduction.fixed))
         for some in chain.from_iterable(combinations(every, size) for size in range(len(every) + 1)):
             yield products.face(some, False)
@@ -134,7 +134,7 @@ class BoundedProfile(Profile):
         return gain, amplitudes
 
     def gain(self, log_k: Float) -> Float:
-        """Return what a flare of temperatures (n, ...) lowers chi-squared by."""
+        """Return the decrease of chi-squared by a flare of temperatures (n, ...)."""
         return self._best_of(log_k)[0]
 
     def gain_at_nodes(self, every: int = 1) -> Float:
@@ -146,18 +146,18 @@ class BoundedProfile(Profile):
         return np.ascontiguousarray(self._best_of(log_k)[1].T)
 
 
-def with_bounds(reduction: Reduction, sums: Float, best: Best) -> Best:
+def with_bounds(reduction: Reduction, sums: Float, best: BestFit) -> BestFit:
     """Return fits with amplitudes of at least zero, from fits without this bound."""
     negative = np.flatnonzero((best.linear < 0.0).any(axis=1))
     return best.replaced(negative, BoundedProfile(reduction, sums[negative]).best()) if negative.size else best
 
 
 def bounded_intervals(
-    model: FlareModel, profile: BoundedProfile, best: Best, at_nodes: Float, allowed: float
+    model: FlareModel, profile: BoundedProfile, best: BestFit, at_nodes: Float, allowed: float
 ) -> tuple[Float, Float]:
     """Return the profile-likelihood intervals of a model's quantities, low and high, each (n, n_derived).
 
-    An interval that reaches a bound ends there; the other end is a one-sided limit. Infinite where there is no limit.
+    An interval that reaches a bound ends there, and its other end is a one-sided limit; it is infinite without a limit.
     """
     low, high = profile.ends(best, at_nodes, allowed)
     x = temperature_samples(profile, low, high)
@@ -173,7 +173,7 @@ def bounded_intervals(
             ends = _ratio_ends(products, faces, spline(x), least)
             ends = one.offset + ends[0], one.offset + ends[1]
         columns.append(ends)
-    # A parabola through the outermost samples may pass a bound.
+    # A parabola through the outermost samples may exceed a bound.
     lows = np.maximum(np.column_stack([c[0] for c in columns]), model.bounds)
     return lows, np.column_stack([c[1] for c in columns])
 

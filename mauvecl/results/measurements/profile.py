@@ -1,9 +1,9 @@
 """Fits of weighted sums: the best temperature and amplitudes, and intervals by profile likelihood.
 
-At a given temperature everything else is linear, so that chi-squared's minimum over the amplitudes is a closed form and
-a function of one variable is left. The profile likelihood of a quantity that is linear in the amplitudes follows
-from that function: at each temperature the quantity may lie within sqrt(c - delta) standard deviations of its best
-value there, delta being what the temperature alone costs of the allowed c; the interval is the hull over temperatures.
+At a given temperature everything else is linear, so that the minimum of chi-squared over the amplitudes is a closed
+form, and a function of one variable remains. It gives the profile likelihood of a quantity that is linear in the
+amplitudes: if chi-squared may rise by c, of which the temperature alone takes delta, the quantity may lie within
+sqrt(c - delta) standard deviations of its best value at that temperature. The interval is the hull over temperatures.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Parabolas through three temperatures that refine the best node, and the factor by which they get narrower.
+#: Number of parabolas through three temperatures that refine the best node, and the factor by which they narrow.
 REFINEMENTS, NARROWER = 3, 8.0
 #: The search for the best temperature starts from every `COARSE`-th node of the model.
 COARSE = 4
@@ -36,7 +36,7 @@ SAMPLES = 33
 
 
 @dataclass(frozen=True, eq=False)
-class Best:
+class BestFit:
     """Best fits of n frames.
 
     Attributes
@@ -52,16 +52,16 @@ class Best:
     linear: Float
     gain: Float
 
-    def replaced(self, rows: NDArray[np.intp], others: Best) -> Best:
+    def replaced(self, rows: NDArray[np.intp], others: BestFit) -> BestFit:
         """Return the fits with those of some frames replaced."""
         every = [getattr(self, one.name).copy() for one in fields(self)]
         for values, one in zip(every, fields(self), strict=True):
             values[rows] = getattr(others, one.name)
-        return Best(*every)
+        return BestFit(*every)
 
 
 class Profile:
-    """The profile likelihood of some frames' sums over the temperature."""
+    """Profile likelihood of the temperature for the sums of some frames."""
 
     def __init__(self, reduction: MeanSums, sums: Float) -> None:
         self.reduction, self.sums = reduction, sums
@@ -87,7 +87,7 @@ class Profile:
         return np.asarray(cubic)
 
     def parts(self, log_k: Float) -> tuple[Float, Float, Float]:
-        """Return amplitudes with nothing else held, their variances, and sums, at temperatures (n, ...)."""
+        """Return the blackbody's amplitude without bounds, its variance, and its sums, at temperatures (n, ...)."""
         hot = self.hot(log_k)
         basis = self._basis
         free = hot - (hot @ basis.T) @ basis
@@ -96,7 +96,7 @@ class Profile:
         return np.einsum("...k,...k->...", free, rest) / power, 1.0 / power, hot
 
     def gain(self, log_k: Float) -> Float:
-        """Return what a flare of temperatures (n, ...) lowers chi-squared by; its blackbody adds light."""
+        """Return the decrease of chi-squared by a flare of temperatures (n, ...) with a positive blackbody."""
         amplitude, variance, _ = self.parts(log_k)
         base = np.einsum("nk,nk->n", self.along, self.along).reshape((-1,) + (1,) * (log_k.ndim - 1))
         return np.asarray(base + np.maximum(amplitude, 0.0) ** 2 / variance)
@@ -107,14 +107,14 @@ class Profile:
         return np.asarray(np.maximum(product, 0.0) ** 2 + np.einsum("nk,nk->n", self.along, self.along)[:, None])
 
     def linear(self, log_k: Float, amplitude: Float, hot: Float) -> Float:
-        """Return all amplitudes, shape (n, ..., n_linear), for that of the blackbody."""
+        """Return all amplitudes, shape (n, ..., n_linear), for a given amplitude of the blackbody."""
         if not len(self._basis):
             return amplitude[..., None]
         along = self.along.reshape(self.along.shape[:1] + (1,) * (log_k.ndim - 1) + self.along.shape[1:])
         others = (along - amplitude[..., None] * (hot @ self._basis.T)) @ self._inverse.T
         return np.concatenate([amplitude[..., None], others], axis=-1)
 
-    def best(self, at_nodes: Float | None = None) -> Best:
+    def best(self, at_nodes: Float | None = None) -> BestFit:
         """Return the best fit of each frame."""
         every = COARSE if at_nodes is None else 1
         at_nodes = self.gain_at_nodes(every) if at_nodes is None else at_nodes
@@ -124,7 +124,7 @@ class Profile:
         for _ in range(REFINEMENTS):
             there = np.clip(x[:, None] + step * np.array([-1.0, 0.0, 1.0]), low, high)
             g = self.gain(there)
-            # The vertex of the parabola through three points; the best of them where that has none.
+            # The vertex of the parabola through three points, or the best point if there is no maximum.
             a, b = there[:, 0] - there[:, 1], there[:, 2] - there[:, 1]
             left, right = g[:, 0] - g[:, 1], g[:, 2] - g[:, 1]
             under = right * a - left * b
@@ -137,17 +137,17 @@ class Profile:
             reached = self.gain(vertex)
             x = np.where(reached >= g.max(axis=1), vertex, three)
             step /= NARROWER
-        return Best(x, self.amplitudes(x), self.gain(x))
+        return BestFit(x, self.amplitudes(x), self.gain(x))
 
     def amplitudes(self, log_k: Float) -> Float:
         """Return the best amplitudes at temperatures (n,), shape (n, n_linear)."""
         amplitude, _, hot = self.parts(log_k)
         return self.linear(log_k, np.maximum(amplitude, 0.0), hot)
 
-    def ends(self, best: Best, at_nodes: Float, allowed: float) -> tuple[Float, Float]:
+    def ends(self, best: BestFit, at_nodes: Float, allowed: float) -> tuple[Float, Float]:
         """Return the log temperatures at which chi-squared has risen by `allowed`, low and high, each (n,).
 
-        NaN where it has not risen that far at the end of the model's temperatures.
+        An end is NaN if chi-squared does not rise that far within the model's temperatures.
         """
         inside = best.gain[:, None] - at_nodes <= allowed
         number = np.arange(self.nodes.size)
@@ -193,10 +193,12 @@ class Profile:
         return x
 
 
-def intervals(model: FlareModel, profile: Profile, best: Best, at_nodes: Float, allowed: float) -> tuple[Float, Float]:
+def intervals(
+    model: FlareModel, profile: Profile, best: BestFit, at_nodes: Float, allowed: float
+) -> tuple[Float, Float]:
     """Return the profile-likelihood intervals of a model's quantities, low and high, each (n, n_derived).
 
-    Infinite where the data give no limit within the model's temperatures, and for the temperature itself.
+    Ends are infinite if the data give no limit within the model's temperatures.
     """
     low, high = profile.ends(best, at_nodes, allowed)
     x = temperature_samples(profile, low, high)
@@ -218,10 +220,10 @@ def intervals(model: FlareModel, profile: Profile, best: Best, at_nodes: Float, 
 
 
 def temperature_samples(profile: Profile, low: Float, high: Float) -> Float:
-    """Return log temperatures between the ends of intervals, or of the model where there is none, (n, n_sample)."""
+    """Return log temperatures between the ends of intervals, or those of the model if undefined, (n, n_sample)."""
     first = np.where(np.isnan(low), profile.nodes[0], low)
     last = np.where(np.isnan(high), profile.nodes[-1], high)
-    # Even in the sine's angle: the allowed rest goes to zero at the ends like a root.
+    # Samples are even in the angle of a sine, because the remaining rise goes to zero at the ends like a root.
     angle = np.linspace(-np.pi / 2, np.pi / 2, SAMPLES)
     return (first + last)[:, None] / 2 + (last - first)[:, None] / 2 * np.sin(angle)
 
@@ -240,14 +242,14 @@ def _linear_interval(
         spread = factors[..., 0] ** 2 * variance
     reach = np.sqrt(np.maximum(left, 0.0) * spread)
     outside = left < 0.0
-    outside[:, [0, -1]] = False  # the ends themselves, where rounding decides
+    outside[:, [0, -1]] = False  # rounding decides at the ends themselves
     low = extreme(np.where(outside, np.inf, value - reach), np.minimum)
     high = extreme(np.where(outside, -np.inf, value + reach), np.maximum)
     return low, high
 
 
 def extreme(values: Float, which: Callable[..., Float]) -> Float:
-    """Return the smallest or largest of samples (n, n_sample), by a parabola through the outermost three."""
+    """Return the smallest or largest of samples (n, n_sample), by a parabola through the three outermost."""
     sign = 1.0 if which is np.maximum else -1.0
     signed = sign * values
     k = np.argmax(signed, axis=1)
@@ -276,7 +278,7 @@ def _ratio_interval(profile: Profile, per: Float, x: Float, hot: Float, least_ga
     least = (least_gain - explained)[:, None]
     yt, yf = np.einsum("nk,nsk->ns", y, t), np.einsum("nk,nsk->ns", y, f)
     tt, tf, ff = (np.einsum("nsk,nsk->ns", a, b) for a, b in ((t, t), (t, f), (f, f)))
-    # (yt + r yf)^2 >= least |t + r f|^2, with r the jump less one and a blackbody that adds light.
+    # (yt + r yf)^2 >= least |t + r f|^2, where r is the jump less one and the blackbody is positive.
     a, b, c = yf**2 - least * ff, yt * yf - least * tf, yt**2 - least * tt
     inside = b**2 - a * c
     root = np.sqrt(np.maximum(inside, 0.0))
@@ -284,14 +286,14 @@ def _ratio_interval(profile: Profile, per: Float, x: Float, hot: Float, least_ga
     with np.errstate(divide="ignore", invalid="ignore"):
         one, other = (-b + root) / a, (-b - root) / a
     smaller, larger = np.fmin(one, other), np.fmax(one, other)
-    # Without a bound the light may be all recombination: every jump above the larger root is allowed.
+    # Without a bound, all light may be recombination, and every jump above the larger root is allowed.
     open_low = (a >= 0.0) & (inside < 0.0)
     low = np.where(bounded, smaller, np.where(a >= 0.0, np.where(open_low, -np.inf, larger), np.inf))
     high = np.where(bounded, larger, np.where(a >= 0.0, np.inf, -np.inf))
     return 1.0 + extreme(low, np.minimum), 1.0 + extreme(high, np.maximum)
 
 
-def covariance(model: FlareModel, profile: Profile, best: Best) -> Float:
+def covariance(model: FlareModel, profile: Profile, best: BestFit) -> Float:
     """Return the covariance of quantities from the Fisher information at the fit, (n, n_derived, n_derived)."""
     hot = profile.hot(best.log_k)
     slope = profile.reduction.spline(best.log_k, 1)
@@ -305,8 +307,8 @@ def covariance(model: FlareModel, profile: Profile, best: Best) -> Float:
 def covariance_of(model: FlareModel, log_k: Float, linear: Float, information: Float) -> Float:
     """Return the covariance of quantities, (n, n_derived, n_derived), from the information on the parameters.
 
-    The parameters are the amplitudes and the log temperature. NaN where a flare adds no light, or its temperature and
-    amplitudes are degenerate.
+    The parameters are the amplitudes and the log temperature. The result is NaN if a flare adds no light, or if its
+    temperature and amplitudes are degenerate.
     """
     m = linear.shape[1]
     scale = np.sqrt(np.einsum("nii->ni", information))
@@ -322,7 +324,7 @@ def covariance_of(model: FlareModel, log_k: Float, linear: Float, information: F
 
 
 def gradient_of(model: FlareModel, log_k: Float, linear: Float) -> Float:
-    """Return derivatives of quantities by the amplitudes and log temperature, (n, n_derived, n_linear + 1)."""
+    """Return derivatives with respect to amplitudes and log temperature, (n, n_derived, n_linear + 1)."""
     n, m = linear.shape
     gradient = np.zeros((n, len(model.derived), m + 1))
     values = derived_values(model, log_k, linear)

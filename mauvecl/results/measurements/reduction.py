@@ -1,8 +1,8 @@
-"""The few weighted sums of a frame that hold all that it tells about a flare.
+"""Reduction of frames to a few weighted sums that are sufficient for fits of flares.
 
-The whitened spectra of flares of all temperatures span about seven directions to one part in 10^9; a fit needs the
-frame's sums along them, and chi-squared of the rest. Unknown amplitudes of known spectra are marginalised over in the
-weights (generalised least squares).
+The whitened spectra of flares of all temperatures span about seven directions to one part in 10^9. A fit needs only the
+sums along these directions, and chi-squared of the residual. The weights marginalise over unknown amplitudes of known
+spectra (generalised least squares).
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ Float = NDArray[np.float64]
 
 #: The spectra of every `EVERY`-th node of the model span the directions.
 EVERY = 4
-#: Directions with less than this share of the largest eigenvalue hold rounding only.
+#: Directions with eigenvalues below this share of the largest are due to rounding.
 LEAST = 1e-11
-#: Pixels this near to saturation, in standard deviations of a frame, are left out.
+#: Pixels within this many standard deviations of saturation in a frame are not used.
 NEAR_SIGMA = 5.0
-#: Share of S/N^2 that a flare must keep when the unknowns are marginalised over.
+#: Smallest share of S/N^2 that must remain after marginalisation over the unknowns.
 LEAST_KEPT = 1e-10
 
 
@@ -44,7 +44,7 @@ class MeanSums:
     hot : ndarray, shape (n_node, n_sum)
         Mean sums for a blackbody of amplitude 1, at each of the model's temperatures.
     fixed : ndarray, shape (n_linear - 1, n_sum)
-        Those of the other components.
+        Mean sums of the other components for unit amplitude.
     log_k : ndarray, shape (n_node,)
         Evenly spaced, to a few percent of a step.
     """
@@ -69,18 +69,18 @@ class MeanSums:
 
 @dataclass(frozen=True, eq=False)
 class Reduction(MeanSums):
-    """Weights of sums, and what a model's flares do to these sums.
+    """Weights of sums, and the mean sums of a model's flares.
 
     Attributes
     ----------
     variance : ndarray, shape (n_pixel,)
-        Of the exposure, zero in pixels that are not used.
+        Variance of the exposure, zero in pixels that are not used.
     weights : ndarray, shape (n_sum, n_pixel)
-        Per DN; sums have covariance one.
+        Weights per DN, for which the sums have unit covariance.
     rows : ndarray, shape (k, n_pixel)
-        What marginalisation subtracts from chi-squared.
+        Weights of the sums whose squares marginalisation subtracts from chi-squared.
     n_free : int
-        Unknowns that are projected out.
+        Number of unknowns that are projected out.
     """
 
     variance: Float
@@ -97,7 +97,7 @@ class Reduction(MeanSums):
         nuisances: Nuisances | None = None,
         left_out: NDArray[np.bool_] | None = None,
     ) -> Self:
-        """Return the reduction of exposures with the variance of a flare that adds some counts.
+        """Compute the reduction for exposures with the variance of a given flare.
 
         Parameters
         ----------
@@ -107,7 +107,7 @@ class Reduction(MeanSums):
             Mean DN of the flare; none by default.
         nuisances : Nuisances, optional
         left_out : ndarray of bool, shape (n_pixel,), optional
-            Pixels that do not count, as saturated ones do not.
+            Pixels that are not used, in addition to saturated ones.
 
         Raises
         ------
@@ -131,7 +131,7 @@ class Reduction(MeanSums):
         return cls(model.hot @ weights.T, model.fixed @ weights.T, model.log_k, variance, weights, rows, free)
 
     def sums(self, excess_dn: Float) -> tuple[Float, Float]:
-        """Return the sums of frames less the quiescent mean, (n, n_sum), and chi-squared of what these leave, (n,)."""
+        """Return the sums of frames less the quiescent mean, (n, n_sum), and chi-squared of the residuals, (n,)."""
         sums = excess_dn @ self.weights.T
         used = self.variance > 0.0
         inverse = np.divide(1.0, self.variance, out=np.zeros_like(self.variance), where=used)
@@ -141,27 +141,27 @@ class Reduction(MeanSums):
 
     @property
     def statistics(self) -> tuple[Linear, ...]:
-        """The sums as statistics, which the device draws pixel by pixel and sums; see `drawn_sums`."""
+        """User-defined statistics equal to the sums, which a device draws by pixel; see `drawn_sums`."""
         return tuple(Linear(f"sum {k}", weights) for k, weights in enumerate(self.weights))
 
     @property
     def n_used(self) -> int:
-        """Number of pixels that count."""
+        """Number of used pixels."""
         return int((self.variance > 0.0).sum())
 
 
 def drawn_sums(values: NDArray[np.float32], reduction: Reduction) -> Float:
-    """Return sums of drawn exposures, (n, n_sum), from what `Engine.statistic_values` gives of one flare."""
+    """Return the sums of drawn exposures, (n, n_sum), from the result of `Engine.statistic_values` for one flare."""
     return np.ascontiguousarray(values[-len(reduction.weights) :].T, np.float64)
 
 
 def variance_of(quiet: Expectation, added_dn: Float | None = None) -> tuple[Float, NDArray[np.bool_]]:
-    """Return the variance of an exposure with a flare, DN^2, zero where a pixel saturates, and which do not."""
+    """Return the variance of an exposure with a flare, DN^2, zero in saturated pixels, and which pixels are used."""
     added = np.zeros(quiet.wavelength_nm.size) if added_dn is None else added_dn
     light = np.maximum(quiet.light_dn + added, 0.0)
     constant = quiet.unsaturated_variance_dn2 - quiet.gain_dn_per_electron * quiet.light_dn
     variance = constant + quiet.gain_dn_per_electron * light
-    # Frames of a pixel that comes near the ceiling are cut off now and then: it tells nothing reliable.
+    # Frames of a pixel near saturation are occasionally clipped, so that the pixel is not reliable.
     raw = light / quiet.n_frames + quiet.dark_dn + quiet.bias_dn
     used = raw + NEAR_SIGMA * np.sqrt(variance / quiet.n_frames) < quiet.ceiling_dn
     return np.where(used, variance, 0.0), used
@@ -170,7 +170,7 @@ def variance_of(quiet: Expectation, added_dn: Float | None = None) -> tuple[Floa
 def usable_variance(
     quiet: Expectation, added_dn: Float | None = None, left_out: NDArray[np.bool_] | None = None
 ) -> tuple[Float, NDArray[np.bool_]]:
-    """Return `variance_of` with some pixels left out; raises InputError if none is left."""
+    """Return `variance_of` without some pixels; raises InputError if no pixel remains."""
     variance, used = variance_of(quiet, added_dn)
     if left_out is not None:
         used = used & ~left_out
@@ -180,9 +180,12 @@ def usable_variance(
 
 
 def check_distinct(kept: Float, whole: Float, nuisances: Nuisances | None) -> None:
-    """Raise InputError if marginalisation over nuisances leaves nothing of the S/N^2 of some light."""
+    """Raise InputError if marginalisation over nuisances removes the S/N^2 of a component."""
     if not (kept > LEAST_KEPT * whole).all():
         unknown = join_names(nuisances.names) if nuisances else "nothing"
         raise InputError(
-            f"the light of a flare cannot be told from {unknown}", "fewer unknowns", key="nuisances", value=unknown
+            f"the light of a flare cannot be distinguished from {unknown}",
+            "fewer unknowns",
+            key="nuisances",
+            value=unknown,
         )

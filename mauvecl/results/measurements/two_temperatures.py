@@ -1,7 +1,7 @@
 """Fits of flares with two free temperatures.
 
-At each second temperature, taken from the model's, the flare is one blackbody with a further component of fixed shape,
-so that everything else is a fit of `results.measurements.nonnegative`. The second temperature is the higher one.
+At each second temperature, one of the model's, the flare is one blackbody with another component of fixed shape, so
+that the rest is a fit of `results.measurements.nonnegative`. The second temperature is the higher one.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from mauvecl.results.measurements.fit import LEVELS, Forecast, Measurement, checked_excess, fit, variance_groups
 from mauvecl.results.measurements.flare_model import Derived, FlareModel, derived_values
 from mauvecl.results.measurements.nonnegative import BoundedProfile, bounded_intervals
-from mauvecl.results.measurements.profile import Best
+from mauvecl.results.measurements.profile import BestFit
 from mauvecl.results.measurements.reduction import Reduction
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Second temperatures are this many to a node of the model: 0.6 % apart.
+#: Number of second temperatures per node of the model, in steps of 0.6 %.
 PER_NODE = 3
-#: Steps between those that are tried at first, and number of those within an interval and next to it.
+#: Steps between the temperatures that are tried first, and number of those in and next to an interval.
 COARSE, TRIES = 36, 20
-#: Nodes between the temperatures, at least: closer ones are one.
+#: Smallest number of nodes between the two temperatures; closer temperatures cannot be distinguished.
 APART = 4
 
 
@@ -44,7 +44,7 @@ class TwoTemperatures:
     Attributes
     ----------
     single : FlareModel
-        Of one blackbody, with lines if they are fitted.
+        Model of one blackbody, optionally with lines.
     """
 
     single: FlareModel
@@ -80,26 +80,26 @@ def fit_two_temperatures(
     levels: Sequence[Probability] = LEVELS,
     skipped_nm: Sequence[tuple[Wavelength, Wavelength]] = (),
 ) -> Measurement:
-    """Fit a flare of two blackbodies, both temperatures free, to each of some exposures.
+    """Fit a flare of two blackbodies with free temperatures to each exposure.
 
     Parameters
     ----------
     frames, expectation, nuisances, levels, skipped_nm
         As for `fit`.
     model : FlareModel
-        Of one blackbody, with lines if they are fitted.
+        Model of one blackbody, optionally with lines.
 
     Returns
     -------
     Measurement
-        As of `fit`: the temperature is the lower one; amplitude, fluxes and areas are those of both. Then the second
-        temperature, and its area over that of the first. Errors by curvature are undefined where one blackbody alone
-        fits best.
+        As for `fit`, with the lower temperature, and with amplitude, fluxes and areas of both blackbodies. The second
+        temperature and the ratio of its area to that of the first follow. Errors from the curvature are undefined if
+        a single blackbody fits best.
 
     Raises
     ------
     InputError
-        For a model with a Balmer jump, and as `fit`.
+        For a model with a Balmer jump, and as for `fit`.
     """
     if any(one.ratio is not None for one in model.derived):
         raise InputError("a model with a Balmer jump", "blackbodies, with lines or without", key="model")
@@ -145,20 +145,20 @@ def forecast_two_temperatures(
     values = derived_values(with_second(model, float(log_k[1])), log_k[:1], linear)
     values = np.insert(values, -1, temperatures_k[1], axis=1)
     sums = linear[0] @ np.vstack([reduction.spline(log_k), reduction.fixed])
-    best = Best(log_k[:1], linear, np.array([sums @ sums]))
+    best = BestFit(log_k[:1], linear, np.array([sums @ sums]))
     spread = _covariance(model, reduction, best, log_k[1:], values)[0]
     errors = np.sqrt(np.diag(spread))
     return Forecast(whole.names, whole.units, values[0], errors, spread, float(np.linalg.norm(sums)))
 
 
 def with_second(model: FlareModel, log_k: float) -> FlareModel:
-    """Return a model of lower temperatures with a blackbody of another one as a further component."""
+    """Return a model of lower temperatures with a blackbody of a second temperature as another component."""
     end = _lower(model.log_k, log_k)
     bolometric = model.splines[model.names.index("flux bolometric")]
     assert bolometric is not None
 
     def area(x: Float | float) -> Float:
-        # Flux at the telescope over that of the surface, which is in proportion to the area.
+        # The ratio of the flux at the telescope to that at the surface is proportional to the area.
         return np.asarray(bolometric(x)[..., 0] / np.exp(4 * x))
 
     def both(one: Derived, spline: scipy.interpolate.CubicSpline | None) -> Derived:
@@ -176,12 +176,12 @@ def with_second(model: FlareModel, log_k: float) -> FlareModel:
 
 
 def _lower(nodes: Float, log_k: float) -> int:
-    """Return the number of nodes that are well below a temperature."""
+    """Return the number of nodes that are at least `APART` nodes below a temperature."""
     return int(np.searchsorted(nodes, log_k - APART * (nodes[1] - nodes[0]) + 1e-9))
 
 
 class _Search:
-    """The fit of some exposures of one variance over second temperatures."""
+    """Fit of exposures with a common variance over second temperatures."""
 
     def __init__(self, model: FlareModel, reduction: Reduction, sums: Float, allowed: list[float]) -> None:
         self._model, self._reduction, self._sums, self._allowed = model, reduction, sums, allowed
@@ -195,19 +195,19 @@ class _Search:
         own = replace(r, hot=r.hot[:end], fixed=np.vstack([r.spline(self._grid[node]), r.fixed]), log_k=r.log_k[:end])
         return BoundedProfile(own, self._sums[rows])
 
-    def _look(self, wanted: NDArray[np.bool_]) -> None:
+    def _evaluate(self, wanted: NDArray[np.bool_]) -> None:
         """Compute the largest gain at second temperatures, (n, n_node)."""
         for node in np.flatnonzero(wanted.any(axis=0)):
             rows = np.flatnonzero(wanted[:, node] & np.isinf(self._gain[:, node]))
             if rows.size:
                 self._gain[rows, node] = self._profile(int(node), rows).best().gain
 
-    def measured(self) -> tuple[Best, Float, Float, Float, Float]:
+    def measured(self) -> tuple[BestFit, Float, Float, Float, Float]:
         """Return best fits, intervals (n_level, n, n_derived), second log temperatures, and estimates."""
         n, nodes = self._gain.shape
         coarse = np.zeros((n, nodes), np.bool_)
         coarse[:, ::COARSE] = True
-        self._look(coarse)
+        self._evaluate(coarse)
         # Twice, since the first interval may be a single temperature.
         for margin in (COARSE, COARSE // 4):
             inside = self._gain >= self._gain.max(axis=1)[:, None] - max(self._allowed)
@@ -216,7 +216,7 @@ class _Search:
             fine = np.zeros((n, nodes), np.bool_)
             for share in np.linspace(0.0, 1.0, TRIES + 1):
                 fine[np.arange(n), np.rint(low + share * (high - low)).astype(np.intp)] = True
-            self._look(fine)
+            self._evaluate(fine)
         best_node = self._gain.argmax(axis=1)
         gain = self._gain.max(axis=1)
         q = len(self._model.derived) + 2
@@ -237,18 +237,18 @@ class _Search:
                 if not there.size:
                     continue
                 some = self._profile(int(node), rows[there])
-                limit = Best(own.log_k[there], own.linear[there], gain[rows[there]])
+                limit = BestFit(own.log_k[there], own.linear[there], gain[rows[there]])
                 ends = bounded_intervals(model, some, limit, at_nodes[there], one)
                 for found, end, which in ((lows, ends[0], np.minimum), (highs, ends[1], np.maximum)):
                     columns = np.delete(np.arange(q), q - 2)
                     found[k][np.ix_(rows[there], columns)] = which(found[k][np.ix_(rows[there], columns)], end)
         for k, one in enumerate(self._allowed):
             lows[k, :, q - 2], highs[k, :, q - 2] = self._second_ends(gain, one)
-        best = Best(log_k, linear, gain)
+        best = BestFit(log_k, linear, gain)
         return best, lows, highs, self._grid[best_node], estimates
 
     def _second_ends(self, gain: Float, allowed: float) -> tuple[Float, Float]:
-        """Return the ends of the second temperature's interval, interpolated between the nodes that were tried."""
+        """Return the ends of the second temperature's interval, interpolated between the tried nodes."""
         low, high = np.full(gain.size, -np.inf), np.full(gain.size, np.inf)
         for k in range(gain.size):
             tried = np.flatnonzero(np.isfinite(self._gain[k]))
@@ -263,7 +263,7 @@ class _Search:
         return low, high
 
 
-def _covariance(model: FlareModel, reduction: Reduction, best: Best, second: Float, estimates: Float) -> Float:
+def _covariance(model: FlareModel, reduction: Reduction, best: BestFit, second: Float, estimates: Float) -> Float:
     """Return the covariance of quantities, (n, n_derived + 2, n_derived + 2), from the Fisher information."""
     n, m = best.linear.shape
     a, b = best.linear[:, 0], best.linear[:, 1]

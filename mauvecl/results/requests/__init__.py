@@ -1,1 +1,1 @@
-"""What is asked of an engine, as data: hypotheses, the channels of a launch, requests and their shards."""
+"""Requests to an engine as data: hypotheses, channels of a launch, requests and their shards."""

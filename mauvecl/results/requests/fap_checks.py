@@ -47,7 +47,7 @@ def countable(fap: float, realisations: int) -> bool:
 
 
 def check_fap(fap: float, realisations: int, tails: Tails = "counted") -> None:
-    """Raise InputError if `fap` is no probability, or too small for counted tails."""
+    """Raise InputError if `fap` is not a probability, or is too small for counted tails."""
     if not 0.0 < fap < 1.0:
         raise InputError.of("fap", fap, "a probability between 0 and 1")
     if tails not in ("counted", "sampled"):

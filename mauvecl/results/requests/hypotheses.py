@@ -129,9 +129,9 @@ class Hypotheses:
                 falls = self.fall(name, k)
                 if falls:
                     matched = Matched().closed_form(self.setting, flare, flare)
-                    told = "marginalised over unknowns, " if self.nuisances else ""
+                    how = "marginalised over unknowns, " if self.nuisances else ""
                     sentences.append(
-                        f"WRONG SIGN: {told}{name} falls by {falls:.3g} standard deviations with flare {k + 1} of "
+                        f"WRONG SIGN: {how}{name} falls by {falls:.3g} standard deviations with flare {k + 1} of "
                         f"{self.quiet.name}, and only higher values are alarms: its detection probability says nothing "
                         f"of the flare, which matched has at {matched.mean / matched.std:.3g}."
                     )

@@ -66,7 +66,7 @@ class Countable:
         return {each.name: getattr(self, each.name) for each in fields(self)}  # type: ignore[arg-type]
 
 
-class _Drawn(Countable):
+class _RealisationRequest(Countable):
     """Base class of requests for realisations."""
 
     def __post_init__(self) -> None:
@@ -75,7 +75,7 @@ class _Drawn(Countable):
 
 @validated
 @dataclass(frozen=True, eq=False)
-class DetectRequest(_Drawn):
+class DetectRequest(_RealisationRequest):
     """Arguments of `Engine.detect`."""
 
     quiet: Expectation
@@ -124,7 +124,7 @@ class DetectRequest(_Drawn):
 
 @validated
 @dataclass(frozen=True, eq=False)
-class SnrRequest(_Drawn):
+class SnrRequest(_RealisationRequest):
     """Arguments of `Engine.snr`."""
 
     expectation: Expectation
@@ -148,7 +148,7 @@ class SnrRequest(_Drawn):
 
 @validated
 @dataclass(frozen=True, eq=False)
-class RealiseRequest(_Drawn):
+class RealiseRequest(_RealisationRequest):
     """Arguments of `Engine.realise`, computed as a single shard, so callers limit the number of realisations."""
 
     expectation: Expectation
