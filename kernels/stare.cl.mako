@@ -1,13 +1,15 @@
 ## Frames of stares. Only the strengths of a few spectra vary between frames and stares; see
 ## mauvecl/lightcurve/stares/frame_components.py. Vector lanes are stares if pixels are drawn, and frames if sums are drawn.
 #define STARE_POINTERS(r) __global const StareJob *r stare_job, __global const uint *r numbers, __global const float *r known, \
-    __global const float *r curves, __global const uint *r kinds, __global const float *r flares, __global const float *r amplitudes
+    __global const float *r curves, __global const uint *r kinds, __global const float *r flares, __global const float *r amplitudes, \
+    __global const float *r losses
 #define STARE STARE_POINTERS(restrict)
 #define STARE_GIVEN STARE_POINTERS()
-#define STARE_PASSED stare_job, numbers, known, curves, kinds, flares, amplitudes
+#define STARE_PASSED stare_job, numbers, known, curves, kinds, flares, amplitudes, losses
 
 % if in_time:
 #define OF_FRAME(array) LOAD((array) + frame)
+#define LOST(stare) ${"OF_FRAME(losses + (size_t)(stare) * stride)" if pointing else "(floatv)0.0f"}
 % else:
 #define OF_FRAME(array) ((floatv)((array)[frame]))
 % endif
@@ -40,7 +42,7 @@ INLINE void unknowns_of(const StareJob stare_job, uintv realisation, uint realis
     }
 }
 
-INLINE Strengths strengths_of(STARE_GIVEN, uint frame, const floatv *jitter, const floatv *z)
+INLINE Strengths strengths_of(STARE_GIVEN, uint frame, const floatv *jitter, const floatv *z, floatv lost)
 {
     const uint stride = stare_job->padded_frames;
 % if jittered:
@@ -53,6 +55,10 @@ INLINE Strengths strengths_of(STARE_GIVEN, uint frame, const floatv *jitter, con
         for (uint kind = 0; kind < 4u; kind++)
             if (kinds[u] == kind) moved[kind] = FMA(z[u], more, moved[kind]);
     }
+% if pointing:
+    /* Light that the stare loses in the frame by drifts out of the fibre. */
+    moved[1] = TOGETHER(moved[1], -lost);
+% endif
     Strengths s;
     s.light = moved[1];
     s.star = FMA(OF_FRAME(known), TOGETHER(moved[1], moved[0]), OF_FRAME(known + stride));

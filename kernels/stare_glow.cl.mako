@@ -25,7 +25,7 @@ void stare_glow(__global const Job *restrict job, STARE, const uint first_low, c
         w[${4 * place}] = x.a; w[${4 * place + 1}] = x.b; w[${4 * place + 2}] = x.c; w[${4 * place + 3}] = x.d;
 % endfor
         for (uint i = 0; i < ${4 * n_words}u; i += 2u) normal_pair(w + i, z + i);
-        const Strengths strengths = strengths_of(STARE_PASSED, frame, z, unknown);
+        const Strengths strengths = strengths_of(STARE_PASSED, frame, z, unknown, LOST(stare));
         __global float *out = values + (size_t)(first_row + stare) * ${sums + 1}u * stride + frame;
 % for a in range(sums):
         STORE(z[${4 * jittered + a}u], out + ${a}u * stride);

@@ -22,7 +22,14 @@ void stare_pixels(SCENE, STARE, const uint first_low, const uint first_high, con
     normal_pair(w, jitter);
     normal_pair(w + 2, jitter + 2);
 % endif
-    const Strengths strengths = strengths_of(STARE_PASSED, frame, jitter, unknown);
+    floatv lost = (floatv)0.0f;
+% if pointing:
+    for (uint i = 0; i < ${width}u; i++) {
+        const uint row = least(most(item * ${width}u + i, start_row), stop_row - 1u) - start_row;
+        ((float *)&lost)[i] = losses[(size_t)row * stare_job->padded_frames + frame];
+    }
+% endif
+    const Strengths strengths = strengths_of(STARE_PASSED, frame, jitter, unknown, lost);
 % if spectra:
     /* Flares per stare, or common to all; lanes outside the wanted range use the nearest row. */
     floatv flare[${scenarios}][${spectra}];

@@ -62,7 +62,7 @@ void stare_sums(__global const Job *restrict job, STARE, const uint first_low, c
 % else:
         for (uint i = 0; i < ${4 * n_words}u; i += 2u) normal_pair(w + i, z + i);
 % endif
-        const Strengths strengths = strengths_of(STARE_PASSED, frame, z, unknown);
+        const Strengths strengths = strengths_of(STARE_PASSED, frame, z, unknown, LOST(stare));
         const floatv *y = z + ${4 * jittered}u;
         /* Quadratic terms of the skewness. */
 % for a, b in pairs:

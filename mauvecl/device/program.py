@@ -79,6 +79,7 @@ class Variant:
     counts: bool = False
     fourths: bool = False
     neighbours: bool = False
+    pointing: bool = False
     in_time: bool = False
 
     @property

@@ -126,7 +126,7 @@ class Stares:
         with self._launches(components, stare, flares, seed, method, processes) as launches:
 
             def work(tile: Tile, done: int) -> None:
-                launches.upload_flares(flares.part(done, tile.wanted))
+                launches.upload_flares(flares.part(done, tile.wanted), first + done, tile.wanted)
                 launches.draw(tile, out, done)
 
             self._tiles.for_each(first, count, out[:, 0].nbytes, work)
@@ -166,7 +166,7 @@ class Stares:
                 for few in tile.pieces(piece):
                     out = room[: each * few.wanted // 4].reshape(-1, few.wanted, *shape)
                     first = few.first + few.start
-                    launches.upload_flares(request.flares.part(first - request.start, few.wanted))
+                    launches.upload_flares(request.flares.part(first - request.start, few.wanted), first, few.wanted)
                     launches.draw(few, out, 0)
                     values = np.moveaxis(out[..., : stare.n_frames], 2, 3)[scenarios]
                     more = []

@@ -41,11 +41,13 @@ class StareLaunches(Launches):
             unknown_groups=-(-len(stare.kinds) // 4),
             counts=stare.counts,
             neighbours=bool(stare.components.quiet.neighbour_electrons.any()),
+            pointing=stare.stare.pointing is not None,
             fourths=table is not None and table.fourths,
             jittered=any(stare.stare.jitters.values()),
             in_time=self._by_sums,
         )
         super().__init__(device, scene, variant, seed)
+        self._seed = seed
         self._held: Any = None
         self._stare, self._local = stare, (1, 1) if variant.width > 1 else None
         self._known = [*map(self.upload, (stare.numbers, stare.known, stare.curves, stare.kinds))]
@@ -60,15 +62,21 @@ class StareLaunches(Launches):
         if self._held is not None:
             self._held.release()
 
-    def upload_flares(self, flares: Flares) -> None:
-        """Upload the flares of the next stares."""
+    def upload_flares(self, flares: Flares, first: int, count: int) -> None:
+        """Upload the flares and the pointing losses of the next `count` stares."""
         self._scenarios = len(flares.amplitudes)
         self._flares = [
             self._fill("stare_job", self._stare.stare_struct(flares)),
             *self._known,
             self._shared(flares.rows) if self._device.record.kind == "cpu" else self._fill("flares", flares.rows),
             self._fill("amplitudes", flares.amplitudes),
+            self._fill("losses", self._losses(first, count)),
         ]
+
+    def _losses(self, first: int, count: int) -> Floats:
+        if not self.variant.pointing:
+            return np.zeros(0, np.float32)
+        return self._stare.losses(np.arange(count, dtype=np.uint64) + np.uint64(first), self._seed)
 
     def _shared(self, array: NDArray[Any]) -> Any:
         """Return a buffer that shares the host's memory, valid until the next flares are uploaded."""

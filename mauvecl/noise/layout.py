@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mauvecl.noise.unknowns import ADDITIVE, CHANGING, PROCESSES
+from mauvecl.noise.unknowns import ADDITIVE, CHANGING, PROCESSES, STARE_PROCESSES
 
 WORD_BITS = 32
 
@@ -25,6 +25,7 @@ STREAMS = {
     "stare_frame": 17,
     "stare_sums": 18,
     "stare_glow": 19,
+    **{f"stare_{name}": process.stream for name, process in STARE_PROCESSES.items()},
     **{name: process.stream for name, process in ADDITIVE.items()},
     **{name: process.stream for name, process in PROCESSES.items()},
 }

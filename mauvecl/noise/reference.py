@@ -49,14 +49,16 @@ def philox(counter: Sequence[ArrayLike], seed: int) -> Words:
     return (c0.astype(np.uint32), c1.astype(np.uint32), c2.astype(np.uint32), c3.astype(np.uint32))
 
 
-def words_at(realisation: ArrayLike, frame: int, stream: str, group: ArrayLike, seed: int, exposure: int = 0) -> Words:
+def words_at(
+    realisation: ArrayLike, frame: ArrayLike, stream: str, group: ArrayLike, seed: int, exposure: int = 0
+) -> Words:
     """Return the four words that four neighbouring pixels of a realisation and frame share in a stream.
 
     Parameters
     ----------
     realisation : array_like of int
         64-bit indices.
-    frame : int
+    frame : array_like of int
     stream : str
         A key of `layout.STREAMS`.
     group : array_like of int
@@ -67,7 +69,9 @@ def words_at(realisation: ArrayLike, frame: int, stream: str, group: ArrayLike, 
     """
     index = np.asarray(realisation, dtype=np.uint64)
     last = np.uint64((exposure + layout.STREAMS[stream]) << 24) | np.asarray(group, dtype=np.uint64)
-    return philox((index & np.uint64(0xFFFFFFFF), index >> np.uint64(32), np.uint64(frame), last), seed)
+    return philox(
+        (index & np.uint64(0xFFFFFFFF), index >> np.uint64(32), np.asarray(frame, dtype=np.uint64), last), seed
+    )
 
 
 def fma(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> Floats:

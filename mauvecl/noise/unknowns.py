@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 from mauvecl.noise.additive import AdditiveProcess
 from mauvecl.noise.cosmic_rays import CosmicRays
+from mauvecl.noise.pointing import PointingDrifts
 from mauvecl.noise.priors import Normal, Prior, Uniform
 from mauvecl.schema.fields import range_of
 from mauvecl.schema.physical import DetectorTemperature
@@ -212,6 +213,9 @@ def _by_name(*rows: Row) -> dict[str, Row]:
 
 #: Additive processes: fields of `processes.Processes`, keys of studies' ``processes``.
 ADDITIVE: dict[str, type[AdditiveProcess]] = {"cosmic_rays": CosmicRays}
+#: Processes of all light during a stare, which are drawn and marginalised: keys of studies' ``stare``, fields of
+#: `lightcurve.stares.stare.Stare`.
+STARE_PROCESSES: dict[str, type[PointingDrifts]] = {"pointing": PointingDrifts}
 
 #: Processes in the order of their tables in kernels: fields of `processes.Processes`, keys of studies' ``processes``.
 PROCESSES = _by_name(

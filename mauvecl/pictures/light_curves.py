@@ -26,7 +26,7 @@ IN_SECONDS_S, IN_MINUTES_S = 600.0, 4 * 3600.0
 def light_curves(plt: Any, one: StarStare) -> Any:
     """Plot light curves in all bands, relative to the quiescent star.
 
-    Dotted lines are injected flares, triangles detections.
+    Dotted lines are injected flares, triangles detections. Shaded frames lose light in pointing drifts.
     """
     from mauvecl.answers.stares.stare import SearchResult
 
@@ -45,6 +45,10 @@ def light_curves(plt: Any, one: StarStare) -> Any:
             )
             axis.plot(time / scale, flux / level[k], ".", markersize=2, color=colour, alpha=0.6)
             axis.plot(time / scale, mean / level[k], color=NULL, linewidth=0.8)
+        lost = stare.numbers[:0] if one.pointing_loss is None else stare.numbers[one.pointing_loss > 0]
+        for part in _runs(lost) if lost.size else ():
+            first, last = lost[part[0]] * stare.frame_s, (lost[part[-1]] + 1) * stare.frame_s
+            axis.axvspan(first / scale, last / scale, color=NULL, alpha=0.2, linewidth=0)
         for flare in one.flares:
             axis.axvline(flare.event.peak_s / scale, color=NULL, linewidth=0.5, linestyle=":")
         if isinstance(one.search, SearchResult):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Literal
 
-from mauvecl.noise.unknowns import COURSES
+from mauvecl.noise.unknowns import COURSES, STARE_PROCESSES
 
 if TYPE_CHECKING:
     from mauvecl.study.study import Study
@@ -98,6 +98,7 @@ def _unknowns(study: Study, uses: Collection[Use]) -> str:
     if "stare" in uses:
         drawn += [name for name in KNOWN_CHANGES if getattr(s, name) is not None]
         drawn += [f"{course} of {', '.join(of)}" for course in COURSES if (of := getattr(s, course))]
+        drawn += [f"{process.label} (assumed)" for name, process in STARE_PROCESSES.items() if getattr(s, name)]
     usual = "drawn and marginalised" if {"nuisances", "stare"} & {*uses} else "drawn"
     parts = [f"the usual unknowns {usual}"] if n.usual else []
     parts += [f"drawn: {', '.join(drawn)}"] if drawn else []
@@ -115,7 +116,7 @@ def unused_unknowns(study: Study, uses: Collection[Use]) -> list[str]:
         "processes": [f"processes.{name}" for name, value in study.processes if value is not None],
         "nuisances": [f"nuisances.{name}" for name in n.spreads()] + [f"nuisances.own.{name}" for name in n.own],
         "stare": [f"stare.{name}" for name in KNOWN_CHANGES if getattr(s, name) is not None]
-        + [f"stare.{course}" for course in COURSES if getattr(s, course)],
+        + [f"stare.{name}" for name in (*COURSES, *STARE_PROCESSES) if getattr(s, name)],
         "values": ["unknowns.draws"] if study.unknowns.draws else [],
     }
     # Verbs of an orbit look at targets, not at the study's star.

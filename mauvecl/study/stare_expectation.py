@@ -15,7 +15,7 @@ from mauvecl.lightcurve.flares.events import Event, check_contributions, coeffic
 from mauvecl.lightcurve.stares.light_curves import StareExpectation
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.noise.priors import Normal, Prior
-from mauvecl.noise.unknowns import CHANGING, COURSES, PROCESSES, Changing, Course, default_spreads
+from mauvecl.noise.unknowns import CHANGING, COURSES, PROCESSES, STARE_PROCESSES, Changing, Course, default_spreads
 from mauvecl.schema.errors import InputError
 from mauvecl.study.stare_section import EventChoice
 
@@ -89,7 +89,7 @@ def stare_of(case: Case) -> Stare:
         spreads = {how: documented | spreads[how] for how, documented in default_spreads().items()}
 
     changes: dict[str, Any] = {name: getattr(q, name) for name in ("variability", "throughput", "sky")} | spreads
-    changes["orbit_s"] = q.orbit_s
+    changes |= {"orbit_s": q.orbit_s} | {name: getattr(q, name) for name in STARE_PROCESSES}
     if q.along_orbit:
         stare = _along_orbit(study, instrument.frame_s, changes)
     else:

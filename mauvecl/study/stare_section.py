@@ -11,7 +11,8 @@ from pydantic import Field, model_validator
 from mauvecl.lightcurve.defaults import ORBIT_S, SHAPE_NAMES, check_shape
 from mauvecl.lightcurve.flares.cooling import CoolingLaw
 from mauvecl.lightcurve.stares.curves import Curve
-from mauvecl.noise.unknowns import COURSES, Changing
+from mauvecl.noise.pointing import PointingDrifts
+from mauvecl.noise.unknowns import COURSES, STARE_PROCESSES, Changing
 from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Unit
@@ -65,6 +66,16 @@ class StareQuestion(Section):
     offsets: Annotated[Spreads, Help("Standard deviations of unknown constant changes")] = Field(default_factory=dict)
     drifts: Annotated[Spreads, Help("Standard deviations of unknown drifts per hour")] = Field(default_factory=dict)
     cycles: Annotated[Spreads, Help("Standard deviations of unknown cycles of the orbit")] = Field(default_factory=dict)
+    pointing: Annotated[
+        PointingDrifts | None,
+        Help("Drifts out of the fibre, each ended by a re-acquisition, all of it assumed"),
+        Flag(
+            "--pointing-drifts",
+            kind=float,
+            read=lambda rate, _: {"rate_per_h": rate},
+            help=Help("Drifts out of the fibre per hour, with assumed depth and duration", default="none"),
+        ),
+    ] = None
     number: Annotated[int, Range(0, 2**32 - 1), Help("Number of the drawn stare")] = 0
     half_width_s: Annotated[Duration, Help("Half-width of the flares"), Flag("--half-width")] = 60.0
     shape: ShapeName = "davenport2014"
@@ -99,7 +110,7 @@ class StareQuestion(Section):
     @property
     def has_unknowns(self) -> bool:
         """True if the stare has unknown changes."""
-        return any(getattr(self, course) for course in COURSES)
+        return any(getattr(self, name) for name in (*COURSES, *STARE_PROCESSES))
 
     def all_gaps(self) -> list[tuple[float, float]]:
         """Return the given gaps and the gap at the end of every orbit."""

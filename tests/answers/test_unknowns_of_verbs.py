@@ -13,7 +13,7 @@ from answers import small
 from mauvecl.answers.verbs import VERBS
 from mauvecl.device.engine import Engine
 from mauvecl.device.stare_engine import Stares
-from mauvecl.noise.unknowns import ADDITIVE, NUISANCES, PROCESSES, STARE_CHANGES
+from mauvecl.noise.unknowns import ADDITIVE, NUISANCES, PROCESSES, STARE_CHANGES, STARE_PROCESSES
 from mauvecl.schema.errors import InputError
 from mauvecl.study.assumptions import unused_unknowns
 from mauvecl.study.study import Study
@@ -42,6 +42,7 @@ UNKNOWNS: dict[str, dict[str, Any]] = (
         for course, rows in STARE_CHANGES.items()
         for name in rows
     }
+    | {f"stare.{name}": {"stare": {name: {"rate_per_h": 20.0}}} for name in STARE_PROCESSES}
 )
 FEW = {"realisations": 2000, "fap": 0.1, "seed": 2, "statistics": ["matched"]}
 #: A bank of two half-widths, whose threshold is the closed form.

@@ -19,6 +19,7 @@ from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.stares.stare_requests import StaresRequest
 from mauvecl.lightcurve.stares.stare_scene import Flares, StareScene
 from mauvecl.lightcurve.stares.sum_cumulants import SumTable
+from mauvecl.noise.pointing import PointingDrifts
 from mauvecl.noise.processes import CosmicRays, Processes
 from mauvecl.results.requests.requests import Shard
 
@@ -32,6 +33,7 @@ WOBBLE: dict[str, Any] = {
     "thermal": 0.5,
     "gaps": [(20.0, 60.0)],
 }
+DRIFTING: dict[str, Any] = {"pointing": PointingDrifts(rate_per_h=100.0, duration_s=30.0, depth=0.9)}
 #: Payload, stare, sums, flare temperatures, scenarios, further words.
 CASES: dict[str, tuple[dict[str, Any], dict[str, Any], int, int, int, dict[str, Any]]] = {
     "plain": ({}, {}, 1, 0, 0, {}),
@@ -42,6 +44,8 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any], int, int, int, dict[str, 
     "cold, fourth cumulants": ({"temperature_c": -20.0, "output_max_nm": 303.0}, WOBBLE, 2, 1, 0, {}),
     "Poisson photons": ({"photon_noise": "poisson"}, WOBBLE, 3, 1, 0, {}),
     "neighbours": ({}, WOBBLE, 3, 2, 0, {}),
+    "pointing drifts": ({}, WOBBLE | DRIFTING, 3, 2, 3, {}),
+    "pointing drifts alone": ({}, DRIFTING, 2, 1, 0, {}),
     "cosmic rays": ({}, WOBBLE, 2, 1, 2, {"processes": Processes(cosmic_rays=CosmicRays(rate_per_cm2_s=200.0))}),
 }
 
@@ -68,7 +72,7 @@ def stares(request: pytest.FixtureRequest, engine: Engine) -> Stares:
     return Stares(engine.open_device) if request.param == "vectors" else Stares(width=1)
 
 
-@pytest.mark.parametrize("name", long_but(CASES, "plain", "all that wobbles", "neighbours"))
+@pytest.mark.parametrize("name", long_but(CASES, "plain", "all that wobbles", "neighbours", "pointing drifts"))
 @pytest.mark.parametrize("method", ["pixels", "cumulants"])
 def test_stares_equal_the_reference(stares: Stares, name: str, method: Any) -> None:
     components, stare, flare, amplitudes, more = case(name)

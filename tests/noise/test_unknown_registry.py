@@ -15,6 +15,7 @@ from mauvecl.noise.unknowns import (
     NUISANCES,
     PROCESSES,
     STARE_CHANGES,
+    STARE_PROCESSES,
     default_processes,
     default_spreads,
 )
@@ -36,7 +37,7 @@ def test_keys_of_studies_are_the_registry() -> None:
     assert list(Processes.model_fields) == [*ADDITIVE, *PROCESSES]
     assert list(NuisanceChoice.model_fields) == ["usual", *NUISANCES, "own"]
     assert list(Unknowns.model_fields) == ["draws", *INSTRUMENT_VALUES, "known"]
-    assert set(COURSES) <= StareQuestion.model_fields.keys()
+    assert {*COURSES, *STARE_PROCESSES} <= StareQuestion.model_fields.keys()
 
 
 def test_every_default_prior_has_a_source_or_documentation() -> None:

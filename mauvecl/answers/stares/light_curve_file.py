@@ -87,11 +87,17 @@ def _table(one: StarStare) -> fits.BinTableHDU:
         suffix = "" if k == 0 else "_" + name.removesuffix(" nm").replace("-", "_")
         for column, values in (("FLUX", light.flux), ("FLUX_ERR", light.sd), ("MEAN", light.mean)):
             columns.append((column + suffix, "E", "adu/s", values[:, k]))
+    if one.pointing_loss is not None:
+        columns.append(("POINTING_LOSS", "E", None, one.pointing_loss))
     made = [fits.Column(name=n, format=form, unit=unit, array=values) for n, form, unit, values in columns]
     hdu = fits.BinTableHDU.from_columns(made, name="LIGHTCURVE")
     hdu.header["BANDS"] = ", ".join(light.bands)
     hdu.header["COMMENT"] = "FLUX: star and sky, bias and known dark taken off. MEAN: the same without noise."
     hdu.header["COMMENT"] = "TIME: middle of the frame, days after MJDREF. QUALITY 1: saturated pixels. 0: none."
+    if one.pointing_loss is not None:
+        lost = int(np.count_nonzero(one.pointing_loss))
+        hdu.header["LOSTFRMS"] = (lost, "frames that lost light, assumed drifts")
+        hdu.header["COMMENT"] = "POINTING_LOSS: share of all light lost in the frame, as drawn."
     return hdu
 
 

@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from mauvecl.answers.answer import Answer, InCell
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from mauvecl.runs.checkpoint import Checkpoint
     from mauvecl.study.assumptions import Use
 
+Float = NDArray[np.float64]
 KINDS: tuple[Kind, ...] = ("band", "bolometric")
 #: Largest number of frames of light curves in text files; longer ones are in FITS files only.
 MOST_ROWS = 100_000
@@ -86,6 +88,8 @@ class StarStare(InCell):
     flares: tuple[StareFlare, ...]
     light: LightCurves
     search: SearchResult | str | None = None
+    # Share of all light that each frame lost in pointing drifts, shape (n_frame,); None unless drifts are drawn.
+    pointing_loss: Float | None = None
 
     @property
     def found(self) -> list[FoundFlare]:
@@ -133,6 +137,10 @@ SEARCHED_COLUMNS = (
 SATURATED_COLUMN = Column(
     "saturated_frames", lambda one: int(np.count_nonzero(one.staring.quality)), "",
     "frames in which the mean of a used pixel reaches saturation", "saturated",
+)  # fmt: skip
+POINTING_COLUMN = Column(
+    "drifting_frames", lambda one: int(np.count_nonzero(one.pointing_loss)), "",
+    "frames that lost light in pointing drifts, which are assumptions", "drifting",
 )  # fmt: skip
 #: Columns of the table of flares, for `StareFlare`.
 EVENT_COLUMNS = (
@@ -204,6 +212,10 @@ FRAME_COLUMNS = (
     Column("frame", "stare.numbers", "", "number of the frame, gaps included"),
     Column("quality", "quality", "", "1 where the mean of a used pixel reaches saturation"),
 )
+LOSS_COLUMN = Column(
+    "pointing_loss", "", "",
+    "share of all light that the frame lost in pointing drifts, as drawn; an observer does not know it",
+)  # fmt: skip
 LIGHT = {
     "flux": "net light, bias and known dark taken off",
     "flux_err": "standard deviation of its photons, dark and reading",
@@ -238,7 +250,8 @@ class StareAnswer(Answer):
     @property
     def _columns(self) -> tuple[Column, ...]:
         searched = SEARCHED_COLUMNS if self.study.stare.search else ()
-        return (*place_columns(self.study), *COLUMNS, *searched, SATURATED_COLUMN)
+        drifting = () if self.study.stare.pointing is None else (POINTING_COLUMN,)
+        return (*place_columns(self.study), *COLUMNS, *searched, SATURATED_COLUMN, *drifting)
 
     @property
     def events(self) -> QTable:
@@ -298,7 +311,9 @@ class StareAnswer(Answer):
         light = {"flux": one.light.flux, "flux_err": one.light.sd, "mean": one.light.mean}
         values = {kind + suffix: light[kind][:, k] for k, suffix in enumerate(suffixes) for kind in LIGHT}
         about = {"star": one.label, "study": self.study.text(), "seed": self.study.run.seed, **one.at}
-        frames = (column.of(itemgetter("stare")) for column in FRAME_COLUMNS)
+        frames = [column.of(itemgetter("stare")) for column in FRAME_COLUMNS]
+        if one.pointing_loss is not None:
+            frames.append(replace(LOSS_COLUMN, get=lambda _: one.pointing_loss))
         return table_of((*frames, *bands), [{"stare": one.staring, **values}], **about)
 
     @property
@@ -388,11 +403,25 @@ def stare(
         for one in drawn
         if isinstance(one.search, SearchResult) and one.search.shifted
     ]
+    messages += [line for one in drawn for line in _pointing_lines(one)]
     for one in drawn:
         cut = int(np.count_nonzero(one.staring.quality))
         if cut:
             messages.insert(0, f"SATURATED: {cut} frames of the stare at {one.title}; their quality is 1.")
     return StareAnswer(study, drawn, messages)
+
+
+def _pointing_lines(one: StarStare) -> list[str]:
+    """Return the message about frames that lost light in pointing drifts, if drifts are drawn."""
+    lost, drifts = one.pointing_loss, one.staring.stare.pointing
+    if lost is None or drifts is None:
+        return []
+    many = int(np.count_nonzero(lost))
+    return [
+        f"POINTING DRIFTS: {many} of {lost.size} frames at {one.title} lose light, up to {100 * lost.max():.3g} %; "
+        f"assumed: {drifts.rate_per_h:g} drifts per hour of {drifts.duration_s:g} s on average, with up to "
+        f"{100 * drifts.depth:g} % of the light lost. The search marginalises over the level of each frame."
+    ]
 
 
 def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStare:
@@ -410,7 +439,10 @@ def _draw(case: Case, stares: Stares, checkpoint: Checkpoint | None) -> StarStar
 
     light = draw_light_curves(staring, q.bands_nm, draw)
     searched = _search(case, draw, checkpoint) if q.search else None
-    return StarStare(case.label, case.at, staring, _flares(case), light, searched)
+    lost = None
+    if staring.stare.pointing is not None:
+        lost = staring.stare.pointing_losses(np.array([q.number], np.uint64), seed)[0]
+    return StarStare(case.label, case.at, staring, _flares(case), light, searched, lost)
 
 
 def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> SearchResult | str:

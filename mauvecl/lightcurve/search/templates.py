@@ -167,6 +167,9 @@ def frame_nuisances(
     """
     names = {"light": "light", "sky": "sky", "temperature": "dark"}
     jitters = {names[of]: sd for of, sd in stare.jitters.items() if sd > 0}
+    # Drifts and re-acquisitions change all light alike, by any amount and at any time.
+    drifting = {} if stare.pointing is None else {"light": np.inf}
+    jitters |= drifting
     if isinstance(more, Nuisances):
         mine = Nuisances.of(quiet, {name: sd for name, sd in jitters.items() if name not in more.names})
         return replace(
@@ -175,5 +178,5 @@ def frame_nuisances(
             spectra=np.vstack([more.spectra, mine.spectra]),
             sd=np.concatenate([more.sd, mine.sd]),
         )
-    spreads = jitters | dict(more or {})
+    spreads = jitters | dict(more or {}) | drifting
     return Nuisances.of(quiet, spreads) if spreads else None

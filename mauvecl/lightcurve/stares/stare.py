@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mauvecl.lightcurve.defaults import ORBIT_S
 from mauvecl.lightcurve.stares.curves import Curve, Sinusoid
+from mauvecl.noise.pointing import PointingDrifts
 from mauvecl.noise.unknowns import CHANGING, STARE_CHANGES, Changing
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -75,6 +76,8 @@ class Stare:
         Standard deviation from frame to frame, deg C.
     unknowns : tuple of StareUnknown
         Changes that differ between stares.
+    pointing : PointingDrifts, optional
+        Drifts out of the fibre, drawn for each stare, by which all light is multiplied as well.
 
     Examples
     --------
@@ -94,6 +97,7 @@ class Stare:
     sky_jitter: float = 0.0
     temperature_jitter_c: float = 0.0
     unknowns: tuple[StareUnknown, ...] = ()
+    pointing: PointingDrifts | None = None
 
     def __post_init__(self) -> None:
         for name in ("start_s", "star", "light", "sky", "temperature_c"):
@@ -153,6 +157,7 @@ class Stare:
         offsets: Mapping[Changing, float] | None = None,
         drifts: Mapping[Changing, float] | None = None,
         cycles: Mapping[Changing, float] | None = None,
+        pointing: PointingDrifts | None = None,
     ) -> Self:
         """Return a stare from its duration, gaps and changes.
 
@@ -178,6 +183,8 @@ class Stare:
         offsets, drifts, cycles : mapping of {"star", "light", "sky", "temperature"} to float, optional
             Standard deviations over stares of an unknown level, of an unknown change per hour that is zero in the
             middle, and of the sine and cosine of an unknown orbital cycle.
+        pointing : PointingDrifts, optional
+            Drifts out of the fibre with re-acquisitions.
 
         Raises
         ------
@@ -211,6 +218,7 @@ class Stare:
             spread.get("sky", 0.0),
             spread.get("temperature", 0.0),
             _unknowns(start, float(frame_s), orbit_s, offsets or {}, drifts or {}, cycles or {}),
+            pointing,
         )
 
     @classmethod
@@ -257,6 +265,19 @@ class Stare:
         first = np.concatenate([[0], breaks + 1])
         last = np.concatenate([breaks, [self.n_frames - 1]])
         return np.column_stack([self.start_s[first], self.start_s[last] + self.frame_s])
+
+    def pointing_losses(self, numbers: NDArray[np.uint64], seed: int) -> Float:
+        """Return the share of all light that frames of stares lose in drifts, shape (n_stare, n_frame).
+
+        Parameters
+        ----------
+        numbers : ndarray, shape (n_stare,)
+            Numbers of the stares.
+        seed : int
+        """
+        if self.pointing is None:
+            return np.zeros((len(numbers), self.n_frames))
+        return self.pointing.losses(numbers, self.start_s, self.frame_s, seed)
 
     def dark_factor(self, quiet: Expectation) -> Float:
         """Return the factor on an expectation's dark current in each frame, shape (n_frame,)."""

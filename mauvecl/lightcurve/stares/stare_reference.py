@@ -30,7 +30,7 @@ def exponential_less_one(x: Floats) -> Floats:
     return fma(scale, fma(r * r, q, r), scale - np.float32(1.0))
 
 
-def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int) -> dict[str, Floats]:
+def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int, lost: Floats) -> dict[str, Floats]:
     """Draw what some stares have in a frame: coefficients of the steady components and the factor on light, minus one.
 
     Returns
@@ -48,6 +48,8 @@ def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int) -> dic
         moved[name] = fma(z, scene.curves[u, frame], moved[name])
     star, star_less_one, sky, sky_less_one, dark, dark_less_one, near, near_less_one, _ = scene.known[:, frame]
     light = moved["light"]
+    if scene.stare.pointing is not None:
+        light = combine_factors(light, -lost[:, frame])
     return {
         "star": fma(star, combine_factors(light, moved["star"]), star_less_one),
         "sky": fma(sky, combine_factors(light, moved["sky"]), sky_less_one),
@@ -64,12 +66,12 @@ def glow(scene: StareScene, numbers: Numbers, frames: Iterable[int], seed: int) 
     -------
     ndarray of float32, shape (n_stare, n_frame, n_statistic + 1)
     """
-    out = []
+    out, lost = [], scene.losses(numbers, seed)
     for frame in frames:
         z: list[Floats] = []
         for group in range(-(-len(scene.weights) // 4)):
             z += four_normals(reference.words_at(numbers, int(scene.numbers[frame]), "stare_glow", group, seed))
-        out.append([*z[: len(scene.weights)], strengths(scene, numbers, frame, seed)["light"]])
+        out.append([*z[: len(scene.weights)], strengths(scene, numbers, frame, seed, lost)["light"]])
     return np.moveaxis(np.array(out), (0, 1, 2), (1, 2, 0))
 
 
@@ -86,9 +88,9 @@ def pixels(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable
     -------
     ndarray of float32, shape (n_scenario, n_stare, n_frame, n_statistic)
     """
-    out = []
+    out, lost = [], scene.losses(numbers, seed)
     for frame in frames:
-        conditions = strengths(scene, numbers, frame, seed)
+        conditions = strengths(scene, numbers, frame, seed, lost)
         sums = np.zeros((len(flares.amplitudes), 4, len(scene.weights), len(numbers)), np.float32)
         for group in range(len(scene.mixtures) // 4):
             drawn = reference.draws(scene.scene, numbers, int(scene.numbers[frame]), group, seed)
@@ -143,9 +145,9 @@ def sums(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[i
     ndarray of float32, shape (n_scenario, n_stare, n_frame, n_statistic)
     """
     table = SumTable.of(scene.components)
-    out = []
+    out, lost = [], scene.losses(numbers, seed)
     for frame in frames:
-        conditions = strengths(scene, numbers, frame, seed)
+        conditions = strengths(scene, numbers, frame, seed, lost)
         z: list[Floats] = []
         for group in range(-(-len(scene.weights) // 4)):
             z += four_normals(reference.words_at(numbers, int(scene.numbers[frame]), "stare_sums", group, seed))

@@ -182,6 +182,10 @@ class StareScene:
         stare_job["flare_rows"] = len(flares.given)
         return stare_job.reshape(1)
 
+    def losses(self, numbers: NDArray[np.uint64], seed: int) -> Floats:
+        """Return the share of all light that padded frames of stares lose, shape (n_stare, n_padded_frame)."""
+        return np.asarray(_padded(self.stare.pointing_losses(numbers, seed), np.float32))
+
     def job(self, seed: int) -> NDArray[np.void]:
         """Return the job of a frame with a seed, shape (1,)."""
         job = self.scene.job.copy()
@@ -216,6 +220,8 @@ class StareScene:
         ends = []
         for sign, of in ((-1.0, np.min), (1.0, np.max)):
             light, star, sky = (1.0 + sign * REACH_SIGMA * spread[name] for name in ("light", "star", "sky"))
+            if sign < 0 and stare.pointing is not None:
+                light = light * (1.0 - stare.pointing.depth)
             warm = np.exp(sign * REACH_SIGMA * abs(self.stare_job["dark_slope"]) * spread["temperature"])
             known = (stare.light * stare.star * light * star, stare.light * stare.sky * light * sky)
             dark = stare.dark_factor(self.components.quiet) * warm
