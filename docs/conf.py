@@ -4,7 +4,9 @@ from importlib.metadata import version as installed
 from pathlib import Path
 
 from astropy.table import Table
+from pydantic import BaseModel
 
+from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.schema.reference import keys_of
 from mauvecl.study.study import Study
 
@@ -55,15 +57,19 @@ def bench_tables() -> None:
         (folder / f"{path.stem}.rst").write_text("\n".join(lines), encoding="utf-8")
 
 
-def study_keys() -> None:
-    """Write the reference of all keys of a study."""
-    lines = [".. list-table::", "   :header-rows: 1", "   :widths: 20 36 22 12 10", ""]
-    for key, *cells in keys_of(Study):
-        lines += [f"   * - ``{key}``", *(f"     - {cell.replace('*', chr(92) + '*')}" for cell in cells)]
-    head = ["   * - key", *(f"     - {name}" for name in ("meaning", "accepted", "default", "flag"))]
-    lines[4:4] = head
-    (Path(__file__).parent / "_generated" / "study_keys.rst").write_text("\n".join(lines) + "\n", encoding="utf-8")
+def write_keys(section: type[BaseModel], name: str, columns: tuple[str, ...]) -> None:
+    """Write the reference of all keys of a section as a table that a page includes."""
+    widths = {"meaning": 36, "accepted": 22, "default": 12, "flags": 10}
+    lines = [".. list-table::", "   :header-rows: 1", f"   :widths: 20 {' '.join(str(widths[one]) for one in columns)}"]
+    lines += ["", "   * - key", *(f"     - {one}" for one in columns)]
+    for key in keys_of(section):
+        lines += [
+            f"   * - ``{key.path}``",
+            *(f"     - {getattr(key, one).replace('*', chr(92) + '*')}" for one in columns),
+        ]
+    (Path(__file__).parent / "_generated" / f"{name}.rst").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 bench_tables()
-study_keys()
+write_keys(Study, "study_keys", ("meaning", "accepted", "default", "flags"))
+write_keys(Instrument, "instrument_keys", ("meaning", "accepted"))

@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 import mauvecl
 from mauvecl import bulk
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import AnyUnit, Range, Unit
-from mauvecl.schema.quantities import unit_of
+from mauvecl.schema.fields import AnyUnit, Range, Unit, first
 from mauvecl.schema.records import Record
 
 #: Modules below the validation, and the inner interface of statistics, whose methods public classes inherit.
@@ -182,13 +181,22 @@ def test_whole_numbers_may_be_floats(path: str, name: str) -> None:
         check(7.5)
 
 
+#: Values of an instrument without a unit.
+DIMENSIONLESS = {
+    "pointing_loss", "coupling_loss", "light_loss", "telescope_mirrors", "spectrometer_mirrors", "couplings", "pixels",
+    "adc_bits",
+}  # fmt: skip
+
+
 @pytest.mark.parametrize(
     "name", [n for n, f in mauvecl.Instrument.model_fields.items() if f.annotation in (float, int)]
 )
 def test_instruments_take_quantities(name: str) -> None:
     mauve = mauvecl.Instrument.load("mauve")
     value = getattr(mauve, name)
-    quantity = value * u.Unit(unit_of(name)) if unit_of(name) else value * u.one
+    unit = first(mauvecl.Instrument.model_fields[name], Unit)
+    assert unit is not None or name in DIMENSIONLESS
+    quantity = value * (u.one if unit is None else u.Unit(unit.name))
     assert getattr(mauve.with_(**{name: quantity}), name) == pytest.approx(value)
     with pytest.raises(InputError) as error:
         mauve.with_(**{name: 3 * u.kg})

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import hashlib
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
 
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Unit
-from mauvecl.schema.physical import DetectorTemperature
-from mauvecl.schema.quantities import count, is_quantity, number, numbers, unit_of
-from mauvecl.schema.records import Record, input_error
+from mauvecl.schema.fields import Help, Range, Unit
+from mauvecl.schema.physical import DetectorTemperature, Exposure, Positive, Wavelength
+from mauvecl.schema.quantities import count, is_quantity, numbers, word_of
+from mauvecl.schema.records import input_error
+from mauvecl.schema.section import Section
 
 from .curve import Curve
 from .pixel_map import MAX_PIXELS, PixelMap
@@ -32,11 +34,16 @@ ELECTRON_C = 1.602176634e-19
 Float = NDArray[np.float64]
 
 
-def _as_curve(value: Any) -> Any:
-    """Convert a path, or one number for all wavelengths, to a curve."""
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        return Curve.flat(float(value))
-    return Curve.read(value) if isinstance(value, str | Path) else value
+def _as_curve(value: Any, unit: str) -> Any:
+    """Convert a path, or one number or Quantity for all wavelengths, to a curve."""
+    try:
+        plain = Unit(unit).plain(value)
+    except ValueError:
+        expected = f"a curve, a path or {word_of(unit)}"
+        raise PydanticCustomError("expected", "Input should be {expected}", {"expected": expected}) from None
+    if isinstance(plain, int | float) and not isinstance(plain, bool):
+        return Curve.flat(float(plain))
+    return Curve.read(plain) if isinstance(plain, str | Path) else plain
 
 
 def _as_map(value: Any) -> Any:
@@ -55,64 +62,24 @@ def _fraction(curve: Curve) -> Curve:
     return curve
 
 
-AnyCurve = Annotated[Curve, BeforeValidator(_as_curve)]
-Fraction = Annotated[float, Field(ge=0, le=1)]
-Loss = Annotated[float, Field(ge=0, lt=1)]
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
-Count = Annotated[int, Field(ge=0, le=20)]
+Efficiency = Annotated[Curve, BeforeValidator(partial(_as_curve, unit=""))]
+Responsivity = Annotated[Curve, BeforeValidator(partial(_as_curve, unit="A / W"))]
+Loss = Annotated[float, Range(0, 1, open_high=True)]
+NotNegative = Annotated[float, Range(0)]
+Count = Annotated[int, Range(0, 20)]
+#: Width of a line spread function; 0 for none.
+Width = Annotated[float, Unit("nm"), Range(0, 500)]
 Wavelengths = Annotated[ArrayLike, Unit("nm")]
 
 
 @validated
-class Instrument(Record):
+class Instrument(Section):
     """A frozen description of an instrument, with units in the names.
 
     `Instrument.load` reads an instrument, and `with_` returns a changed copy. The values of the nominal payload, each
-    with source and tag, are in `instruments/mauve.toml`; none is a flight calibration.
-
-    Attributes
-    ----------
-    name : str
-    notice : str
-        Remark on the values that every report repeats.
-    sources : dict of str
-        "tag: source" of each value by name, with the tags P paper, D datasheet, C computed, A assumption, U user.
-    collecting_area_cm2, field_of_view_radius_arcsec, pointing_loss : float
-    grating_efficiency, fibre_efficiency, telescope_mirror_reflectivity, spectrometer_mirror_reflectivity : Curve
-    collection_lens_efficiency, window_efficiency : Curve
-    coupling_loss, light_loss : float
-    telescope_mirrors, spectrometer_mirrors, couplings : int
-        Number of each in the optical path.
-    pixels : int
-    pixel_zero_nm, dispersion_nm_per_pixel : float
-        Centre of pixel 0 and linear dispersion.
-    output_min_nm, output_max_nm : float
-        Closed range of the centres of the pixels that are read.
-    top_hat_width_nm, gaussian_fwhm_nm : float
-        Line spread function: a top hat of this full width convolved with a Gaussian; either may be 0 (none), not both.
-    resolution_element_nm : float
-    quantum_efficiency_a_per_w : Curve
-    conversion_uv_per_electron, adc_range_v, saturation_v : float
-    adc_bits : int
-    temperature_c : float
-        Temperature of the detector, -40 to 65.
-    dark_scale_dn_per_s, dark_slope_per_c : float
-        Dark current is dark_scale_dn_per_s * exp(dark_slope_per_c * temperature_c).
-    dark_unit : {"DN", "electrons"}
-        Unit in which the dark counts follow a Poisson distribution.
-    photon_noise : {"gaussian", "poisson"}
-        Distribution of the photons about their mean.
-    read_noise_dn, bias_dn, frame_s : float
-    pixel_map : PixelMap, optional
-        Deviations of single pixels from these values.
-    throughput_factor : Curve, optional
-        Calibrated throughput over that of the curves and losses above; the end values hold beyond its knots.
-    throughput_errors : ThroughputErrors, optional
-        Uncertainty of the calibrated throughput.
-    throughput_amplitudes : tuple of float
-        Amplitudes of the modes of `throughput_errors`, the first ones first, by which the throughput differs from the
-        calibrated one.
+    with source and tag, are in `instruments/mauve.toml`; none is a flight calibration. The dark current is
+    dark_scale_dn_per_s * exp(dark_slope_per_c * temperature_c). The line spread function is a top hat convolved with a
+    Gaussian, either of which may have no width.
 
     Examples
     --------
@@ -126,52 +93,76 @@ class Instrument(Record):
 
     model_config = ConfigDict(strict=True, arbitrary_types_allowed=True)
 
-    name: str = Field(min_length=1)
-    notice: str
-    sources: dict[str, str] = Field(default_factory=dict, repr=False)
+    name: Annotated[str, Field(min_length=1), Help("Name")]
+    notice: Annotated[str, Help("Remark on the values that every report repeats")]
+    sources: Annotated[
+        dict[str, str],
+        Field(repr=False),
+        Help("Tag and source of each value by name", "P paper, D datasheet, C computed, A assumption, U user"),
+    ] = Field(default_factory=dict)
 
-    collecting_area_cm2: Positive
-    field_of_view_radius_arcsec: Positive
-    pointing_loss: Loss
+    collecting_area_cm2: Annotated[Positive, Unit("cm2"), Help("Collecting area")]
+    field_of_view_radius_arcsec: Annotated[Positive, Unit("arcsec"), Help("Radius of the field of view")]
+    pointing_loss: Annotated[Loss, Help("Fraction of the light that is lost by pointing")]
 
-    grating_efficiency: AnyCurve
-    fibre_efficiency: AnyCurve
-    telescope_mirror_reflectivity: AnyCurve
-    telescope_mirrors: Count
-    spectrometer_mirror_reflectivity: AnyCurve
-    spectrometer_mirrors: Count
-    collection_lens_efficiency: AnyCurve
-    window_efficiency: AnyCurve
-    coupling_loss: Loss
-    couplings: Count
-    light_loss: Loss
+    grating_efficiency: Annotated[Efficiency, Help("Efficiency of the grating")]
+    fibre_efficiency: Annotated[Efficiency, Help("Efficiency of the fibre")]
+    telescope_mirror_reflectivity: Annotated[Efficiency, Help("Reflectivity of a mirror of the telescope")]
+    telescope_mirrors: Annotated[Count, Help("Number of mirrors of the telescope")]
+    spectrometer_mirror_reflectivity: Annotated[Efficiency, Help("Reflectivity of a mirror of the spectrometer")]
+    spectrometer_mirrors: Annotated[Count, Help("Number of mirrors of the spectrometer")]
+    collection_lens_efficiency: Annotated[Efficiency, Help("Efficiency of the collection lens")]
+    window_efficiency: Annotated[Efficiency, Help("Efficiency of the detector's window")]
+    coupling_loss: Annotated[Loss, Help("Fraction of the light that is lost at a coupling")]
+    couplings: Annotated[Count, Help("Number of couplings")]
+    light_loss: Annotated[Loss, Help("Fraction of the light that is lost elsewhere")]
 
-    pixels: int = Field(ge=1, le=MAX_PIXELS)
-    pixel_zero_nm: float
-    dispersion_nm_per_pixel: Positive
-    output_min_nm: Positive
-    output_max_nm: Positive
-    top_hat_width_nm: float = Field(ge=0, le=500)
-    gaussian_fwhm_nm: float = Field(ge=0, le=500)
-    resolution_element_nm: Positive
+    pixels: Annotated[int, Range(1, MAX_PIXELS), Help("Number of pixels")]
+    pixel_zero_nm: Annotated[float, Unit("nm"), Range(), Help("Wavelength of the centre of pixel 0")]
+    dispersion_nm_per_pixel: Annotated[Positive, Unit("nm / pix"), Help("Linear dispersion")]
+    output_min_nm: Annotated[Wavelength, Help("Smallest wavelength of the centre of a pixel that is read")]
+    output_max_nm: Annotated[Wavelength, Help("Largest wavelength of the centre of a pixel that is read")]
+    top_hat_width_nm: Annotated[Width, Help("Full width of the top hat of the line spread function")]
+    gaussian_fwhm_nm: Annotated[Width, Help("Full width at half maximum of its Gaussian")]
+    resolution_element_nm: Annotated[Wavelength, Help("Width of a resolution element")]
 
-    quantum_efficiency_a_per_w: AnyCurve
-    conversion_uv_per_electron: Positive
-    adc_bits: int = Field(ge=1, le=24)
-    adc_range_v: Positive
-    saturation_v: Positive
-    temperature_c: DetectorTemperature
-    dark_scale_dn_per_s: NotNegative
-    dark_slope_per_c: float = Field(ge=-1, le=1)
-    dark_unit: Literal["DN", "electrons"]
-    photon_noise: Literal["gaussian", "poisson"] = "gaussian"
-    read_noise_dn: NotNegative
-    bias_dn: NotNegative
-    frame_s: float = Field(gt=0, le=86_400)
-    pixel_map: Annotated[PixelMap | None, BeforeValidator(_as_map)] = None
-    throughput_factor: Annotated[Curve | None, BeforeValidator(_as_curve)] = None
-    throughput_errors: Annotated[ThroughputErrors | None, BeforeValidator(_as_errors)] = None
-    throughput_amplitudes: tuple[float, ...] = ()
+    quantum_efficiency_a_per_w: Annotated[Responsivity, Help("Responsivity of the detector, A/W")]
+    conversion_uv_per_electron: Annotated[Positive, Unit("uV / electron"), Help("Voltage per electron")]
+    adc_bits: Annotated[int, Range(1, 24), Help("Bits of the converter")]
+    adc_range_v: Annotated[Positive, Unit("V"), Help("Voltage of the converter's full range")]
+    saturation_v: Annotated[Positive, Unit("V"), Help("Voltage at which the detector saturates")]
+    temperature_c: Annotated[DetectorTemperature, Help("Temperature of the detector")]
+    dark_scale_dn_per_s: Annotated[NotNegative, Unit("DN / s"), Help("Dark current at 0 deg C")]
+    dark_slope_per_c: Annotated[
+        float, Unit("1 / K"), Range(-1, 1), Help("Relative change of the dark current per degree")
+    ]
+    dark_unit: Annotated[
+        Literal["DN", "electrons"], Help("Unit in which the dark counts follow a Poisson distribution")
+    ]
+    photon_noise: Annotated[Literal["gaussian", "poisson"], Help("Distribution of the photons about their mean")] = (
+        "gaussian"
+    )
+    read_noise_dn: Annotated[NotNegative, Unit("DN"), Help("Read noise of a frame")]
+    bias_dn: Annotated[NotNegative, Unit("DN"), Help("Bias")]
+    frame_s: Annotated[Exposure, Help("Length of a frame")]
+    pixel_map: Annotated[
+        PixelMap | None, BeforeValidator(_as_map), Help("Deviations of single pixels from these values")
+    ] = None
+    throughput_factor: Annotated[
+        Curve | None,
+        BeforeValidator(partial(_as_curve, unit="")),
+        Help("Calibrated throughput over that of the curves and losses above, with the end values beyond its knots"),
+    ] = None
+    throughput_errors: Annotated[
+        ThroughputErrors | None, BeforeValidator(_as_errors), Help("Uncertainty of the calibrated throughput")
+    ] = None
+    throughput_amplitudes: Annotated[
+        tuple[float, ...],
+        Help(
+            "Amplitudes of the modes of `throughput_errors`, the first ones first, by which the throughput differs from "
+            "the calibrated one"
+        ),
+    ] = ()
 
     @classmethod
     def load(cls, name: str | Path) -> Instrument:
@@ -202,7 +193,7 @@ class Instrument(Record):
             one number.
         """
         marks = {name: "U: set by the user" for name in changes if name not in LABELS}
-        changes = {name: _in_its_unit(name, value) for name, value in changes.items()}
+        changes = {name: _counted(name, value) for name, value in changes.items()}
         changed = Instrument.build({**self._values(), **changes}, self.name)
         given = {name: value.source for name in changes if isinstance(value := getattr(changed, name), Curve)}
         own = {name: source for name, source in given.items() if isinstance(changes[name], str | Path)}
@@ -478,16 +469,11 @@ class Instrument(Record):
         return isinstance(other, Instrument) and self.digest == other.digest
 
 
-def _in_its_unit(name: str, value: Any) -> Any:
-    """Convert a number or Quantity to a plain number in the unit of the name; return other values unchanged."""
+def _counted(name: str, value: Any) -> Any:
+    """Convert a whole number of any type to an int where the instrument has a count; return other values unchanged."""
     field = Instrument.model_fields.get(name)
-    kind = None if field is None else field.annotation
-    quantity = is_quantity(value)
-    if kind is int and (quantity or isinstance(value, float | np.number)):
-        return count(name, value)
-    if quantity or isinstance(value, np.number):
-        return number(name, value, unit_of(name))
-    return value
+    is_number = is_quantity(value) or isinstance(value, float | np.number)
+    return count(name, value) if is_number and field is not None and field.annotation is int else value
 
 
 #: Fields that do not affect a measurement.

@@ -25,45 +25,6 @@ WORDS = {
     "s": "seconds",
 }
 
-#: Units that ends of names state, the longest ends first.
-UNITS = {
-    "_uv_per_electron": "uV / electron",
-    "_nm_per_pixel": "nm / pix",
-    "_per_cm2_s": "1 / (cm2 s)",
-    "_dn_per_s": "DN / s",
-    "_a_per_w": "A / W",
-    "_per_day": "1 / d",
-    "_arcsec2": "arcsec2",
-    "_arcsec": "arcsec",
-    "_per_c": "1 / K",
-    "_rsun": "solRad",
-    "_msun": "solMass",
-    "_cm2": "cm2",
-    "_deg": "deg",
-    "_erg": "erg",
-    "_myr": "Myr",
-    "_nm": "nm",
-    "_dn": "DN",
-    "_pc": "pc",
-    "_v": "V",
-    "_c": "deg_C",
-    "_k": "K",
-    "_s": "s",
-}
-#: Units of names without such an end.
-NAMED = {
-    "magnitude": "mag",
-    "ebv": "mag",
-    "surface_brightness": "mag / arcsec2",
-    "temperature": "K",
-    "seconds": "s",
-}
-
-
-def unit_of(name: str) -> str:
-    """Return the unit that the end of a name states, or an empty string."""
-    return NAMED.get(name) or next((unit for end, unit in UNITS.items() if name.endswith(end)), "")
-
 
 def is_quantity(value: Any) -> bool:
     """Return whether a value is an astropy Quantity."""

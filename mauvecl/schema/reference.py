@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
@@ -62,7 +63,7 @@ def _accepted(annotation: Any, unit: str, reach: Range | None) -> str:
         return "table"
     if inner in (float, int):
         return (reach or Range()).words(unit, whole=inner is int)
-    return {str: "text", bool: "true or false"}.get(inner, "path")
+    return {str: "text", bool: "true or false", Path: "path"}.get(inner, "file")
 
 
 def _default(field: Any, help: Help | None) -> str:

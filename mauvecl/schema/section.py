@@ -9,7 +9,7 @@ from pydantic import BaseModel, ValidationInfo, field_validator
 from pydantic.fields import FieldInfo
 
 from mauvecl.schema.fields import Unit, first
-from mauvecl.schema.quantities import is_quantity, numbers, unit_of
+from mauvecl.schema.quantities import is_quantity, numbers
 from mauvecl.schema.records import Record, model_in
 
 
@@ -55,7 +55,7 @@ class Section(Record):
         if unit is not None and not getattr(given, "ndim", 0):
             # The annotation converts it.
             return given
-        return plain(key, given, unit_of(key) if unit is None else unit.name)
+        return plain(key, given, "" if unit is None else unit.name)
 
 
 def fields_of(section: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], FieldInfo]]:
