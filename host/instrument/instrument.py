@@ -158,10 +158,7 @@ class Instrument(Section):
     ] = None
     throughput_amplitudes: Annotated[
         tuple[float, ...],
-        Help(
-            "Amplitudes of the modes of `throughput_errors`, the first ones first, by which the throughput differs from "
-            "the calibrated one"
-        ),
+        Help("Amplitudes of the first modes of `throughput_errors`, by which the throughput is not the calibrated"),
     ] = ()
 
     @classmethod
