@@ -292,13 +292,16 @@ VERBS: dict[str, Verb] = {
             "observations.analyse",
             """Flares in observed frames, with their false alarms.
 
-    Reads light curves of mauvecl, TESS and Kepler as they are, and other tables through a mapping (TOML). Nothing is
+    Reads light curves of mauvecl, TESS and Kepler as they are, and other tables through a mapping (TOML). Spectra of
+    the instrument are searched with weights for flares, which are measured: name the star for energies. Nothing is
     deleted in silence: the table of frames states why a frame is not searched.
 
-    Example: mauvecl analyse light-curve-1.fits --false-alarms 1 --alarms-per month
+    Examples: mauvecl analyse light-curve-1.fits --false-alarms 1 --alarms-per month
+
+    mauvecl analyse light-curve-1.fits --star M3V --magnitude 9 --distance 5
     """,
-            ("data", "search.false_alarms", "search.per", "run.seed"),
-            observation=(),
+            ("data", *SIZE, "flare.temperature_k", "search.false_alarms", "search.per", "run.seed"),
+            without="observation.exposure_s",
         ),
         Verb(
             "calibrate",

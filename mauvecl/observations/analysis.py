@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.defaults import Per, per_day
+from mauvecl.lightcurve.defaults import RANK, Per, per_day
 from mauvecl.lightcurve.flares.shapes import shape_of
 from mauvecl.lightcurve.search.importance_sampling import SampledRate
 from mauvecl.observations.colour import Colour, event_colour
 from mauvecl.observations.completeness import Completeness, inject
-from mauvecl.observations.events import ObservedEvent, detect_events, measure_events
+from mauvecl.observations.event_spectrum import EventSpectrum, event_spectrum, measure_flare
+from mauvecl.observations.events import Detection, ObservedEvent, detect_events, measure_events
+from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames
 from mauvecl.observations.level import QuiescentLevel, quiescent_level
 from mauvecl.observations.noise import Scatter, binned_scatter
-from mauvecl.observations.search import MeasuredRate, SeriesSurvey
+from mauvecl.observations.search import NO_COLOUR_K, MeasuredRate, SeriesSurvey
+from mauvecl.observations.spectra import CleanedSpectra, SpectralSeries, clean_spectra, survey_spectra
+from mauvecl.results.measurements.fit import Measurement
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
 
@@ -25,6 +30,26 @@ Float = NDArray[np.float64]
 
 #: False alarms per star-day above which events are candidates.
 CANDIDATES = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class SpectralAnalysis:
+    """What the analysis of spectra has beyond that of a light curve.
+
+    Attributes
+    ----------
+    cleaned : CleanedSpectra
+    series : SpectralSeries
+    found : list of EventSpectrum
+        Spectra of the events, in their order.
+    measured : list of Measurement or str
+        Flares fitted to the events, or the reason why none is.
+    """
+
+    cleaned: CleanedSpectra
+    series: SpectralSeries
+    found: list[EventSpectrum]
+    measured: list[Measurement | str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +78,8 @@ class Analysis:
     completeness : Completeness
         Share of flares that the search detects in these frames.
     scatter : list of Scatter
+    spectra : SpectralAnalysis or None
+        Of spectra that are searched with weights for flares.
     """
 
     frames: Frames
@@ -68,6 +95,7 @@ class Analysis:
     events: list[ObservedEvent]
     completeness: Completeness
     scatter: list[Scatter]
+    spectra: SpectralAnalysis | None = None
 
     @cached_property
     def days(self) -> float:
@@ -107,6 +135,7 @@ class Analysis:
         if self.level.excess > 1.2:
             lines.append(f"The scatter of quiescent frames is {self.level.excess:.2f} times the stated errors; the "
                          "measured scatter is used.")  # fmt: skip
+        lines += [] if self.spectra is None else _spectral_messages(self.spectra)
         red = next((one for one in self.scatter if one.red), None)
         if red is not None:
             lines.append(
@@ -122,7 +151,16 @@ class Analysis:
 
 
 def analyse_frames(
-    frames: Frames, *, false_alarms: float = 1.0, per: Per = "day", shape: str = "davenport2014", seed: int = 1
+    frames: Frames,
+    *,
+    false_alarms: float = 1.0,
+    per: Per = "day",
+    shape: str = "davenport2014",
+    seed: int = 1,
+    model: FrameModel | None = None,
+    rank: int = RANK,
+    jitters: Mapping[str, float] | None = None,
+    temperature_k: float = NO_COLOUR_K,
 ) -> Analysis:
     """Find the flares in observed frames.
 
@@ -136,11 +174,26 @@ def analyse_frames(
         Shape of the templates; see `SHAPES`.
     seed : int
         Seed of the resampled noise and of injections.
+    model : FrameModel, optional
+        What the pixels of spectra record; without it, spectra are searched as their sum over wavelength.
+    rank : int
+        Largest number of weighted sums of a spectrum.
+    jitters : mapping of str to float, optional
+        Standard deviations of light, dark current and sky from frame to frame; as measured by default.
+    temperature_k : float
+        Temperature of injected flares in spectra.
     """
     wanted = per_day(false_alarms, per)
+    cleaned = None if model is None else clean_spectra(frames, model)
+    frames = frames if cleaned is None else cleaned.frames
     flux, error = frames.white_light
-    level = quiescent_level(frames, flux, error)
-    survey = SeriesSurvey.of(frames, flux, error, level, shape_of(shape))
+    saturated = np.zeros(frames.n_frames, np.bool_) if cleaned is None else cleaned.saturated
+    level = quiescent_level(frames, flux, error, saturated=saturated)
+    series = None
+    if cleaned is None:
+        survey = SeriesSurvey.of(frames, flux, error, level, shape_of(shape))
+    else:
+        survey, series, level = survey_spectra(cleaned, flux, level, shape_of(shape), rank, jitters)
     frequent = max(wanted, CANDIDATES)
     normal = survey.normal_rate(frequent, seed)
     first = _threshold(normal, frequent)
@@ -151,13 +204,59 @@ def analyse_frames(
     candidates = min(max(first, measured.threshold(frequent)), threshold)
     detected, taken = detect_events(survey, candidates)
     events = measure_events(survey, taken, candidates, detected)
+    spectra = None
+    if cleaned is not None and series is not None:
+        events, spectra = _with_spectra(survey, cleaned, series, taken, detected, events)
     quiet = level.quiet[level.used] & ~taken
-    residual = survey.sums[:, 0] / np.sqrt(survey.variance)
+    residual = survey.along(len(survey.bank.directions) // 2) / np.sqrt(survey.variance)
     return Analysis(
         frames, flux, error, level, survey, wanted, normal, measured, threshold, candidates, events,
-        inject(survey, ~taken, threshold, seed),
-        binned_scatter(survey.stare.numbers[quiet], residual[quiet]),
+        inject(survey, ~taken, threshold, seed, temperature_k),
+        binned_scatter(survey.stare.numbers[quiet], residual[quiet]), spectra,
     )  # fmt: skip
+
+
+def _with_spectra(
+    survey: SeriesSurvey,
+    cleaned: CleanedSpectra,
+    series: SpectralSeries,
+    taken: NDArray[np.bool_],
+    detected: list[Detection],
+    events: list[ObservedEvent],
+) -> tuple[list[ObservedEvent], SpectralAnalysis]:
+    """Return events with the kind that their spectra give them, and their spectra and measurements."""
+    found = [event_spectrum(survey, series, taken, one) for one in detected]
+    judged = [
+        event if one.cause == "flare" else replace(event, kind=one.cause, components=[])
+        for event, one in zip(events, found, strict=True)
+    ]
+    measured = [
+        measure_flare(survey, series, taken, one) if event.kind == "flare" else f"its kind is {event.kind}"
+        for event, one in zip(judged, detected, strict=True)
+    ]
+    return judged, SpectralAnalysis(cleaned, series, found, measured)
+
+
+def _spectral_messages(spectra: SpectralAnalysis) -> list[str]:
+    """Return statements about the pixels of spectra that a reader must know."""
+    cleaned, noise, lines = spectra.cleaned, spectra.series.noise, []
+    if count := int(cleaned.rays.sum()):
+        lines.append(
+            f"{count} single values in {np.count_nonzero(cleaned.rays)} frames stand out from their spectrum, as "
+            "cosmic rays do; a fit to the other pixels replaces them, and the table of frames counts them."
+        )
+    if cleaned.stated_by == "instrument":
+        lines.append("The frames state no errors: the noise of each pixel is that of the instrument's model.")
+    if many := int(noise.departs.sum()):
+        ratio = noise.measured / noise.stated
+        lines.append(
+            f"The noise of {many} of {ratio.size} pixels departs from what is stated: their measured noise is used, "
+            f"{ratio.min():.2f} to {ratio.max():.2f} times it."
+        )
+    for name, sd in spectra.series.jitters.items():
+        size = "free" if np.isinf(sd) else f"{sd:.2g} deg C" if name == "dark" else f"{100 * sd:.2g} %"
+        lines.append(f"The {name} of single frames changes: {size}, which the search marginalises over.")
+    return lines
 
 
 def _threshold(normal: SampledRate, rate: float) -> float:
@@ -165,5 +264,5 @@ def _threshold(normal: SampledRate, rate: float) -> float:
 
     Few frames a day give few false alarms at any sensible threshold.
     """
-    lowest = float(normal.thresholds[0])
+    lowest = normal.lowest
     return lowest if rate >= normal.rate(lowest).value else normal.threshold(rate).value

@@ -7,13 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.observations.search import SeriesSurvey
+from mauvecl.observations.search import NO_COLOUR_K, SeriesSurvey
 from mauvecl.statistics.intervals import Interval, clopper_pearson
 
 Float = NDArray[np.float64]
 
 #: Default numbers of half-widths, sizes and peak times.
 WIDTHS, SIZES, TIMES = 4, 12, 40
+#: Injections that are searched together.
+BATCH = 10
 #: Range of sizes, in equivalent durations whose S/N without a baseline equals these multiples of the threshold.
 RANGE = (0.5, 4.0)
 #: Probability of detection that limits refer to.
@@ -60,7 +62,9 @@ class Completeness:
         return float(np.exp(logs[k - 1] + part * (logs[k] - logs[k - 1])))
 
 
-def inject(survey: SeriesSurvey, free: NDArray[np.bool_], threshold: float, seed: int) -> Completeness:
+def inject(
+    survey: SeriesSurvey, free: NDArray[np.bool_], threshold: float, seed: int, temperature_k: float = NO_COLOUR_K
+) -> Completeness:
     """Inject flares of several half-widths and sizes at random times, and count those that the search detects.
 
     Parameters
@@ -70,32 +74,45 @@ def inject(survey: SeriesSurvey, free: NDArray[np.bool_], threshold: float, seed
         Frames that belong to no event; flares are injected into these, and the others are left out of the search.
     threshold : float
     seed : int
+    temperature_k : float
+        Temperature of the flares; light curves have no colour.
     """
     part = survey.frames(free)
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, INJECTION_KEY]))
     bank, frame_s = part.bank, part.stare.frame_s
     widths = np.geomspace(bank.half_widths_s[0], bank.half_widths_s[-1], WIDTHS)
-    noise = float(np.median(np.sqrt(part.variance)))
+    kelvin = np.array(part.templates.temperatures_k)
+    direction = part.templates.directions[int(np.argmin(np.abs(np.log(kelvin / temperature_k))))]
+    # Photon noise of a flare of unit amplitude.
+    own_noise = np.linalg.cholesky(part.templates.noise_of(temperature_k) + 1e-300 * np.eye(direction.size))
+    noise = float(np.median(np.sqrt(part.variance))) / float(np.linalg.norm(direction))
+    edges = np.column_stack([part.stare.start_s, part.stare.start_s + frame_s])
     durations = np.zeros((WIDTHS, SIZES))
     detected = np.zeros((WIDTHS, SIZES), np.int64)
     for w, width in enumerate(widths):
         power = float(np.sqrt(np.max(bank.template(float(width)).power))) / noise
         amplitudes = threshold / power * np.geomspace(*RANGE, SIZES)
-        durations[w] = amplitudes * part.scale / part.level * width * bank.shape.equivalent_duration
-        lead, tail = bank.window(bank.half_widths_s[-1])
-        for _ in range(TIMES):
-            middle = int(rng.integers(part.stare.n_frames))
-            peak = float(part.stare.start_s[middle] + frame_s * rng.random())
-            number = part.stare.numbers
-            near = np.abs(number - number[middle]) <= lead + tail
-            here = part.frames(near)
-            edges = np.column_stack([here.stare.start_s, here.stare.start_s + frame_s])
-            shape = bank.shape.mean_over(edges, peak, float(width))
-            light = amplitudes[:, None] * shape
+        durations[w] = amplitudes * width * bank.shape.equivalent_duration
+        for first in range(0, TIMES, BATCH):
+            count = min(BATCH, TIMES - first)
+            peaks = part.stare.start_s[rng.integers(part.stare.n_frames, size=count)] + frame_s * rng.random(count)
+            shapes = np.array([bank.shape.mean_over(edges, peak, float(width)) for peak in peaks])
             # The photon noise of the flare itself is added to that of the frames.
-            own = np.sqrt(np.maximum(part.photon / part.scale * light, 0.0)) * rng.standard_normal(light.shape)
-            sums = (here.sums[:, 0] + light + own)[:, :, None]
-            best = here.search.largest(sums.astype(np.float32))
-            close = np.abs(best.peak_s - peak) <= 2 * (width + frame_s) + best.half_width_s
-            detected[w] += (best.maximum >= threshold) & close
+            drawn = rng.standard_normal((*shapes.shape, direction.size)) @ own_noise.T
+            added = np.concatenate([
+                part.sums[None], shapes[:, :, None] * direction,
+                np.sqrt(np.maximum(shapes, 0.0))[:, :, None] * drawn,
+            ])  # fmt: skip
+            best = np.full((SIZES, count), -np.inf)
+            # The statistics are linear in the sums, so that one search serves all sizes.
+            for row, rho in part.search.values(added.astype(np.float32)):
+                at = (part.stare.numbers[0] + row.peaks + row.template.phases[row.phase]) * frame_s
+                for k, peak in enumerate(peaks):
+                    near = np.abs(at - peak) <= 2 * (width + frame_s) + row.template.half_width_s
+                    near &= row.per_amplitude > 0
+                    if near.any():
+                        quiet, flare, own = (rho[n][:, near] for n in (0, 1 + k, 1 + count + k))
+                        size = amplitudes[:, None, None]
+                        best[:, k] = np.maximum(best[:, k], (quiet + size * flare + np.sqrt(size) * own).max((1, 2)))
+            detected[w] += (best >= threshold).sum(axis=1)
     return Completeness(widths, durations, detected, TIMES)

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from mauvecl.lightcurve.search.alarms import Alarm, alarms
 from mauvecl.lightcurve.search.bank import TAIL
+from mauvecl.lightcurve.search.search import LargestValue
 from mauvecl.observations.search import SeriesSurvey
 
 Float = NDArray[np.float64]
-Kind = Literal["flare", "step"]
+Kind = Literal["flare", "step", "throughput", "dark current", "sky", "cosmic ray"]
 
 #: Number of consecutive frames below one standard deviation that end an event.
 END_FRAMES = 3
@@ -52,7 +53,9 @@ class ObservedEvent:
         Number of frames missing inside the event.
     cut : bool
         True if the event reaches the first or last frame of the light curve or of the part before a longer gap.
-    kind : {"flare", "step"}
+    kind : str
+        A flare, or what resembles one: a step of the level or, in spectra, a change of the throughput, the dark
+        current or the sky, or a cosmic ray.
     components : list of Alarm
         Flares fitted to the event together, the largest first; empty if the event is no flare.
     """
@@ -73,10 +76,20 @@ class ObservedEvent:
 
 @dataclass(frozen=True)
 class Detection:
-    """What the search detects: statistic and half-width of the best template, and the frames of the event."""
+    """What the search detects.
+
+    Attributes
+    ----------
+    value, half_width_s, peak_s, direction : float, float, float, int
+        Statistic, half-width, time of the peak in the stare, and row of the bank's directions, of the best template.
+    first, last : int
+        First and last frame of the event.
+    """
 
     value: float
     half_width_s: float
+    peak_s: float
+    direction: int
     first: int
     last: int
 
@@ -93,42 +106,38 @@ def detect_events(survey: SeriesSurvey, threshold: float) -> tuple[list[Detectio
         new = _search_once(survey, taken, threshold)
         if new is None:
             break
-        value, half_width, peak, amplitude = new
-        first, last = _extent(survey, taken, peak, half_width, amplitude)
-        found.append(Detection(value, half_width, first, last))
+        best, peak = new
+        first, last = _extent(survey, taken, peak, best)
+        value, half_width, peak_s = (float(each[0]) for each in (best.maximum, best.half_width_s, best.peak_s))
+        found.append(Detection(value, half_width, peak_s, int(best.temperature[0]), first, last))
         taken[first : last + 1] = True
     return sorted(found, key=lambda one: one.first), taken
 
 
-def _search_once(
-    survey: SeriesSurvey, taken: NDArray[np.bool_], threshold: float
-) -> tuple[float, float, int, float] | None:
-    """Return statistic, half-width, brightest frame and amplitude of the best template among frames that are left."""
+def _search_once(survey: SeriesSurvey, taken: NDArray[np.bool_], threshold: float) -> tuple[LargestValue, int] | None:
+    """Return the best template among frames that are left, and its brightest frame; None below the threshold."""
     left = np.flatnonzero(~taken)
     if left.size < 3:
         return None
     part = survey.frames(~taken)
     best = part.search.largest(part.net(part.sums)[None])
-    value = float(best.maximum[0])
-    if value < threshold:
+    if float(best.maximum[0]) < threshold:
         return None
-    half_width = float(best.half_width_s[0])
-    near = np.flatnonzero(np.abs(part.stare.middle_s - best.peak_s[0]) <= half_width + part.stare.frame_s)
+    near = np.flatnonzero(np.abs(part.stare.middle_s - best.peak_s[0]) <= best.half_width_s[0] + part.stare.frame_s)
     if not near.size:
         near = np.array([int(np.argmin(np.abs(part.stare.middle_s - best.peak_s[0])))])
-    return value, half_width, int(left[near[np.argmax(part.sums[near, 0])]]), float(best.amplitude[0])
+    return best, int(left[near[np.argmax(part.along(int(best.temperature[0]))[near])]])
 
 
-def _extent(
-    survey: SeriesSurvey, taken: NDArray[np.bool_], peak: int, half_width: float, amplitude: float
-) -> tuple[int, int]:
+def _extent(survey: SeriesSurvey, taken: NDArray[np.bool_], peak: int, best: LargestValue) -> tuple[int, int]:
     """Return the first and last frame of an event.
 
     It includes half of a half-width of the best template before the brightest frame, and after it at least a whole one
     and the tail of the template above `FAINT` standard deviations. It ends where the flux stays within the noise for
     several frames, at a gap, or at another event.
     """
-    sigma = survey.sums[:, 0] / np.sqrt(survey.variance)
+    half_width, amplitude = float(best.half_width_s[0]), float(best.amplitude[0])
+    sigma = survey.along(int(best.temperature[0])) / np.sqrt(survey.variance)
     numbers = survey.stare.numbers
     frames = half_width / survey.stare.frame_s
     tau = np.linspace(0.0, TAIL, 400)
@@ -174,12 +183,12 @@ def measure_event(survey: SeriesSurvey, taken: NDArray[np.bool_], threshold: flo
     value, half_width, first, last = found.value, found.half_width_s, found.first, found.last
     rows = slice(first, last + 1)
     baseline, baseline_variance = _baseline(survey, taken, first, last, half_width)
-    flux, numbers = (survey.sums[rows, 0] - baseline) * survey.scale, survey.stare.numbers[rows]
+    flux, numbers = (survey.flux[rows] - baseline) * survey.scale, survey.stare.numbers[rows]
     every = np.arange(numbers[0], numbers[-1] + 1)
     missing = every.size - numbers.size
     cadence = survey.stare.frame_s
     total = float(np.interp(every, numbers, flux).sum()) * cadence / survey.level
-    variance = survey.variance[rows] * survey.scale**2 + survey.photon * np.maximum(flux, 0.0)
+    variance = survey.flux_variance[rows] * survey.scale**2 + survey.photon * np.maximum(flux, 0.0)
     # The baseline of all frames is wrong by the same amount.
     variance_of_sum = variance.sum() * every.size / numbers.size + baseline_variance * (survey.scale * every.size) ** 2
     error = float(np.sqrt(variance_of_sum)) * cadence / survey.level
@@ -192,7 +201,8 @@ def measure_event(survey: SeriesSurvey, taken: NDArray[np.bool_], threshold: flo
     lead, tail = survey.bank.window(half_width)
     number = survey.stare.numbers
     part = survey.frames(~others & (number >= number[first] - lead) & (number <= number[last] + tail))
-    kind = _kind(part, int(np.searchsorted(part.stare.numbers, survey.stare.numbers[brightest])), half_width)
+    peak = int(np.searchsorted(part.stare.numbers, survey.stare.numbers[brightest]))
+    kind = _kind(part, peak, half_width, found.direction)
     components = alarms(part, part.templates, part.sums, max(threshold, value / 4)) if kind == "flare" else []
     middle = survey.stare.middle_s[[first, last]]
     inside = [
@@ -209,7 +219,7 @@ def measure_event(survey: SeriesSurvey, taken: NDArray[np.bool_], threshold: flo
 def _baseline(
     survey: SeriesSurvey, taken: NDArray[np.bool_], first: int, last: int, half_width: float
 ) -> tuple[Float, float]:
-    """Return the baseline of the sums under an event, shape (n_frame,), and the variance of its mean.
+    """Return the baseline of the flux under an event, shape (n_frame,), and the variance of its mean.
 
     A straight line through the frames of the event's window that belong to no event, or a constant if they are on one
     side only: a line is not extrapolated.
@@ -218,9 +228,9 @@ def _baseline(
     numbers = survey.stare.numbers
     near = ~taken & (numbers >= numbers[first] - lead) & (numbers <= numbers[last] + tail)
     inside = survey.stare.middle_s[first : last + 1]
-    time, y, weight = survey.stare.middle_s[near], survey.sums[near, 0], 1.0 / survey.variance[near]
+    time, y, weight = survey.stare.middle_s[near], survey.flux[near], 1.0 / survey.flux_variance[near]
     if time.size < MIN_BASELINE:
-        return np.zeros(inside.size), float(np.mean(survey.variance))
+        return np.zeros(inside.size), float(np.mean(survey.flux_variance))
     middle = inside.mean()
     degree = 1 if min((time < inside[0]).sum(), (time > inside[-1]).sum()) >= MIN_BASELINE / 2 else 0
     design = np.vander((time - middle) / half_width, degree + 1)
@@ -229,7 +239,7 @@ def _baseline(
     return np.vander((inside - middle) / half_width, degree + 1) @ line, float(inverse[-1, -1])
 
 
-def _kind(survey: SeriesSurvey, peak: int, half_width: float) -> Kind:
+def _kind(survey: SeriesSurvey, peak: int, half_width: float, direction: int) -> Kind:
     """Return whether an event is more like a flare or like a step of the level.
 
     Both are fitted with a straight line to the window of the event: the flare with the time and half-width of any
@@ -238,9 +248,13 @@ def _kind(survey: SeriesSurvey, peak: int, half_width: float) -> Kind:
     lead, tail = survey.bank.window(half_width)
     number = survey.stare.numbers
     window = (number >= number[peak] - lead) & (number <= number[peak] + tail)
-    y = survey.sums[window, 0]
+    y = survey.along(direction)[window]
     time = survey.stare.middle_s[window]
-    flare = np.maximum(y, 0.0) * survey.photon / survey.scale
+    # The photon noise of a flare that rises the sum along the direction by as much.
+    templates, along = survey.templates, survey.bank.directions[direction]
+    row = templates.chosen[direction]
+    rise = float(along @ templates.noise[row] @ along) / float(along @ templates.directions[row])
+    flare = np.maximum(y, 0.0) * rise
     weight = 1.0 / np.sqrt(survey.variance[window] + flare)
     line = np.column_stack([np.ones_like(time), (time - time.mean()) / max(float(np.ptp(time)), 1.0)])
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -58,8 +58,21 @@ class QuiescentLevel:
         """Frames that are searched."""
         return np.asarray(self.reasons == 0)
 
+    def without(self, single: NDArray[np.bool_]) -> QuiescentLevel:
+        """Return the level without some single bright frames."""
+        return replace(
+            self, quiet=self.quiet & ~single, reasons=np.where(single, self.reasons | Reason.SPIKE, self.reasons)
+        )
 
-def quiescent_level(frames: Frames, flux: Float, error: Float | None, median_s: float = MEDIAN_S) -> QuiescentLevel:
+
+def quiescent_level(
+    frames: Frames,
+    flux: Float,
+    error: Float | None,
+    median_s: float = MEDIAN_S,
+    *,
+    saturated: NDArray[np.bool_] | None = None,
+) -> QuiescentLevel:
     """Estimate level and noise of a light curve, and flag frames that cannot be part of a flare.
 
     Parameters
@@ -69,8 +82,10 @@ def quiescent_level(frames: Frames, flux: Float, error: Float | None, median_s: 
         The light curve; of spectra, light in a band.
     median_s : float
         Length of the running median.
+    saturated : ndarray of bool, shape (n_frame,), optional
+        Frames with saturated pixels.
     """
-    reasons = frames.faults.copy()
+    reasons = frames.faults | (0 if saturated is None else np.where(saturated, Reason.SATURATED, 0))
     usable = reasons == 0
     if usable.sum() < 10:
         raise InputError(
@@ -83,8 +98,8 @@ def quiescent_level(frames: Frames, flux: Float, error: Float | None, median_s: 
     quiet = usable.copy()
     excess = float("nan")
     for _ in range(ROUNDS):
-        level = _running(frames, flux, quiet, width)
-        stated = np.ones_like(flux) if error is None else _running(frames, error, quiet, width)
+        level = running_median(frames, flux, quiet, width)
+        stated = np.ones_like(flux) if error is None else running_median(frames, error, quiet, width)
         spread = _scatter(frames.numbers[quiet], ((flux - level) / stated)[quiet])
         if not spread > 0:
             raise InputError(
@@ -103,11 +118,11 @@ def quiescent_level(frames: Frames, flux: Float, error: Float | None, median_s: 
     sigmas = np.where(usable, (flux - level) / noise, 0.0)
     reasons |= np.where(finite & (np.where(finite, flux, 0.0) - level < -FAR * noise), Reason.BELOW, 0)
     fine = reasons == 0
-    reasons |= np.where(_spikes(frames, sigmas, fine, flux, level), Reason.SPIKE, 0)
+    reasons |= np.where(single_frames(frames, sigmas, fine), Reason.SPIKE, 0)
     return QuiescentLevel(level, noise, excess, quiet & (reasons == 0), reasons)
 
 
-def _running(frames: Frames, values: Float, chosen: NDArray[np.bool_], width: int) -> Float:
+def running_median(frames: Frames, values: Float, chosen: NDArray[np.bool_], width: int) -> Float:
     """Return the running median of chosen frames, interpolated to all frames."""
     at = np.flatnonzero(chosen)
     if at.size <= width:
@@ -122,13 +137,21 @@ def _scatter(numbers: NDArray[np.int64], values: Float) -> float:
     return PER_MAD * float(np.median(np.abs(steps))) / np.sqrt(2.0) if steps.size else float("nan")
 
 
-def _spikes(frames: Frames, sigmas: Float, fine: NDArray[np.bool_], flux: Float, level: Float) -> NDArray[np.bool_]:
+def single_frames(frames: Frames, sigmas: Float, fine: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return single frames far above the level whose neighbours on both sides are not.
 
     A flare decays over several frames; one that is shorter than a frame cannot be told from a cosmic ray.
+
+    Parameters
+    ----------
+    frames : Frames
+    sigmas : ndarray, shape (n_frame,)
+        Distance of the frames from the level, in standard deviations.
+    fine : ndarray of bool, shape (n_frame,)
+        Frames without another fault.
     """
     at = np.flatnonzero(fine)
-    single = np.zeros(flux.size, np.bool_)
+    single = np.zeros(sigmas.size, np.bool_)
     if at.size < 3:
         return single
     here, before, after = at[1:-1], at[:-2], at[2:]

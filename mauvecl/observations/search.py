@@ -32,8 +32,8 @@ NARROWEST, WIDEST, WIDEST_S = 1.5, 0.15, 7200.0
 WINDOW_FRAMES, WINDOW_S = 120, 1800.0
 #: Number of alarms in resampled light curves from which a rate is estimated, and the largest number of those.
 MIN_ALARMS, MAX_RESAMPLED = 30, 20_000
-#: Largest number of values in all resampled light curves.
-MAX_VALUES = 2**26
+#: Largest number of values in all resampled light curves, which bounds the time.
+MAX_VALUES = 2**24
 #: Expected number of false alarms at the largest rate of interest in the part of the light curve that importance
 #: sampling uses, and the smallest number of its frames.
 SAMPLED_ALARMS, MIN_SAMPLED = 0.6, 200
@@ -93,19 +93,25 @@ class MeasuredRate:
 
 @dataclass(frozen=True, eq=False)
 class SeriesSurvey:
-    """An observed light curve as `lightcurve.search` sees a stare: sums in units of the quiescent noise.
+    """Observed frames as `lightcurve.search` sees a stare: sums in units of the quiescent noise.
 
     Attributes
     ----------
     stare : Stare
         Times of the searched frames.
     bank : Bank
-    sums : ndarray, shape (n_frame, 1)
-        Flux less the quiescent level, over `scale`.
+    templates : Templates
+        What a flare of unit amplitude, whose light is once that of the quiescent star, does to the sums.
+    sums : ndarray, shape (n_frame, n_sum)
+        Searched sums less their quiescent level: of spectra, sums weighted for flares; of a light curve, its flux.
     variance : ndarray, shape (n_frame,)
         Variance of the quiescent sums.
+    flux : ndarray, shape (n_frame,)
+        Flux less the quiescent level, over `scale`: what amplitudes and durations are measured of.
+    flux_variance : ndarray, shape (n_frame,)
+        Variance of the quiescent flux.
     scale : float
-        Typical standard deviation of a frame, in the unit of the flux.
+        Typical standard deviation of the flux of a frame, in the unit of the flux.
     level : float
         Typical quiescent level, in the unit of the flux, to which amplitudes are relative.
     photon : float
@@ -116,8 +122,11 @@ class SeriesSurvey:
 
     stare: Stare
     bank: Bank
+    templates: Templates
     sums: Float
     variance: Float
+    flux: Float
+    flux_variance: Float
     scale: float
     level: float
     photon: float
@@ -128,19 +137,20 @@ class SeriesSurvey:
     def of(cls, frames: Frames, flux: Float, error: Float | None, level: QuiescentLevel, shape: Shape) -> SeriesSurvey:
         """Prepare the frames of a light curve that can be searched."""
         used = level.used
-        numbers = frames.numbers[used]
-        n, cadence = int(used.sum()), frames.cadence_s
-        start = (numbers - numbers[0]) * cadence
-        ones = np.ones(n)
-        stare = Stare(start, cadence, ones, ones, ones, np.zeros(n))
-        bank = Bank(half_widths(stare), np.ones((1, 1)), shape, cadence,
-                    Baseline(window_s=max(WINDOW_S, WINDOW_FRAMES * cadence)))  # fmt: skip
+        stare = stare_of(frames, used)
         scale = float(np.median(level.error[used]))
-        sums = ((flux - level.level)[used] / scale)[:, None]
+        typical = abs(float(np.median(level.level[used])))
+        photon = _photon_noise(
+            flux[used], None if error is None else error[used] * np.nan_to_num(level.excess, nan=1.0)
+        )
+        size, noise = typical / scale, photon * typical / scale**2
+        templates = Templates(
+            (NO_COLOUR_K,), np.ones((1, 1)), np.full((1, 1), size), np.array([size]), np.full((1, 1, 1), noise)
+        )
+        net, variance = (flux - level.level)[used] / scale, (level.error[used] / scale) ** 2
         return cls(
-            stare, bank, sums, (level.error[used] / scale) ** 2, scale, abs(float(np.median(level.level[used]))),
-            _photon_noise(flux[used], None if error is None else error[used] * np.nan_to_num(level.excess, nan=1.0)),
-            frames.time_s[used],
+            stare, bank_of(stare, np.ones((1, 1)), shape), templates, net[:, None], variance, net, variance, scale,
+            typical, photon, frames.time_s[used],
         )  # fmt: skip
 
     @cached_property
@@ -155,25 +165,21 @@ class SeriesSurvey:
 
     def covariance(self) -> Float:
         """Return the covariance of each frame's sums without a flare, shape (n_frame, 1, 1)."""
-        return self.variance[:, None, None].copy()
+        return np.asarray(self.variance[:, None, None] * np.eye(self.sums.shape[1]))
 
     def net(self, sums: NDArray[Any]) -> NDArray[np.float32]:
         """Return the sums, whose level is already subtracted."""
         return np.asarray(sums, np.float32)
 
-    @property
-    def templates(self) -> Templates:
-        """Effect of a flare of unit amplitude on the sums: its flux is once the quiescent level."""
-        size = self.level / self.scale
-        noise = self.photon * self.level / self.scale**2
-        return Templates(
-            (NO_COLOUR_K,), np.ones((1, 1)), np.full((1, 1), size), np.array([size]), np.full((1, 1, 1), noise)
-        )
+    def along(self, direction: int) -> Float:
+        """Return the sum along a direction of the bank, which the search of its templates looks at, (n_frame,)."""
+        return np.asarray(self.sums @ self.bank.directions[direction])
 
     def frames(self, kept: NDArray[np.bool_]) -> SeriesSurvey:
         """Return the survey of some of the frames."""
         part = select_frames(self.stare, kept)
-        return replace(self, stare=part, sums=self.sums[kept], variance=self.variance[kept], time_s=self.time_s[kept])
+        names = ("sums", "variance", "flux", "flux_variance", "time_s")
+        return replace(self, stare=part, **{name: getattr(self, name)[kept] for name in names})
 
     def normal_rate(self, rate: float, seed: int) -> SampledRate:
         """Return the false-alarm rate in normal noise of the measured variance.
@@ -203,34 +209,47 @@ class SeriesSurvey:
         seed : int
         """
         days = self.stare.observed_s / DAY_S
-        n = self.stare.n_frames
+        n, n_sum = self.sums.shape
         residual = self._residual(quiet)
-        count = int(np.clip(MIN_ALARMS / (rate * days), 200, min(MAX_RESAMPLED, max(200, MAX_VALUES // n))))
+        count = int(np.clip(MIN_ALARMS / (rate * days), 200, min(MAX_RESAMPLED, max(200, MAX_VALUES // (n * n_sum)))))
         rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, RESAMPLING_KEY]))
-        length = block_length(residual)
+        length = max(block_length(column) for column in residual.T)
         largest = []
         # Few at once, so that memory stays flat.
-        batch = max(1, 2**22 // n)
+        batch = max(1, 2**22 // (n * n_sum))
         for first in range(0, count, batch):
             size = min(batch, count - first)
-            starts = rng.integers(0, residual.size, (size, -(-n // length)))
-            rows = (starts[:, :, None] + np.arange(length)) % residual.size
-            drawn = residual[rows.reshape(size, -1)[:, :n]] * np.sqrt(self.variance)
-            largest.append(self.search.largest(drawn[:, :, None].astype(np.float32)).maximum)
+            starts = rng.integers(0, len(residual), (size, -(-n // length)))
+            rows = (starts[:, :, None] + np.arange(length)) % len(residual)
+            drawn = residual[rows.reshape(size, -1)[:, :n]] * np.sqrt(self.variance)[:, None]
+            largest.append(self.search.largest(drawn.astype(np.float32)).maximum)
         return MeasuredRate(np.sort(np.concatenate(largest)).astype(np.float64), days)
 
     def _residual(self, quiet: NDArray[np.bool_]) -> Float:
-        """Return the residuals of quiescent frames from a straight line in each window, in standard deviations."""
-        y = self.sums[:, 0] / np.sqrt(self.variance)
+        """Return residuals of quiescent frames from a line in each window, in standard deviations, (n, n_sum)."""
+        y = self.sums / np.sqrt(self.variance)[:, None]
         windows = (self.stare.start_s // self.bank.baseline.window_s).astype(np.int64)
         residual = []
         for window in np.unique(windows[quiet]):
             here = quiet & (windows == window)
-            time = self.stare.start_s[here]
             if here.sum() >= MIN_WINDOW:
-                residual.append(y[here] - np.polyval(np.polyfit(time - time.mean(), y[here], 1), time - time.mean()))
+                line = np.vander(self.stare.start_s[here] - self.stare.start_s[here].mean(), 2)
+                residual.append(y[here] - line @ np.linalg.lstsq(line, y[here], rcond=None)[0])
         every = np.concatenate(residual) if residual else y[quiet]
         return np.asarray(every)
+
+
+def stare_of(frames: Frames, used: NDArray[np.bool_]) -> Stare:
+    """Return the frames that are searched as a stare on the regular grid of the cadence."""
+    numbers = frames.numbers[used]
+    ones = np.ones(numbers.size)
+    return Stare((numbers - numbers[0]) * frames.cadence_s, frames.cadence_s, ones, ones, ones, np.zeros(numbers.size))
+
+
+def bank_of(stare: Stare, directions: Float, shape: Shape) -> Bank:
+    """Return the template bank for a stare."""
+    window = max(WINDOW_S, WINDOW_FRAMES * stare.frame_s)
+    return Bank(half_widths(stare), directions, shape, stare.frame_s, Baseline(window_s=window))
 
 
 def half_widths(stare: Stare) -> tuple[float, ...]:

@@ -13,6 +13,7 @@ from mauvecl.pictures.style import COLOURS, NULL, headline, styled_picture
 
 if TYPE_CHECKING:
     from mauvecl.answers.stares.stare import StareAnswer, StarStare
+    from mauvecl.lightcurve.stares.stare import Stare
 
 Float = NDArray[np.float64]
 #: Largest number of points of a light curve, and of rows of a dynamic spectrum; longer stares are averaged.
@@ -31,7 +32,7 @@ def light_curves(plt: Any, one: StarStare) -> Any:
     from mauvecl.answers.stares.stare import SearchResult
 
     stare, light = one.staring.stare, one.light
-    scale, unit = _time(stare.duration_s)
+    scale, unit = time_unit(stare.duration_s)
     level = np.median(light.mean, axis=0)
     figure, axes = plt.subplots(
         len(light.bands), 1, figsize=(7.2, 1.5 * len(light.bands) + 0.7), sharex=True, squeeze=False
@@ -80,7 +81,7 @@ def compare_light_curves(plt: Any, answers: Sequence[tuple[str, StareAnswer]], b
     for column, (title, answer) in zip(axes.T, answers, strict=True):
         for axis, one in zip(column, answer.stares, strict=True):
             light, stare = one.light, one.staring.stare
-            scale, unit = _time(stare.duration_s)
+            scale, unit = time_unit(stare.duration_s)
             level = np.median(light.mean[:, band])
             axis.plot(stare.middle_s / scale, light.flux[:, band] / level, ".", markersize=1.5, color=COLOURS[0])
             axis.plot(stare.middle_s / scale, light.mean[:, band] / level, color=NULL, linewidth=0.8)
@@ -96,37 +97,53 @@ def compare_light_curves(plt: Any, answers: Sequence[tuple[str, StareAnswer]], b
 @styled_picture
 def dynamic_spectrum(plt: Any, one: StarStare) -> Any:
     """Plot each resolution element and frame, in standard deviations from the median over the stare."""
-    stare, light = one.staring.stare, one.light
-    scale, unit = _time(stare.duration_s)
+    light = one.light
+    figure, axis = plt.subplots(figsize=(7.2, 3.6))
+    column_s = show_spectra(axis, one.staring.stare, light.spectrum, light.spectrum_sd, light.element_nm)
+    axis.set_title(f"{one.title}: dynamic spectrum, {column_s:g} s to a column")
+    return figure
+
+
+def show_spectra(axis: Any, stare: Stare, spectra: NDArray[Any], sd: NDArray[Any], wavelength_nm: Float) -> float:
+    """Show spectra against time, in standard deviations from their median, and return the time of a column in s.
+
+    Parameters
+    ----------
+    axis : matplotlib Axes
+    stare : Stare
+        Times of the frames.
+    spectra, sd : ndarray, shape (n_frame, n_pixel)
+    wavelength_nm : ndarray, shape (n_pixel,)
+    """
+    scale, unit = time_unit(stare.duration_s)
     # The stare is shown on a regular grid with empty gaps.
-    step = -(-(int(stare.numbers[-1]) + 1) // MOST_ROWS)
-    rows = stare.numbers // step
+    numbers = stare.numbers - stare.numbers[0]
+    step = -(-(int(numbers[-1]) + 1) // MOST_ROWS)
+    rows = numbers // step
     n_rows = int(rows[-1]) + 1
     counts = np.bincount(rows, minlength=n_rows)[:, None].astype(np.float64)
 
     def summed(values: NDArray[Any]) -> Float:
         return np.array([np.bincount(rows, column, minlength=n_rows) for column in values.T]).T
 
-    centred = light.spectrum - np.median(light.spectrum, axis=0)
+    centred = spectra - np.median(spectra, axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        image = summed(centred) / np.sqrt(summed(light.spectrum_sd.astype(np.float64) ** 2))
+        image = summed(centred) / np.sqrt(summed(sd.astype(np.float64) ** 2))
     image[counts[:, 0] == 0] = np.nan
     reach = max(3.0, float(np.nanpercentile(np.abs(image), 99.5)))
-    figure, axis = plt.subplots(figsize=(7.2, 3.6))
-    half = (light.element_nm[1] - light.element_nm[0]) / 2 if light.element_nm.size > 1 else 5.0
-    extent = (0.0, n_rows * step * stare.frame_s / scale, light.element_nm[0] - half, light.element_nm[-1] + half)
+    half = (wavelength_nm[1] - wavelength_nm[0]) / 2 if wavelength_nm.size > 1 else 5.0
+    extent = (0.0, n_rows * step * stare.frame_s / scale, wavelength_nm[0] - half, wavelength_nm[-1] + half)
     shown = axis.imshow(
         image.T, origin="lower", aspect="auto", extent=extent, cmap="RdBu_r", vmin=-reach, vmax=reach,
         interpolation="nearest",
     )  # fmt: skip
     axis.set_facecolor("#dddddd")
-    figure.colorbar(shown, label="standard deviations from the median")
+    axis.figure.colorbar(shown, label="standard deviations from the median")
     axis.set(xlabel=f"time from the start of the stare ({unit})", ylabel="wavelength (nm)")
-    axis.set_title(f"{one.title}: dynamic spectrum, {step * stare.frame_s:g} s to a column")
-    return figure
+    return step * stare.frame_s
 
 
-def _time(duration_s: float) -> tuple[float, str]:
+def time_unit(duration_s: float) -> tuple[float, str]:
     if duration_s <= IN_SECONDS_S:
         return 1.0, "s"
     return (

@@ -6,12 +6,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.pictures.light_curves import show_spectra, time_unit
 from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import COLOURS, NULL, headline, styled_picture
 
 if TYPE_CHECKING:
     from mauvecl.answers.observations.analyse import AnalyseAnswer
+    from mauvecl.observations.analysis import Analysis
+    from mauvecl.observations.events import ObservedEvent
 
+#: What the colours of events say.
+KINDS = "events above {:.2f} (blue), candidates (grey), look-alikes (red)"
 #: Flux in standard deviations above which the light curve has a second panel near the level.
 BRIGHT = 30.0
 
@@ -27,7 +32,7 @@ def observed_light_curve(plt: Any, answer: AnalyseAnswer) -> Any:
     time = (one.frames.time_s - one.frames.time_s[0]) / 60.0
     used = one.level.used
     finite = np.isfinite(one.flux)
-    bright = bool((one.survey.sums > BRIGHT).any())
+    bright = bool((one.survey.flux > BRIGHT).any())
     figure, axes = plt.subplots(1 + bright, 1, figsize=(7.2, 2.9 + 1.8 * bright), sharex=True, squeeze=False)
     for axis in axes[:, 0]:
         axis.plot(time[used], one.flux[used], ".", markersize=3, color="black", alpha=0.7)
@@ -35,9 +40,8 @@ def observed_light_curve(plt: Any, answer: AnalyseAnswer) -> Any:
         left_out = ~used & finite
         axis.plot(time[left_out], one.flux[left_out], "x", markersize=5, color=COLOURS[1])
         for event in one.events:
-            found = event.value >= one.threshold
             first, last = ((one.survey.time_s[k] - one.frames.time_s[0]) / 60.0 for k in (event.first, event.last))
-            axis.axvspan(first, last, color=COLOURS[0] if found else NULL, alpha=0.2, linewidth=0)
+            axis.axvspan(first, last, color=_colour(one, event), alpha=0.2, linewidth=0)
         axis.set_ylabel(f"flux ({one.frames.unit})" if one.frames.unit else "flux")
     if bright:
         axes[1, 0].set_ylim(
@@ -49,7 +53,52 @@ def observed_light_curve(plt: Any, answer: AnalyseAnswer) -> Any:
             float(np.min(one.flux[used] - one.level.error[used])), float(np.max(one.flux[used] + one.level.error[used]))
         )
     axes[-1, 0].set_xlabel(f"time (min) from {one.frames.date(float(one.frames.time_s[0]))[:19]}")
-    headline(figure, f"{one.frames.name}: events above {one.threshold:.2f} (blue) and candidates (grey)")
+    headline(figure, f"{one.frames.name}: {KINDS.format(one.threshold)}")
+    return figure
+
+
+def _colour(one: Analysis, event: ObservedEvent) -> str:
+    """Return the colour of an event."""
+    if event.kind != "flare":
+        return COLOURS[4]
+    return COLOURS[0] if event.value >= one.threshold else NULL
+
+
+@picture_of("AnalyseAnswer", "dynamic-spectrum", when=lambda answer: answer.analysis.spectra is not None)
+@styled_picture
+def observed_dynamic_spectrum(plt: Any, answer: AnalyseAnswer) -> Any:
+    """Plot the searched spectra, in standard deviations from their median, and mark the events."""
+    one, spectra = answer.analysis, answer.analysis.spectra
+    assert spectra is not None
+    stare, noise = one.survey.stare, spectra.series.noise
+    figure, axis = plt.subplots(figsize=(7.2, 3.6))
+    sd = np.broadcast_to(noise.used, spectra.series.excess.shape)
+    show_spectra(axis, stare, spectra.series.excess, sd, noise.wavelength_nm)
+    scale = time_unit(stare.duration_s)[0]
+    for event in one.events:
+        first, last = (stare.start_s[k] - stare.start_s[0] for k in (event.first, event.last))
+        ends = np.array([first, last + stare.frame_s]) / scale
+        axis.plot(ends, [1.02, 1.02], transform=axis.get_xaxis_transform(), color=_colour(one, event), linewidth=3,
+                  clip_on=False, solid_capstyle="butt")  # fmt: skip
+    headline(figure, f"{one.frames.name}: {KINDS.format(one.threshold)}")
+    return figure
+
+
+@picture_of("AnalyseAnswer", "noise-per-pixel", when=lambda answer: answer.analysis.spectra is not None)
+@styled_picture
+def observed_pixel_noise(plt: Any, answer: AnalyseAnswer) -> Any:
+    """Plot the noise of each pixel as measured over that which is stated, with the range of 95 % of normal noise."""
+    spectra = answer.analysis.spectra
+    assert spectra is not None
+    noise = spectra.series.noise
+    figure, axis = plt.subplots(figsize=(4.6, 3.2))
+    axis.fill_between(noise.wavelength_nm, noise.low / noise.stated, noise.high / noise.stated, color=NULL, alpha=0.4,
+                      linewidth=0)  # fmt: skip
+    for which, colour in ((~noise.departs, COLOURS[0]), (noise.departs, COLOURS[4])):
+        axis.plot(noise.wavelength_nm[which], (noise.measured / noise.stated)[which], ".", color=colour, markersize=3)
+    axis.set_xlabel("wavelength (nm)")
+    axis.set_ylabel("measured over stated noise")
+    headline(figure, f"{answer.analysis.frames.name}: quiescent frames; grey: 95 % of normal noise; red: departs")
     return figure
 
 

@@ -86,7 +86,7 @@ def test_the_answer_writes_its_tables_and_shows_them(analysis: Analysis, tmp_pat
     assert "below" in reasons[265]
     titles = [view.texts()[0] for view in answer.views]
     assert all(titles)
-    assert set(answer.as_json()) == {"messages", "events", "limits", "noise"}
+    assert set(answer.as_json()) == {"messages", "events", "limits", "noise", "measured"}
     # The end of the great flare is not observed, one bin within it is bad, and no template has its shape.
     assert sum(events["note"] != "") >= 1
     assert "1 missing frame" in str(events["note"][-1])

@@ -9,14 +9,20 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from mauvecl.answers.answer import Answer
+from mauvecl.host.stars.source import Source
 from mauvecl.observations.analysis import Analysis, analyse_frames
+from mauvecl.observations.event_spectrum import EventSpectrum
 from mauvecl.observations.events import ObservedEvent
+from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.reading import read_frames
+from mauvecl.results.measurements.fit import Measurement
+from mauvecl.results.measurements.flare_model import FlareModel
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
 from mauvecl.schema.tables import Column, View, interval, number, percent, table_of
+from mauvecl.study.cases import cases
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,16 +36,61 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 
+#: Name of the bolometric energy among measured quantities.
+ENERGY = "energy bolometric"
+NO_SPECTRA = "no spectra of the instrument are given"
+NO_DISTANCE = (
+    "the distance of the star is not known: name the star that was observed, and its distance (star.distance_pc)"
+)
+#: V magnitude of the star that stands for one that is not named: far from saturation.
+ANY_MAGNITUDE = 12.0
+
+
 @dataclass(frozen=True, eq=False)
 class EventRow:
-    """An event with the analysis that it belongs to."""
+    """An event, by its number, with the analysis that it belongs to."""
 
     analysis: Analysis
-    event: ObservedEvent
+    number: int
+
+    @property
+    def event(self) -> ObservedEvent:
+        """The event."""
+        return self.analysis.events[self.number]
+
+    @property
+    def spectrum(self) -> EventSpectrum | None:
+        """Its spectrum, in spectra that are searched with weights for flares."""
+        return None if self.analysis.spectra is None else self.analysis.spectra.found[self.number]
+
+    @property
+    def measured(self) -> Measurement | str:
+        """The flare fitted to its spectrum, or the reason why none is."""
+        one = self.analysis.spectra
+        return NO_SPECTRA if one is None else one.measured[self.number]
+
+    @property
+    def unmeasured(self) -> str:
+        """Why temperature or energy are not measured; empty if they are."""
+        if isinstance(self.measured, str):
+            return self.measured
+        return "" if ENERGY in self.measured.names else NO_DISTANCE
+
+    def quantity(self, name: str) -> tuple[float, float, float]:
+        """Return estimate and 68 % interval of a measured quantity; NaN if it is not measured."""
+        one = self.measured
+        if isinstance(one, str) or name not in one.names:
+            return (float("nan"),) * 3
+        k = one.column(name)
+        return float(one.estimates[0, k]), float(one.low[0, 0, k]), float(one.high[0, 0, k])
 
     def time_d(self, frame: int) -> float:
         """Return the time of a searched frame, in days."""
         return float(self.analysis.survey.time_s[frame]) / DAY_S
+
+    def cadence(self, frame: int) -> int:
+        """Return the number of a searched frame on the grid of the cadence."""
+        return int(self.analysis.frames.numbers[self.analysis.level.used][frame])
 
     @property
     def date(self) -> str:
@@ -94,13 +145,32 @@ class EventRow:
     def note(self) -> str:
         """Statements about the event that a reader must know."""
         event = self.event
-        notes = [] if event.kind == "flare" else ["a step of the level fits better than a flare"]
+        notes = ["a step of the level fits better than a flare"] if event.kind == "step" else []
+        notes += [self.spectrum.reason] if self.spectrum is not None and self.spectrum.reason else []
         notes += ["it begins before or ends after the frames"] if event.cut else []
         frames = "1 missing frame is" if event.missing == 1 else f"{event.missing} missing frames are"
         notes += [f"{frames} interpolated"] if event.missing else []
         if event.components and event.components[0].p_value < 1e-3:
             notes.append("the shape of the templates does not fit it")
         return "; ".join(notes)
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredRow:
+    """A measured quantity of an event."""
+
+    row: EventRow
+    found: Measurement
+    column: int
+
+    @property
+    def date(self) -> str:
+        """Date of the event's brightest frame."""
+        return self.row.date
+
+    def end(self, level: int, which: str) -> float:
+        """Return one end, "low" or "high", of the interval of a level."""
+        return float(getattr(self.found, which)[level, 0, self.column])
 
 
 def _rate(value: float) -> str:
@@ -116,6 +186,11 @@ EVENTS = (
     Column("tstop", lambda row: row.time_d(row.event.last), "d", "middle of the last frame"),
     Column("istart", lambda row: row.event.first, "", "first frame, counted among the searched frames", kind=int),
     Column("istop", lambda row: row.event.last, "", "last frame, inclusive", kind=int),
+    Column("cstart", lambda row: row.cadence(row.event.first), "", "first frame, counted on the grid of the cadence "
+           "with gaps", kind=int),
+    Column("cstop", lambda row: row.cadence(row.event.last), "", "last frame, likewise", kind=int),
+    Column("total_n_valid_data_points", lambda row: row.analysis.survey.stare.n_frames, "", "searched frames",
+           kind=int),
     Column("dur", "duration_d", "d", "from the start of the first frame to the end of the last", "duration (min)",
            lambda days: f"{1440 * days:.3g}"),
     Column("ampl_rec", "event.amplitude", "", "largest flux above the level, relative to the level", "peak",
@@ -144,7 +219,19 @@ EVENTS = (
     Column("blue_over_red_error", lambda row: row.colour[1], "", "its standard error"),
     Column("p_no_colour", lambda row: row.colour[2], "", "probability of a spectrum at least as different from the "
            "star's if the event has no colour, as a change of throughput"),
-    Column("kind", "event.kind", "", "flare, or step of the level", "kind", kind=str),
+    Column("temperature", lambda row: row.quantity("temperature")[0], "K", "temperature of a blackbody fitted to the "
+           "summed spectra of the event; nan: not measured", "temperature (K)", number(".4g")),
+    Column("temperature_low", lambda row: row.quantity("temperature")[1], "K", "lower end of its 68 % interval"),
+    Column("temperature_high", lambda row: row.quantity("temperature")[2], "K", "upper end"),
+    Column("energy", lambda row: row.quantity(ENERGY)[0], "erg", "bolometric energy in the frames of the event",
+           "energy (erg)", number(".3g")),
+    Column("energy_low", lambda row: row.quantity(ENERGY)[1], "erg", "lower end of its 68 % interval"),
+    Column("energy_high", lambda row: row.quantity(ENERGY)[2], "erg", "upper end"),
+    Column("unmeasured", "unmeasured", "", "why temperature or energy are not measured", kind=str),
+    Column("snr_flare", lambda row: float("nan") if row.spectrum is None else row.spectrum.snr, "", "S/N of a flare in "
+           "the event's spectrum if star, dark current and sky changed by any amount", kind=float),
+    Column("kind", "event.kind", "", "flare, or what resembles one: step of the level, change of throughput, dark "
+           "current or sky, cosmic ray", "kind", kind=str),
     Column("note", "note", "", "what is special", kind=str),
 )  # fmt: skip
 #: Columns of the table of frames, one row for all frames of an analysis.
@@ -155,6 +242,35 @@ FRAMES = (
     Column("error", "level.error", "", "standard deviation of a quiescent frame"),
     Column("reason", lambda one: np.array([Reason.words(int(value)) for value in one.level.reasons]), "",
            "why the frame is not searched; empty if it is"),
+    Column("rays", lambda one: np.zeros(one.frames.n_frames, np.int64) if one.spectra is None
+           else one.spectra.cleaned.rays, "", "single values that a fit to the other pixels replaces, such as those of "
+           "cosmic rays"),
+)  # fmt: skip
+#: Columns of the measured quantities, one row per event and quantity.
+MEASURED = (
+    Column("date", description="brightest frame of the event", heading="event", format=lambda text: text[:22],
+           kind=str),
+    Column("quantity", lambda one: one.found.names[one.column], "", "what is measured", "quantity", kind=str),
+    Column("unit", lambda one: one.found.units[one.column], "", "of estimate and intervals", "unit", kind=str),
+    Column("estimate", lambda one: float(one.found.estimates[0, one.column]), "", "of maximum likelihood", "estimate",
+           number(".4g"), kind=float),
+    Column("low", lambda one: one.end(0, "low"), "", "lower end of the 68 % interval", "68 %", interval(".4g"),
+           ("high",), float),
+    Column("high", lambda one: one.end(0, "high"), "", "upper end", kind=float),
+    Column("low_95", lambda one: one.end(1, "low"), "", "lower end of the 95 % interval", kind=float),
+    Column("high_95", lambda one: one.end(1, "high"), "", "upper end", kind=float),
+    Column("p_value", lambda one: float(one.found.p_value[0]), "", "probability of a worse fit of a blackbody",
+           kind=float),
+)  # fmt: skip
+#: Columns of the noise per pixel, one row for all pixels.
+PIXELS = (
+    Column("wavelength", "wavelength_nm", "nm", "middle of the pixel"),
+    Column("stated", "stated", "", "standard deviation of a quiescent frame, as stated or by the instrument's model"),
+    Column("measured", "measured", "", "from differences of neighbouring quiescent frames, without changes of light "
+           "and dark current that all pixels share"),
+    Column("low", "low", "", "lower end of the range of 95 % of noise of the stated size"),
+    Column("high", "high", "", "upper end"),
+    Column("departs", "departs", "", "whether the search uses the measured noise"),
 )  # fmt: skip
 #: Columns of the completeness, one row per half-width and equivalent duration.
 COMPLETENESS = (
@@ -195,17 +311,30 @@ class AnalyseAnswer(Answer):
     study : Study
         Its sections `data` and `search`.
     analysis : Analysis
+    white : str
+        Why spectra are searched as their sum over wavelength; empty if they are not.
     """
 
     USES: ClassVar[tuple[Use, ...]] = ("templates", "seed")
-    JSON: ClassVar = {"events": "events", "limits": "limits", "noise": "noise"}
+    JSON: ClassVar = {"events": "events", "limits": "limits", "noise": "noise", "measured": "measured"}
 
     study: Study
     analysis: Analysis
+    white: str = ""
 
     @property
     def messages(self) -> list[str]:
-        return self.analysis.messages
+        return [*([self.white] if self.white else []), *self.analysis.messages]
+
+    @property
+    def uses(self) -> tuple[Use, ...]:
+        """Parts of the study that this answer uses: the instrument only for spectra of its pixels."""
+        return (*self.USES, *(("instrument", "sky") if self.analysis.spectra is not None else ()))
+
+    @property
+    def rows(self) -> list[EventRow]:
+        """Events in order of time."""
+        return [EventRow(self.analysis, number) for number in range(len(self.analysis.events))]
 
     @cached_property
     def events(self) -> QTable:
@@ -213,8 +342,7 @@ class AnalyseAnswer(Answer):
         frames = self.analysis.frames
         about = {"star": frames.name, "time_scale": frames.scale, "position": frames.position, "unit": frames.unit,
                  "time_zero_mjd": frames.reference_mjd, "threshold": self.analysis.threshold}  # fmt: skip
-        rows = [EventRow(self.analysis, event) for event in self.analysis.events]
-        return table_of(EVENTS, rows, study=self.study.text(), **about)
+        return table_of(EVENTS, self.rows, study=self.study.text(), **about)
 
     @property
     def frames(self) -> QTable:
@@ -237,10 +365,29 @@ class AnalyseAnswer(Answer):
         return table_of(NOISE, self.analysis.scatter)
 
     @property
+    def measured(self) -> QTable:
+        """One row per event and measured quantity, with intervals."""
+        rows = [
+            MeasuredRow(row, row.measured, column)
+            for row in self.rows
+            if not isinstance(row.measured, str)
+            for column in range(len(row.measured.names))
+        ]
+        return table_of(MEASURED, rows)
+
+    @property
+    def pixels(self) -> QTable:
+        """One row per pixel of spectra: noise as stated and as measured."""
+        one = self.analysis.spectra
+        return table_of(PIXELS, [] if one is None else [one.series.noise], unit=self.analysis.frames.unit)
+
+    @property
     def tables(self) -> dict[str, Table]:
-        """Events, frames, completeness, limits and noise."""
-        return {"events": self.events, "frames": self.frames, "completeness": self.completeness,
-                "limits": self.limits, "noise": self.noise}  # fmt: skip
+        """Events, frames, completeness, limits and noise; of spectra, measured quantities and noise per pixel."""
+        tables = {"events": self.events, "frames": self.frames, "completeness": self.completeness,
+                  "limits": self.limits, "noise": self.noise}  # fmt: skip
+        of_spectra = {"measured": self.measured, "noise-per-pixel": self.pixels}
+        return tables | (of_spectra if self.analysis.spectra is not None else {})
 
     @property
     def views(self) -> list[View]:
@@ -253,14 +400,14 @@ class AnalyseAnswer(Answer):
         nothing = f"Nothing above {one.candidates:.2f} in {one.days:.3g} star-days of {one.frames.name} ({wanted})."
         return [
             View(title, EVENTS, self.events) if one.events else View(nothing),
+            *([View("Measured in the summed spectra of each event", MEASURED, self.measured)] if one.spectra else []),
             View("Smallest flares that would have been detected, by injecting into these frames", LIMITS, self.limits),
             View("Noise of quiescent frames", NOISE, self.noise),
         ]
 
     @property
     def remarks(self) -> list[str]:
-        rows = [EventRow(self.analysis, event) for event in self.analysis.events]
-        return [f"{row.date[:19]}: {row.note}." for row in rows if row.note]
+        return [f"{row.date[:19]}: {row.note}." for row in self.rows if row.note]
 
     @property
     def inputs(self) -> list[Expectation]:
@@ -293,7 +440,37 @@ def analyse(
             raise InputError("no observed frames are given", "data.file, or frames", key="data.file")
         frames = read_frames(study.data.file, study.data.mapping)
     search = study.search
+    model = frame_model(study, frames)
+    jitters = search.spreads() or None
     analysis = analyse_frames(
-        frames, false_alarms=search.false_alarms, per=search.per, shape=search.shape, seed=study.run.seed
-    )
-    return AnalyseAnswer(study, analysis)
+        frames, false_alarms=search.false_alarms, per=search.per, shape=search.shape, seed=study.run.seed,
+        model=model if isinstance(model, FrameModel) else None, rank=search.sums, jitters=jitters,
+        temperature_k=study.flare.temperature_k,
+    )  # fmt: skip
+    return AnalyseAnswer(study, analysis, model if isinstance(model, str) else "")
+
+
+def frame_model(study: Study, frames: Frames) -> FrameModel | str:
+    """Return what the pixels of frames record, or the reason why that is not known; empty for a light curve.
+
+    The star is known if the study names exactly one. Otherwise a faint one stands for it: the fluxes of flares do not
+    depend on it, and the light of the star is measured.
+    """
+    if frames.flux.ndim == 1:
+        return ""
+    named = len(study.star) == 1
+    (case, *_) = cases(study, swept=False)
+    observation = study.observation.model_copy(update={"exposure_s": float(np.median(frames.exposure_s))})
+    case = case.with_sections(observation=observation)
+    star = case.star
+    source = case.source if named else Source.from_library("G2V").at_magnitude(ANY_MAGNITUDE)
+    try:
+        quiet = case.expect(source)[0]
+        flare = FlareModel.of(
+            source, case.instrument, quiet, band=study.flare.band, bands_nm=study.measure.bands_nm,
+            distance_pc=star.distance_pc if named else None, radius_rsun=star.radius_rsun if named else None,
+            order=study.observation.order,
+        )  # fmt: skip
+        return FrameModel.of(frames, quiet, flare)
+    except InputError as error:
+        return f"Spectra are searched as their sum over wavelength: {error}."

@@ -165,6 +165,11 @@ class SampledRate:
         return Interval(value, value - reach, value + reach)
 
     @property
+    def lowest(self) -> float:
+        """Smallest threshold at which the rate is known."""
+        return self._ends[0]
+
+    @property
     def _ends(self) -> tuple[float, float]:
         """Range of thresholds: from one step below the lowest trusted one to the highest."""
         return float(self.thresholds[self._trusted][0] - STEP), float(self.thresholds[-1])

@@ -87,7 +87,36 @@ class Templates:
         used = ~quiet.saturated
         if not used.any():
             raise InputError.of("quiet", quiet.name, "a star that does not saturate every pixel")
-        variance, flares = np.where(used, quiet.variance_dn2, 0.0), flares_dn * used
+        variance = np.where(used, quiet.variance_dn2, 0.0)
+        return cls.of_spectra(
+            variance, flares_dn * used, quiet.gain_dn_per_electron, temperatures_k, nuisances=nuisances, rank=rank
+        )
+
+    @classmethod
+    def of_spectra(
+        cls,
+        variance: Float,
+        flares: Float,
+        photon_variance: Float,
+        temperatures_k: Sequence[float],
+        *,
+        nuisances: Nuisances | None = None,
+        rank: int = RANK,
+    ) -> Self:
+        """Compute weights from the noise of a quiescent frame and flare spectra, all in one unit.
+
+        Parameters
+        ----------
+        variance : ndarray, shape (n_pixel,)
+            Variance of a quiescent frame; zero in pixels that are not used.
+        flares : ndarray, shape (n_temperature, n_pixel)
+            Flares of unit amplitude; zero in pixels that are not used.
+        photon_variance : ndarray, shape (n_pixel,)
+            Rise of the variance with the flux.
+        temperatures_k, nuisances, rank
+            As for `of`.
+        """
+        used = variance > 0
         plain = np.divide(flares, variance, out=np.zeros_like(flares), where=used)
         optimal = plain
         if nuisances:
@@ -109,9 +138,18 @@ class Templates:
         weights = (vectors[:, kept] / length[:, None] / np.sqrt(values[kept])).T @ optimal
         # Signs are arbitrary; choose them so that the hottest flare increases each sum.
         weights *= np.where(weights @ flares[-1] < 0, -1.0, 1.0)[:, None]
-        photons = flares * quiet.gain_dn_per_electron
+        photons = flares * photon_variance
         noise = np.einsum("kp,lp,tp->tkl", weights, weights, photons, optimize=True)
         return cls(tuple(temperatures_k), weights, flares @ weights.T, length, noise)
+
+    def mixed(self, matrix: Float) -> Self:
+        """Return the templates of linear combinations of the sums, with `matrix` of shape (n_sum, n_sum)."""
+        return replace(
+            self,
+            weights=matrix @ self.weights,
+            directions=self.directions @ matrix.T,
+            noise=np.einsum("kl,tlm,nm->tkn", matrix, self.noise, matrix),
+        )
 
     @cached_property
     def chosen(self) -> tuple[int, ...]:

@@ -1,0 +1,215 @@
+"""Spectrum of an event: that of a flare or of a change of the instrument, and the flare that is fitted to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from mauvecl.lightcurve.search.templates import TEMPERATURES_K
+from mauvecl.noise.unknowns import NUISANCES, Amplitude
+from mauvecl.observations.events import MIN_BASELINE, Detection
+from mauvecl.observations.search import SeriesSurvey
+from mauvecl.observations.spectra import SpectralSeries
+from mauvecl.results.measurements.fit import Measurement, fit
+from mauvecl.schema.errors import InputError
+from mauvecl.statistics.nuisances import Nuisances
+
+Float = NDArray[np.float64]
+Cause = Literal["flare", "throughput", "dark current", "sky", "cosmic ray"]
+#: Words for the unknowns of frames that may cause an event.
+CAUSES: dict[str, Cause] = {"light": "throughput", "dark": "dark current", "sky": "sky"}
+#: Fall of chi-squared by which another cause must fit better than a flare: 3 standard deviations for one parameter.
+CLEARLY = 9.0
+#: S/N of a flare, next to unknown changes of star, dark current and sky, from which an event is a flare.
+FLARE_SNR = 4.0
+#: Share of an event's chi-squared in a single pixel from which it is that of a cosmic ray.
+RAY_SHARE = 0.5
+#: Smallest number of means of quiescent frames from which drifts are measured.
+MIN_PARTS = 8
+#: Probability of a worse fit below which no spectrum that is known explains an event.
+NO_FIT = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class EventSpectrum:
+    """Spectrum of an event and its fits.
+
+    Attributes
+    ----------
+    cause : str
+        What explains the spectrum: a flare, or what resembles one.
+    snr : float
+        S/N of a flare whose amplitude is fitted together with changes of star, dark current and sky.
+    chi2 : dict of str to float
+        Chi-squared of single causes, each with its best amplitude; of flares, the best temperature.
+    dof : int
+    p_value : float
+        Probability of a chi-squared at least as large as the smallest, if its cause is right.
+    """
+
+    cause: Cause
+    snr: float
+    chi2: dict[Cause, float]
+    dof: int
+    p_value: float
+
+    @property
+    def reason(self) -> str:
+        """Why the event is no flare, or what is doubtful if it is one; empty if nothing is."""
+        if self.cause == "cosmic ray":
+            return "its light is in a single pixel, as that of a cosmic ray"
+        if self.cause != "flare":
+            gain = self.chi2["flare"] - self.chi2[self.cause]
+            return f"its spectrum is that of a change of the {self.cause}: chi-squared is {gain:.3g} below a flare's"
+        others = min(value for cause, value in self.chi2.items() if cause != "flare")
+        if others < self.chi2["flare"] + CLEARLY:
+            return "its spectrum does not tell it from a change of the instrument"
+        return "no flare of one temperature fits its spectrum" if self.p_value < NO_FIT else ""
+
+
+def event_spectrum(
+    survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], one: Detection
+) -> EventSpectrum:
+    """Compare the spectrum of an event with those of flares and of what resembles them.
+
+    Parameters
+    ----------
+    survey : SeriesSurvey
+    series : SpectralSeries
+    taken : ndarray of bool, shape (n_frame,)
+        Frames of all events.
+    one : Detection
+    """
+    spectrum, variance = _weighted(survey, series, taken, one)
+    flares = series.model.flares(TEMPERATURES_K)
+    unknown = series.model.unknowns(series.light)
+    whole = float((spectrum**2 / variance).sum())
+
+    def best(rows: Float) -> Float:
+        """Return chi-squared with each of some spectra alone."""
+        along = rows @ (spectrum / variance)
+        return np.asarray(whole - along**2 / np.einsum("kp,kp->k", rows, rows / variance))
+
+    # Light is added, never taken away.
+    rises = flares @ (spectrum / variance) > 0
+    chi2: dict[Cause, float] = {"flare": float(np.where(rises, best(flares), whole).min())}
+    chi2 |= {CAUSES[name]: float(best(row[None])[0]) for name, row in unknown.items()}
+    together = Nuisances(tuple(unknown), np.array(list(unknown.values())), np.full(len(unknown), np.inf))
+    rows = together.rows(variance, together.spectra)
+    optimal = flares / variance - (flares @ rows.T) @ rows
+    values = (optimal @ spectrum) / np.sqrt(np.einsum("kp,kp->k", optimal, flares))
+    snr = float(values.max())
+    cause: Cause = min(chi2, key=lambda name: chi2[name])
+    dof = spectrum.size - 1
+    least = chi2[cause]
+    left = spectrum - _fitted(cause, spectrum, variance, flares, unknown)
+    p_value = float(scipy.stats.chi2.sf(least, dof))
+    if p_value < NO_FIT and (left**2 / variance).max() > RAY_SHARE * least:
+        cause = "cosmic ray"
+    elif cause != "flare" and (chi2["flare"] - least < CLEARLY or snr >= FLARE_SNR):
+        cause = "flare"
+    return EventSpectrum(cause, snr, chi2, dof, p_value)
+
+
+def _fitted(cause: Cause, spectrum: Float, variance: Float, flares: Float, unknown: dict[str, Float]) -> Float:
+    """Return the best fit of a single cause, shape (n_pixel,)."""
+    rows = flares if cause == "flare" else np.array([row for name, row in unknown.items() if CAUSES[name] == cause])
+    amplitudes = (rows @ (spectrum / variance)) / np.einsum("kp,kp->k", rows, rows / variance)
+    chi2 = (((spectrum - amplitudes[:, None] * rows) ** 2) / variance).sum(axis=1)
+    k = int(np.argmin(chi2))
+    return np.asarray(amplitudes[k] * rows[k])
+
+
+def _window(
+    survey: SeriesSurvey, taken: NDArray[np.bool_], one: Detection
+) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Return the frames of an event and of its surroundings without other events, and which belong to the event."""
+    lead, tail = survey.bank.window(one.half_width_s)
+    numbers = survey.stare.numbers
+    inside = np.zeros(numbers.size, np.bool_)
+    inside[one.first : one.last + 1] = True
+    near = (numbers >= numbers[one.first] - lead) & (numbers <= numbers[one.last] + tail)
+    at = np.flatnonzero(near & (inside | ~taken))
+    return at, inside[at]
+
+
+def _weighted(
+    survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], one: Detection
+) -> tuple[Float, Float]:
+    """Return the spectrum of an event, of the size of its peak, and its variance.
+
+    The template of the search is fitted to each pixel, with a straight line.
+    """
+    at, _ = _window(survey, taken, one)
+    start = survey.stare.start_s[at]
+    edges = np.column_stack([start, start + survey.stare.frame_s])
+    shape = survey.bank.shape.mean_over(edges, one.peak_s, one.half_width_s)
+    middle = (start - start.mean()) / max(float(np.ptp(start)), 1.0)
+    weights = np.linalg.pinv(np.column_stack([shape, np.ones(at.size), middle]))[0]
+    spectrum = weights @ series.excess[at]
+    quiet = (weights**2).sum() * series.noise.used**2
+    photons = series.model.gain * np.maximum(spectrum, 0.0) * float((weights**2) @ np.maximum(shape, 0.0))
+    return np.asarray(spectrum), np.asarray(quiet + photons)
+
+
+def drifts(survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], n_frames: int) -> dict[str, float]:
+    """Return how much star, dark current and sky differ between parts of the frames and their surroundings.
+
+    Measured from means of `n_frames` quiescent frames against the means before and after: the scatter beyond that of
+    noise, and what of it the noise may hide. The sky is not measured, but changes by its documented prior.
+
+    Returns
+    -------
+    dict of str to float
+        Standard deviation by name; infinite if there are fewer than `MIN_PARTS` such means.
+    """
+    unknown = series.model.unknowns(series.light)
+    names = ("light", "dark")
+    white = np.array([unknown[name] for name in names]) / series.noise.used
+    covariance = np.linalg.inv(white @ white.T)
+    amplitudes = series.excess @ (covariance @ white / series.noise.used).T
+    numbers = survey.stare.numbers
+    found = dict.fromkeys(names, np.inf)
+    part = numbers // n_frames
+    means = [amplitudes[here].mean(axis=0) for k in np.unique(part) if (here := (part == k) & ~taken).sum() == n_frames]
+    if len(means) >= MIN_PARTS:
+        bends = np.diff(np.array(means), 2, axis=0) / 2
+        for k, name in enumerate(names):
+            # A mean less that of its neighbours has 3/2 of the variance of a mean.
+            expected = 1.5 * float(covariance[k, k]) / n_frames
+            beyond = max(float(np.mean(bends[:, k] ** 2)) - expected, 0.0)
+            found[name] = float(np.sqrt(beyond + 2 * expected * np.sqrt(2 / len(bends))))
+    if "sky" in unknown and isinstance(NUISANCES["sky"].prior, Amplitude):
+        found["sky"] = NUISANCES["sky"].prior.sd
+    return found
+
+
+def measure_flare(
+    survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], one: Detection
+) -> Measurement | str:
+    """Fit a flare to the sum of the spectra of an event, or return the reason why none is.
+
+    The level of each pixel is the mean of the surroundings of the event. Star, dark current and sky may differ from
+    these during the event, by as much as between other parts of the frames that are as long; see `drifts`.
+    """
+    at, inside = _window(survey, taken, one)
+    n, base = int(inside.sum()), int((~inside).sum())
+    if base < MIN_BASELINE:
+        return f"{base} frames around it show the quiescent star, {MIN_BASELINE} are needed"
+    excess = series.excess[at]
+    summed = excess[inside].sum(axis=0) - n * excess[~inside].mean(axis=0)
+    model = series.model
+    # The level is that of a finite number of frames.
+    variance = series.noise.used**2 * (1 + n / base)
+    exposure = model.exposure(series.light, variance, n)
+    unknown = {name: row * n / model.per_dn for name, row in model.unknowns(series.light).items()}
+    sd = drifts(survey, series, taken, n)
+    nuisances = Nuisances(tuple(unknown), np.array(list(unknown.values())), np.array([sd[name] for name in unknown]))
+    try:
+        return fit((summed / model.per_dn + exposure.recorded_dn)[None], exposure, model.flares_of(n), nuisances)
+    except InputError as error:
+        return str(error)

@@ -1,0 +1,176 @@
+"""What the pixels of observed frames record of flares, the star, the dark current and the sky."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.schema.errors import InputError
+from mauvecl.statistics.nuisances import spectrum_of
+
+if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.observations.frames import Frames
+    from mauvecl.results.measurements.flare_model import FlareModel
+
+Float = NDArray[np.float64]
+
+#: Units of frames of the instrument: counts of an exposure with bias and dark current, and rates without these, as
+#: `stare` writes them.
+RAW_UNITS, RATE_UNITS = ("adu", "DN"), ("adu / s", "DN / s")
+#: Largest distance of a wavelength from that of the instrument, as a share of the step between pixels.
+MAX_OFFSET = 0.5
+#: Largest relative difference between exposure times.
+SAME_EXPOSURE = 0.01
+#: Level beyond every count, for pixels whose saturation was dealt with before.
+NO_CEILING_DN = 2**31 - 1
+
+
+@dataclass(frozen=True, eq=False)
+class FrameModel:
+    """Frames of spectra of the instrument: its pixels or resolution elements.
+
+    Attributes
+    ----------
+    quiet : Expectation
+        One frame of the quiescent star in the instrument's pixels.
+    flare : FlareModel
+        Flares in one frame in the instrument's pixels.
+    bins : ndarray, shape (n_value, n_pixel)
+        Weights of the instrument's pixels in each value of a frame: 0 or 1.
+    per_dn : float
+        Unit of the frames per DN of an exposure.
+    raw : bool
+        True if the frames include bias and dark current.
+    """
+
+    quiet: Expectation
+    flare: FlareModel
+    bins: Float
+    per_dn: float
+    raw: bool
+
+    @classmethod
+    def of(cls, frames: Frames, quiet: Expectation, flare: FlareModel) -> Self:
+        """Match frames with the pixels or resolution elements of an instrument.
+
+        Raises InputError if their wavelengths or their unit are others.
+        """
+        unit = _plain(frames.unit)
+        if unit not in {_plain(each) for each in (*RAW_UNITS, *RATE_UNITS)}:
+            raise InputError.of("unit", frames.unit, f"one of {', '.join((*RAW_UNITS, *RATE_UNITS))}")
+        exposure = float(np.median(frames.exposure_s))
+        if np.ptp(frames.exposure_s) > SAME_EXPOSURE * exposure:
+            raise InputError.of("exposure_s", f"{frames.exposure_s.min():g} to {frames.exposure_s.max():g} s",
+                                "one exposure time for all frames of spectra")  # fmt: skip
+        assert frames.wavelength_nm is not None
+        pixels = _matched(frames.wavelength_nm, quiet.wavelength_nm)
+        elements = _matched(frames.wavelength_nm, quiet.element_wavelength_nm)
+        if pixels is not None:
+            bins = np.eye(quiet.wavelength_nm.size)[pixels]
+        elif elements is not None:
+            bins = (~quiet.saturated * (quiet.element == elements[:, None])).astype(np.float64)
+        else:
+            raise InputError.of(
+                "wavelength_nm", f"{frames.wavelength_nm.size} values from {frames.wavelength_nm[0]:.1f} nm",
+                f"the {quiet.wavelength_nm.size} pixels or {quiet.element_wavelength_nm.size} resolution elements of "
+                f"{quiet.instrument}",
+            )  # fmt: skip
+        raw = unit in {_plain(each) for each in RAW_UNITS}
+        return cls(quiet, flare, bins, 1.0 if raw else 1.0 / exposure, raw)
+
+    @cached_property
+    def offset(self) -> Float:
+        """Bias and dark current in the frames, shape (n_value,)."""
+        dark = self.quiet.n_frames * (self.quiet.bias_dn + self.quiet.dark_dn)
+        return self.bins @ dark * self.per_dn if self.raw else np.zeros(len(self.bins))
+
+    @cached_property
+    def gain(self) -> Float:
+        """Rise of the variance with the light, shape (n_value,)."""
+        return np.asarray(self.bins @ self.quiet.gain_dn_per_electron / self.bins.sum(axis=1) * self.per_dn)
+
+    @cached_property
+    def ceiling(self) -> float:
+        """Value at which a pixel saturates; infinite for sums of pixels."""
+        return self.quiet.n_frames * self.quiet.ceiling_dn * self.per_dn if self.raw else np.inf
+
+    def flares(self, temperatures_k: tuple[float, ...]) -> Float:
+        """Return the light of flares of unit amplitude, shape (n_temperature, n_value)."""
+        return np.asarray(self.flare.hot_spline(np.log(temperatures_k)) @ self.bins.T * self.per_dn)
+
+    def unknowns(self, light: Float) -> dict[str, Float]:
+        """Return the spectra of what changes in frames without a flare, in the frames' unit, shape (n_value,) each.
+
+        `light` is that of the quiescent star, which pointing and throughput scale; the dark current is per deg C, and
+        the sky once the nominal one, if there is a sky.
+        """
+        spectra = {"light": light, "dark": self.bins @ spectrum_of("dark", self.quiet) * self.per_dn}
+        sky = self.bins @ spectrum_of("sky", self.quiet) * self.per_dn
+        return spectra | ({"sky": sky} if sky.any() else {})
+
+    def variance(self, light: Float) -> Float:
+        """Return the instrument's variance of a frame with this light, shape (n_value,)."""
+        quiet = self.quiet
+        fixed = quiet.unsaturated_variance_dn2 - quiet.gain_dn_per_electron * quiet.light_dn
+        return self.bins @ fixed * self.per_dn**2 + self.gain * np.maximum(light, 0.0)
+
+    def exposure(self, light: Float, variance: Float, n_frames: int) -> Expectation:
+        """Return the expectation of some frames, with one pixel for each value, as measured.
+
+        Parameters
+        ----------
+        light, variance : ndarray, shape (n_value,)
+            Light of a quiescent frame and its variance, in the frames' unit.
+        n_frames : int
+        """
+        gain = self.gain / self.per_dn
+        electrons = np.maximum(light / self.per_dn, 0.0) / gain / self.quiet.n_frames
+        total = variance / self.per_dn**2 / self.quiet.n_frames
+        rest = np.maximum(total - gain**2 * electrons - 1 / 12, 0.0)
+        n = electrons.size
+        return replace(
+            self.quiet,
+            source_electrons=electrons,
+            sky_electrons=np.zeros(n),
+            neighbour_electrons=np.zeros(n),
+            dark_dn=np.zeros(n),
+            bias_dn=np.zeros(n),
+            read_noise_dn=np.sqrt(rest),
+            gain_dn_per_electron=gain,
+            wavelength_nm=self.bins @ self.quiet.wavelength_nm / self.bins.sum(axis=1),
+            element=np.arange(n, dtype=np.int32),
+            element_wavelength_nm=self.bins @ self.quiet.wavelength_nm / self.bins.sum(axis=1),
+            n_frames=self.quiet.n_frames * n_frames,
+            adc_max_dn=NO_CEILING_DN,
+            saturation_dn=float(NO_CEILING_DN),
+            messages=(),
+        )
+
+    def flares_of(self, n_frames: int) -> FlareModel:
+        """Return the model of flares in the sum of some frames, with one pixel for each value, in DN."""
+        binned = replace(self.flare, hot=self.flare.hot @ self.bins.T, fixed=self.flare.fixed @ self.bins.T)
+        return binned.stacked(n_frames)
+
+    def part(self, kept: NDArray[np.bool_]) -> FrameModel:
+        """Return the model of some of the values."""
+        return replace(self, bins=self.bins[kept])
+
+
+def _plain(unit: str) -> str:
+    """Return a unit without spaces, in small letters; "adu s-1" is "adu/s"."""
+    return unit.lower().replace(" ", "").replace("s-1", "/s").replace("dn", "adu")
+
+
+def _matched(wanted: Float, given: Float) -> NDArray[np.intp] | None:
+    """Return the index of each wavelength among those of an instrument, or None if one is not there."""
+    nearest = np.array([int(np.argmin(np.abs(given - each))) for each in wanted])
+    step = float(np.median(np.diff(given)))
+    same = np.abs(given[nearest] - wanted) < MAX_OFFSET * step
+    # Wavelengths of pixels are those of elements only where pixels are as wide.
+    alike = wanted.size < 2 or abs(float(np.median(np.diff(wanted))) / step - 1.0) < MAX_OFFSET
+    return nearest if same.all() and alike and np.unique(nearest).size == nearest.size else None

@@ -1,0 +1,332 @@
+"""Spectra of observed frames: single bad pixels, noise of each pixel as measured, and sums weighted for flares.
+
+The weights are those of the marginalised matched filter (METHODS section 7) for flares of 6000 to 30 000 K, with the
+noise of each pixel, where light and dark current jitter from frame to frame with the scatter that the frames show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates
+from mauvecl.observations.frame_model import FrameModel
+from mauvecl.observations.level import MEDIAN_S, PER_MAD, QuiescentLevel, running_median, single_frames
+from mauvecl.observations.search import SeriesSurvey, bank_of, stare_of
+from mauvecl.schema.errors import InputError
+from mauvecl.statistics.nuisances import Nuisances
+
+if TYPE_CHECKING:
+    from mauvecl.lightcurve.flares.shapes import Shape
+    from mauvecl.observations.frames import Frames
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+#: Expected number of values of normal noise in all frames that are taken for cosmic rays.
+CHANCE_RAYS = 0.01
+#: Flares that explain the light of many pixels at once, K; what they leave in one pixel of one frame is a cosmic ray.
+RAY_FLARES_K = (6_000.0, 12_000.0, 30_000.0)
+#: Largest number of rounds of replacing bad values by the fit to the others, which end where the values change by less
+#: than this share of a standard deviation.
+RAY_ROUNDS, SETTLED = 50, 0.05
+#: Differences, in standard errors, beyond which noise as measured is used in place of what is stated.
+DEPARTS = 4.0
+#: Frames of one block of computations, which bounds the memory.
+BLOCK = 1024
+
+
+@dataclass(frozen=True, eq=False)
+class CleanedSpectra:
+    """Frames whose single bad values are replaced.
+
+    Attributes
+    ----------
+    frames : Frames
+        Without bias and dark current, in the pixels that are used.
+    model : FrameModel
+        Of these pixels.
+    rays : ndarray of int, shape (n_frame,)
+        Number of values of each frame that are replaced.
+    stated : ndarray, shape (n_pixel,)
+        Standard deviation of a quiescent frame, as the file states it or else by the noise model of the instrument.
+    stated_by : {"file", "instrument"}
+    saturated : ndarray of bool, shape (n_frame,)
+    """
+
+    frames: Frames
+    model: FrameModel
+    rays: NDArray[np.int64]
+    stated: Float
+    stated_by: str
+    saturated: Bool
+
+
+@dataclass(frozen=True, eq=False)
+class PixelNoise:
+    """Noise of each pixel in quiescent frames, without the light and dark current that all pixels share.
+
+    Attributes
+    ----------
+    wavelength_nm, stated, measured : ndarray, shape (n_pixel,)
+        Standard deviations of a frame.
+    low, high : ndarray, shape (n_pixel,)
+        Range of `measured` for 95 % of normal noise of the stated size.
+    count : int
+        Number of differences of neighbouring frames.
+    """
+
+    wavelength_nm: Float
+    stated: Float
+    measured: Float
+    low: Float
+    high: Float
+    count: int
+
+    @property
+    def departs(self) -> Bool:
+        """True for pixels whose measured noise differs significantly from the stated one."""
+        return np.asarray(np.abs(self.measured / self.stated - 1.0) > DEPARTS * relative_error(self.count))
+
+    @property
+    def used(self) -> Float:
+        """Noise by which pixels are weighted: as stated, or as measured where it departs from that."""
+        return np.where(self.departs, self.measured, self.stated)
+
+
+@dataclass(frozen=True, eq=False)
+class SpectralSeries:
+    """Spectra of the searched frames.
+
+    Attributes
+    ----------
+    excess : ndarray, shape (n_frame, n_pixel)
+        Spectra less that of the quiescent star.
+    light : ndarray, shape (n_pixel,)
+        Spectrum of the quiescent star.
+    noise : PixelNoise
+    model : FrameModel
+    jitters : mapping of str to float
+        Standard deviations of the unknowns that change from frame to frame.
+    """
+
+    excess: Float
+    light: Float
+    noise: PixelNoise
+    model: FrameModel
+    jitters: Mapping[str, float]
+
+
+def relative_error(differences: int) -> float:
+    """Return the relative standard error of a standard deviation from successive differences (von Neumann 1941)."""
+    return 0.5 * float(np.sqrt(3.0 / max(differences, 1)))
+
+
+def clean_spectra(frames: Frames, model: FrameModel) -> CleanedSpectra:
+    """Replace single bad values of spectra by a fit to the other pixels of their frame.
+
+    Flares, and changes of the star, the dark current and the sky, change many pixels; one that stands out from these by
+    itself, in one frame, is hit by a particle or read wrongly. Pixels that are not finite in a frame without a fault
+    are left out of all frames.
+    """
+    usable = frames.faults == 0
+    fine = np.isfinite(frames.flux[usable]).all(axis=0) & (model.bins.sum(axis=1) > 0)
+    if not fine.any() or not usable.any():
+        raise InputError.of("flux", "no pixel that is finite in every frame", "pixels with light in every frame",
+                            where=frames.name)  # fmt: skip
+    model = model.part(fine)
+    assert frames.wavelength_nm is not None
+    flux = frames.flux[:, fine]
+    saturated = usable & (flux >= model.ceiling).any(axis=1)
+    flux = flux - model.offset
+    good = usable & ~saturated
+    if not good.any():
+        raise InputError.of("flux", "saturated pixels in every frame", "frames below saturation", where=frames.name)
+    light = np.median(flux[good], axis=0)
+    error = None if frames.error is None else frames.error[:, fine]
+    stated = np.sqrt(model.variance(light)) if error is None else np.median(error[good], axis=0)
+    rays = np.zeros(frames.n_frames, np.int64)
+    rays[good] = _replace_rays(flux, np.flatnonzero(good), light, stated, model, frames.numbers)
+    made = replace(
+        frames, flux=flux, error=np.broadcast_to(stated, flux.shape) if error is None else error,
+        wavelength_nm=frames.wavelength_nm[fine],
+    )  # fmt: skip
+    return CleanedSpectra(made, model, rays, stated, "instrument" if error is None else "file", saturated)
+
+
+def _replace_rays(
+    flux: Float, at: NDArray[np.intp], light: Float, stated: Float, model: FrameModel, numbers: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Replace bad values in some frames of `flux`, in place, and return their number in each of these frames."""
+    excess = flux[at] - light
+    # Measured robustly, so that a wrong statement makes no rays.
+    scatter = PER_MAD * np.median(np.abs(np.diff(excess, axis=0)), axis=0) / np.sqrt(2.0)
+    sd = np.maximum(stated, scatter)
+    spectra = np.vstack([*model.unknowns(light).values(), model.flares(RAY_FLARES_K)])
+    basis = np.linalg.svd(spectra / np.linalg.norm(spectra, axis=1, keepdims=True) / sd, full_matrices=False)[2]
+    limit = float(scipy.stats.norm.isf(CHANCE_RAYS / 2 / excess.size))
+    bad = np.zeros(excess.shape, np.bool_)
+    rows = np.arange(at.size)
+    for _ in range(RAY_ROUNDS):
+        fit = (excess[rows] / sd) @ basis.T @ basis * sd
+        left = np.abs(excess[rows] - fit) / np.sqrt(sd**2 + model.gain * np.maximum(fit, 0.0))
+        left[bad[rows]] = 0.0
+        # The farthest alone: a large one moves the fit away from the others.
+        worst = left.argmax(axis=1)
+        far = left[np.arange(rows.size), worst] > limit
+        bad[rows[far], worst[far]] = True
+        moved = np.where(bad[rows], fit - excess[rows], 0.0)
+        excess[rows] += moved
+        rows = rows[far | (np.abs(moved) > SETTLED * sd).any(axis=1)]
+        if not rows.size:
+            break
+    # What stands out in the same pixel of a neighbouring frame as well is no ray, but light that the fit does not know.
+    adjacent = np.diff(numbers[at]) == 1
+    both = bad[1:] & bad[:-1] & adjacent[:, None]
+    bad[1:] &= ~both
+    bad[:-1] &= ~both
+    where = np.nonzero(bad)
+    flux[at[where[0]], where[1]] = (excess + light)[where]
+    return np.asarray(bad.sum(axis=1), np.int64)
+
+
+def measure_noise(excess: Float, pairs: NDArray[np.intp], stated: Float, shared: Float, nm: Float) -> PixelNoise:
+    """Measure the noise of each pixel from differences of neighbouring quiescent frames.
+
+    Parameters
+    ----------
+    excess : ndarray, shape (n_frame, n_pixel)
+    pairs : ndarray of int
+        Quiescent frames whose successor is the next one, and quiescent.
+    stated : ndarray, shape (n_pixel,)
+        Standard deviation of a frame that is expected.
+    shared : ndarray, shape (k, n_pixel)
+        Spectra of what all pixels share; their part is fitted in each frame.
+    nm : ndarray, shape (n_pixel,)
+    """
+    basis = np.linalg.svd(shared / stated, full_matrices=False)[2]
+    total = np.zeros(stated.size)
+    for first in range(0, pairs.size, BLOCK):
+        some = pairs[first : first + BLOCK]
+        steps = (excess[some + 1] - excess[some]) / stated
+        total += ((steps - steps @ basis.T @ basis) ** 2).sum(axis=0)
+    # The fit takes its share of the noise of each pixel.
+    left = 1.0 - (basis**2).sum(axis=0)
+    measured = stated * np.sqrt(total / (2.0 * pairs.size * left))
+    reach = float(scipy.stats.norm.isf(0.025)) * relative_error(pairs.size)
+    return PixelNoise(nm, stated, measured, stated * (1 - reach), stated * (1 + reach), int(pairs.size))
+
+
+def survey_spectra(
+    cleaned: CleanedSpectra,
+    flux: Float,
+    level: QuiescentLevel,
+    shape: Shape,
+    rank: int,
+    jitters: Mapping[str, float] | None = None,
+) -> tuple[SeriesSurvey, SpectralSeries, QuiescentLevel]:
+    """Prepare the search of spectra that is weighted for flares.
+
+    Parameters
+    ----------
+    cleaned : CleanedSpectra
+    flux : ndarray, shape (n_frame,)
+        Their sum over wavelength.
+    level : QuiescentLevel
+        Of this sum.
+    shape : Shape
+    rank : int
+        Largest number of sums of a frame.
+    jitters : mapping of str to float, optional
+        Standard deviations of unknowns of each frame, infinite for those that are projected out; as measured by
+        default.
+
+    Returns
+    -------
+    survey : SeriesSurvey
+    series : SpectralSeries
+    level : QuiescentLevel
+        With single frames flagged that only the weighted sums show.
+    """
+    frames, model = cleaned.frames, cleaned.model
+    light = frames.flux[level.quiet].mean(axis=0)
+    unknown = model.unknowns(light)
+    excess = frames.flux - light
+    neighbours = np.diff(frames.numbers) == 1
+    pairs = np.flatnonzero(level.quiet[:-1] & level.quiet[1:] & neighbours)
+    assert frames.wavelength_nm is not None
+    shared = {name: unknown[name] for name in ("light", "dark")}
+    noise = measure_noise(excess, pairs, cleaned.stated, np.array(list(shared.values())), frames.wavelength_nm)
+    known = _jitters(excess, pairs, noise.used, shared) if jitters is None else dict(jitters)
+    names = tuple(name for name in known if name in unknown)
+    nuisances = Nuisances(names, np.array([unknown[name] for name in names]).reshape(len(names), light.size),
+                          np.array([known[name] for name in names]))  # fmt: skip
+    flares = model.flares(TEMPERATURES_K)
+    typical = abs(float(np.median(level.level[level.used])))
+    # Flares that once more add the light of the star, in the sum over wavelength.
+    flares *= typical / flares.sum(axis=1, keepdims=True)
+    templates = Templates.of_spectra(
+        noise.used**2, flares, model.gain, TEMPERATURES_K, nuisances=nuisances or None, rank=rank
+    )
+    sums = np.concatenate([excess[i : i + BLOCK] @ templates.weights.T for i in range(0, len(excess), BLOCK)])
+    used = level.used
+    width = max(3, round(MEDIAN_S / frames.cadence_s))
+    sums -= np.column_stack([running_median(frames, column, level.quiet, width) for column in sums.T])
+    mixing = _whitening(sums, pairs)
+    if mixing is not None:
+        templates, sums = templates.mixed(mixing), sums @ mixing.T
+    directions = templates.directions[list(templates.chosen)]
+    middle = directions[len(directions) // 2] / np.linalg.norm(directions[len(directions) // 2])
+    single = single_frames(frames, np.where(used, sums @ middle, 0.0), used)
+    level = level.without(single)
+    used = level.used
+    stare = stare_of(frames, used)
+    scale = float(np.median(level.error[used]))
+    # The noise follows that of the whole light in time.
+    variance = (level.error[used] / scale) ** 2
+    net = (flux - level.level)[used] / scale
+    photon = float(model.gain @ np.maximum(light, 0.0) / np.maximum(light, 0.0).sum())
+    survey = SeriesSurvey(
+        stare, bank_of(stare, directions, shape), templates, sums[used], variance, net, variance, scale, typical,
+        photon, frames.time_s[used],
+    )  # fmt: skip
+    return survey, SpectralSeries(excess[used], light, noise, model, known), level
+
+
+def _jitters(excess: Float, pairs: NDArray[np.intp], sd: Float, shared: Mapping[str, Float]) -> dict[str, float]:
+    """Measure the scatter of unknowns from frame to frame beyond that of noise, the most significant one first.
+
+    Each is fitted together with those that were found before, and the search ends where none is significant.
+    """
+    found: dict[str, float] = {}
+    while len(found) < len(shared):
+        best: tuple[float, dict[str, float]] = (DEPARTS, {})
+        for name in [each for each in shared if each not in found]:
+            names = (*found, name)
+            white = np.array([shared[each] for each in names]) / sd
+            covariance = np.linalg.inv(white @ white.T)
+            weights = (covariance @ white / sd).T
+            amplitudes = np.concatenate([excess[i : i + BLOCK] @ weights for i in range(0, len(excess), BLOCK)])
+            beyond = np.mean((amplitudes[pairs + 1] - amplitudes[pairs]) ** 2, axis=0) / 2 / np.diag(covariance) - 1
+            significance = float(beyond[-1]) / (2 * relative_error(pairs.size))
+            if significance > best[0]:
+                spread = np.sqrt(np.maximum(beyond, 0.0) * np.diag(covariance))
+                best = significance, dict(zip(names, spread.tolist(), strict=True))
+        if not best[1]:
+            break
+        found = best[1]
+    return {name: value for name, value in found.items() if value > 0}
+
+
+def _whitening(sums: Float, pairs: NDArray[np.intp]) -> Float | None:
+    """Return the matrix that gives the sums unit covariance, as measured; None if they have it already."""
+    steps = sums[pairs + 1] - sums[pairs]
+    covariance = steps.T @ steps / (2 * pairs.size)
+    error = 2 * relative_error(pairs.size)
+    departs = np.abs(covariance - np.eye(len(covariance))) > DEPARTS * error
+    return np.linalg.inv(np.linalg.cholesky(covariance)) if departs.any() else None

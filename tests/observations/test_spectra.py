@@ -1,0 +1,271 @@
+"""Spectra of the instrument with a known truth: noise, bad values, look-alikes, false alarms, limits, measurements."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+
+from mauvecl import Study, analyse
+from mauvecl.answers.observations.analyse import frame_model
+from mauvecl.lightcurve.flares.shapes import shape_of
+from mauvecl.observations.analysis import analyse_frames
+from mauvecl.observations.event_spectrum import event_spectrum, measure_flare
+from mauvecl.observations.events import detect_events
+from mauvecl.observations.frame_model import FrameModel
+from mauvecl.observations.frames import Frames, Reason
+from mauvecl.observations.level import quiescent_level
+from mauvecl.observations.search import SeriesSurvey
+from mauvecl.observations.spectra import CleanedSpectra, SpectralSeries, clean_spectra, survey_spectra
+from tests.refusals import refused
+
+Float = NDArray[np.float64]
+SHAPE = shape_of("davenport2014")
+N, FRAME_S = 720, 5.0
+TIME = (np.arange(N) + 0.5) * FRAME_S
+STUDY = Study(star=[{"library": "M3V", "magnitude": 9.0, "distance_pc": 5.0}])  # type: ignore[arg-type]
+Prepared = tuple[CleanedSpectra, SeriesSurvey, SpectralSeries]
+
+
+def element_frames(flux: Float, error: Float | None = None) -> Frames:
+    nm = np.arange(205.25, 700.0, 10.5)[: flux.shape[1]]
+    return Frames.of(TIME[: len(flux)], flux, error, exposure_s=FRAME_S, wavelength_nm=nm, unit="adu / s", name="M3V")
+
+
+@cache
+def model() -> FrameModel:
+    found = frame_model(STUDY, element_frames(np.ones((N, 48))))
+    assert isinstance(found, FrameModel), found
+    return found
+
+
+@cache
+def light() -> Float:
+    return np.asarray(model().bins @ model().quiet.light_dn * model().per_dn)
+
+
+def flare(peak_s: float, half_width_s: float, size: float, kelvin: float = 10_000.0) -> Float:
+    """Return the light of a flare whose peak adds `size` times the star's light, summed over wavelength."""
+    edges = np.column_stack([TIME - FRAME_S / 2, TIME + FRAME_S / 2])
+    spectrum = model().flares((kelvin,))[0]
+    return np.outer(SHAPE.mean_over(edges, peak_s, half_width_s), size * light().sum() / spectrum.sum() * spectrum)
+
+
+def drawn(rng: np.random.Generator, added: Float | float = 0.0, scale: float | Float = 1.0) -> Frames:
+    """Draw frames with normal noise of the instrument's model, times a factor that the stated errors leave out."""
+    mean = light() + np.broadcast_to(np.asarray(added, np.float64), (N, light().size))
+    quiet = np.sqrt(model().variance(light()))
+    photons = np.sqrt(quiet**2 + model().gain * np.maximum(mean - light(), 0.0))
+    return element_frames(mean + photons * scale * rng.standard_normal(mean.shape), np.tile(quiet, (N, 1)))
+
+
+def prepared(frames: Frames, **how: Any) -> Prepared:
+    cleaned = clean_spectra(frames, model())
+    flux, error = cleaned.frames.white_light
+    survey, series, _ = survey_spectra(cleaned, flux, quiescent_level(cleaned.frames, flux, error), SHAPE, 3, **how)
+    return cleaned, survey, series
+
+
+@pytest.fixture(scope="module")
+def threshold() -> float:
+    return prepared(drawn(np.random.default_rng(1)))[1].normal_rate(20.0, 1).threshold(20.0).value
+
+
+@pytest.fixture(scope="module")
+def rare() -> float:
+    return prepared(drawn(np.random.default_rng(1)))[1].normal_rate(1.0, 1).threshold(0.2).value
+
+
+def test_frames_of_other_wavelengths_or_units_are_searched_in_white_light() -> None:
+    frames = drawn(np.random.default_rng(2))
+    with refused("unit"):
+        FrameModel.of(Frames.of(TIME, frames.flux, exposure_s=5.0, wavelength_nm=frames.wavelength_nm, unit="Jy"),
+                      model().quiet, model().flare)  # fmt: skip
+    with refused("wavelength_nm"):
+        FrameModel.of(Frames.of(TIME, frames.flux, exposure_s=5.0, wavelength_nm=frames.wavelength_nm + 7, unit="adu"),
+                      model().quiet, model().flare)  # fmt: skip
+
+
+def test_noise_per_pixel_lies_within_its_range_and_departures_are_used() -> None:
+    """95 % of pixels within their ranges; the binomial bound fails by chance once in ten thousand times."""
+    rng = np.random.default_rng(300)
+    noises = [prepared(drawn(rng))[2].noise for _ in range(12)]
+    outside = sum(int(((one.measured < one.low) | (one.measured > one.high)).sum()) for one in noises)
+    low, high = stats.binom.ppf([5e-5, 1 - 5e-5], sum(one.measured.size for one in noises), 0.05)
+    assert low <= outside <= high
+    scale = np.where(np.arange(light().size) == 20, 1.5, 1.0)
+    noise = prepared(drawn(rng, scale=scale))[2].noise
+    assert np.flatnonzero(noise.departs).tolist() == [20]
+    assert noise.used[20] / noise.stated[20] == pytest.approx(1.5, rel=0.1)
+
+
+def test_sums_of_quiescent_frames_have_covariance_one_however_the_errors_are_stated() -> None:
+    """Also where the noise is 1.4 times what is stated; standard errors of 0.03 of each covariance, 5 allowed."""
+    for scale in (1.0, 1.4):
+        _, survey, _ = prepared(drawn(np.random.default_rng(301), scale=scale))
+        steps = np.diff(survey.sums / np.sqrt(survey.variance)[:, None], axis=0) / np.sqrt(2)
+        np.testing.assert_allclose(steps.T @ steps / len(steps), np.eye(steps.shape[1]), atol=5 * 0.05)
+
+
+@pytest.mark.parametrize("name", ["light", "dark"])
+def test_jitter_of_frames_is_measured_and_marginalised_over(name: str) -> None:
+    rng = np.random.default_rng(302)
+    sd = {"light": 0.06, "dark": 0.2}[name]
+    frames = drawn(rng, np.outer(sd * rng.standard_normal(N), model().unknowns(light())[name]))
+    _, survey, series = prepared(frames)
+    assert set(series.jitters) == {name}
+    # A standard deviation of 720 values has a standard error of 2.6 %, and of the noise next to it.
+    assert series.jitters[name] == pytest.approx(sd, rel=0.25)
+    # What is marginalised over moves the sums no more than their unit variance says.
+    assert survey.sums.std(axis=0).max() < 1.15
+
+
+def test_cosmic_rays_are_replaced_and_counted_and_flares_are_not() -> None:
+    rng = np.random.default_rng(303)
+    clean = drawn(rng, flare(2000.0, 60.0, 0.8))
+    flux, sd = clean.flux.copy(), clean.error[0]  # type: ignore[index]
+    hits = rng.choice(N, 30, replace=False)
+    pixels = rng.integers(light().size, size=30)
+    flux[hits, pixels] += rng.uniform(12, 80, 30) * sd[pixels]
+    cleaned = clean_spectra(element_frames(flux, clean.error), model())
+    # Pixels next to one another in time are light, not rays.
+    assert cleaned.rays.sum() >= 28
+    assert (cleaned.rays[hits] > 0).sum() >= 28
+    assert cleaned.rays.sum() <= 31
+    assert clean_spectra(clean, model()).rays.sum() <= 1
+    left = np.abs(cleaned.frames.flux - clean.flux)[hits, pixels] / sd[pixels]
+    assert np.median(left) < 2.0
+
+
+def test_saturated_pixels_and_missing_errors_of_raw_frames_are_stated() -> None:
+    rng = np.random.default_rng(304)
+    quiet = model().quiet
+    raw = rng.normal(quiet.recorded_dn, np.sqrt(quiet.variance_dn2), (120, quiet.wavelength_nm.size))
+    raw[50:53, 900] = quiet.ceiling_dn
+    frames = Frames.of(TIME[:120], raw, exposure_s=5.0, wavelength_nm=quiet.wavelength_nm, unit="adu")
+    answer = analyse(STUDY, frames=frames)
+    reasons = [str(text) for text in answer.frames["reason"]]
+    assert [k for k, text in enumerate(reasons) if "saturated" in text] == [50, 51, 52]
+    assert any("state no errors" in message for message in answer.messages)
+    # The noise that the instrument's model states is that of the draws: its mean over pixels to half a per cent.
+    ratio = np.asarray(answer.pixels["measured"] / answer.pixels["stated"])
+    assert ratio.mean() == pytest.approx(1.0, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("kind", "spectrum", "size"),
+    [("throughput", "light", 0.3), ("dark current", "dark", 1.5), ("flare", "", 0.5)],
+)
+def test_look_alikes_are_rejected_by_their_spectrum(kind: str, spectrum: str, size: float) -> None:
+    """A rise of five minutes: of the throughput, the detector's temperature, or a flare."""
+    shape = flare(1800.0, 90.0, 1.0).sum(axis=1) / light().sum()
+    added = flare(1800.0, 90.0, size) if not spectrum else size * np.outer(shape, model().unknowns(light())[spectrum])
+    analysis = analyse_frames(drawn(np.random.default_rng(305), added), model=model())
+    assert analysis.spectra is not None
+    event, found = max(zip(analysis.events, analysis.spectra.found, strict=True), key=lambda pair: pair[0].value)
+    assert abs(analysis.survey.time_s[event.brightest] - 1800.0) < 60
+    assert (event.kind, found.cause) == (kind, kind)
+    assert (found.reason == "") == (kind == "flare")
+
+
+def test_one_pixel_of_several_frames_is_no_flare() -> None:
+    added = np.zeros((N, light().size))
+    added[300:306, 5] = 12 * np.sqrt(model().variance(light())[5])
+    analysis = analyse_frames(drawn(np.random.default_rng(306), added), model=model())
+    near = [event for event in analysis.events if event.first <= 305 and event.last >= 300]
+    assert [event.kind for event in near] == ["cosmic ray"]
+
+
+def test_single_frames_that_only_the_weighted_sums_show_are_flagged() -> None:
+    spike = np.zeros((N, 1))
+    spike[400] = 1.0
+    ultraviolet = model().flares((30_000.0,))[0]
+    size = 9 / np.sqrt((ultraviolet**2 / model().variance(light())).sum())
+    analysis = analyse_frames(drawn(np.random.default_rng(307), spike * size * ultraviolet), model=model())
+    assert analysis.level.reasons[400] == Reason.SPIKE
+
+
+@pytest.mark.long
+def test_false_alarms_are_as_many_as_promised(threshold: float) -> None:
+    """20 a star-day, level, noise and jitters estimated from the frames; fails by chance once in a thousand times."""
+    rng = np.random.default_rng(308)
+    count, days = 0, 0.0
+    for _ in range(60):
+        _, survey, _ = prepared(drawn(rng))
+        count += len(detect_events(survey, threshold)[0])
+        days += survey.stare.observed_s / 86_400
+    low, high = stats.poisson.ppf([0.0005, 0.9995], 20.0 * days)
+    assert 0.9 * low < count < 1.15 * high
+
+
+@pytest.mark.long
+def test_flares_are_detected_as_often_as_their_signal_to_noise_says(rare: float) -> None:
+    """The share of flares of one size above the threshold; the binomial bound fails once in a thousand times.
+
+    The statistic of the template of the flare's own shape is normal about its S/N; others of the bank only add.
+    """
+    rng = np.random.default_rng(309)
+    _, survey, _ = prepared(drawn(rng))
+    unit = survey.templates.directions[np.argmin(np.abs(np.array(survey.templates.temperatures_k) - 10_000))]
+    # The template of 48 s is near enough to flares of 48 s; the line under the flare is fitted, which costs S/N.
+    row = min(survey.search.grid, key=lambda each: abs(each.template.half_width_s - 48.0))
+    power = float(np.median(row.per_amplitude[row.per_amplitude > 0]))
+    size = (rare + 0.5) / (power * float(np.linalg.norm(unit)))
+    seen, number = 0, 60
+    for _ in range(number):
+        peak = rng.uniform(900, 2700)
+        _, survey, _ = prepared(drawn(rng, flare(peak, row.template.half_width_s, size)))
+        best = survey.search.largest(survey.net(survey.sums)[None])
+        seen += best.maximum[0] >= rare and abs(best.peak_s[0] - peak) < 120
+    expected = stats.norm.sf(-0.5)
+    low, high = stats.binom.ppf([0.0005, 0.9995], number, [expected - 0.03, expected + 0.12])
+    assert low <= seen <= high
+
+
+@pytest.mark.long
+def test_intervals_of_temperature_and_energy_cover(threshold: float) -> None:
+    """68 % intervals of flares of S/N 20-100; each binomial bound fails by chance once in a thousand times."""
+    rng = np.random.default_rng(310)
+    number, inside = 40, {"temperature": 0, "energy bolometric": 0}
+    for _ in range(number):
+        kelvin, size = rng.uniform(7000, 15_000), rng.uniform(0.5, 2.0)
+        added = flare(rng.uniform(900, 2700), rng.uniform(30, 90), size, kelvin)
+        _, survey, series = prepared(drawn(rng, added))
+        found, taken = detect_events(survey, threshold)
+        one = max(found, key=lambda each: each.value)
+        assert event_spectrum(survey, series, taken, one).cause == "flare"
+        measured = measure_flare(survey, series, taken, one)
+        assert not isinstance(measured, str), measured
+        # What the flare adds in the frames of the event: its part of the amplitude, of the model's energy of a frame.
+        flares = model().flare.values(kelvin, [1.0])
+        frame = model().flares((kelvin,))[0].sum()
+        kept = np.isin(TIME, survey.time_s[one.first : one.last + 1])
+        truth = {"temperature": kelvin,
+                 "energy bolometric": flares["energy bolometric"] * added[kept].sum() / frame}  # fmt: skip
+        for name, value in truth.items():
+            k = measured.column(name)
+            inside[name] += measured.low[0, 0, k] <= value <= measured.high[0, 0, k]
+    low, high = stats.binom.ppf([0.0005, 0.9995], number, 0.6827)
+    assert all(low <= count <= high for count in inside.values()), inside
+
+
+def test_answer_states_measurements_or_why_there_are_none() -> None:
+    frames = drawn(np.random.default_rng(311), flare(1800.0, 60.0, 1.0))
+    answer = analyse(STUDY, frames=frames)
+    (k,) = np.flatnonzero(np.asarray(answer.events["significant"]))
+    event = answer.events[k]
+    assert event["temperature_low"] < event["temperature"] < event["temperature_high"]
+    assert event["energy_low"] < event["energy"] < event["energy_high"]
+    assert event["unmeasured"] == ""
+    assert {"area", "energy bolometric"} <= {str(name) for name in answer.measured["quantity"]}
+    assert set(answer.tables) >= {"measured", "noise-per-pixel"}
+    unnamed = analyse(Study(), frames=frames)
+    event = unnamed.events[k]
+    assert np.isnan(event["energy"])
+    assert "distance" in event["unmeasured"]
+    # The flux of a flare does not depend on the star.
+    assert event["temperature"].value == pytest.approx(answer.events["temperature"][k].value, rel=1e-3)
