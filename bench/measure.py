@@ -3,13 +3,16 @@
     python bench/measure.py [--count 200000] [--device NAME] [--output bench/results/measure.ecsv]
 
 M3V at V = 9, a flare of 50 % at 9500 K, 50 s. "Estimates" have standard errors, "intervals" two profile intervals of
-every quantity and goodness of fit. The other programs fit pixels that are drawn already. Wall time of all processors.
+every quantity and goodness of fit; "at a bound" those of flares without a jump, whose intervals end at the bound.
+The other programs fit pixels that are drawn already. Wall time of all processors, median of five rounds in which the
+programs take turns; ratios are medians over rounds. Memory: growth of the peak from a tenth of the fits to all of them.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib.metadata
+import resource
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -24,8 +27,8 @@ from mauvecl import BalmerFlare, Engine, FlareModel, Instrument, Source, expect,
 from mauvecl.results.measurements.fit import fit_sums
 from mauvecl.results.measurements.reduction import Reduction, drawn_sums
 
-#: Fits of the slower ways.
-FRAMES, SLOW = 10_000, 100
+#: Fits of the slower ways, and rounds.
+FRAMES, SLOW, ROUNDS = 10_000, 100, 5
 BLOCK = 16_384
 
 
@@ -38,10 +41,12 @@ def main() -> None:
     options = parser.parse_args()
     mauve, star, engine = Instrument.load("mauve"), Source.from_library("M3V").at_magnitude(9), Engine(options.device)
     quiet = expect(star, mauve, exposure=50.0)
-    rows = []
-    for name, jump in (("blackbody (2)", 1.0), ("with a Balmer jump (3)", 2.0)):
-        lit = expect(star.flaring(0.5, spectrum=BalmerFlare(9500.0, jump)), mauve, exposure=50.0)
-        model = FlareModel.of(star, mauve, quiet, jump=jump > 1)
+    rows, growth = [], 0.0
+    for name, true_jump, jump in (
+        ("blackbody (2)", 1.0, False), ("with a Balmer jump (3)", 2.0, True), ("the same, at a bound", 1.0, True)
+    ):  # fmt: skip
+        lit = expect(star.flaring(0.5, spectrum=BalmerFlare(9500.0, true_jump)), mauve, exposure=50.0)
+        model = FlareModel.of(star, mauve, quiet, jump=jump)
         reduction = Reduction.of(model, quiet, lit.net_source_dn - quiet.net_source_dn)
 
         def sums(count: int, lit=lit, reduction=reduction, model=model) -> None:
@@ -60,24 +65,43 @@ def main() -> None:
                 fit(raw, quiet, model)
 
         raw = engine.realise(lit, count=SLOW, seed=1)
-        rows.append((name, "mauvecl, estimates", options.count, timed(sums, options.count)))
-        rows.append((name, "mauvecl, intervals", FRAMES, timed(frames, FRAMES)))
-        for program, other in peers(raw, quiet, model).items():
-            rows.append((name, program, SLOW, timed(other, SLOW)))
-    table = Table(rows=rows, names=("model", "program", "fits", "rate"))
+        ways = {"mauvecl, estimates": (sums, options.count), "mauvecl, intervals": (frames, FRAMES)}
+        ways |= {program: (other, SLOW) for program, other in peers(raw, quiet, model).items()}
+        if not rows:
+            growth = growth_mb(sums, options.count)
+        rates = timed(ways)
+        peer = next(rate for program, rate in rates.items() if "least_squares" in program)
+        rows += [(name, program, ways[program][1], float(np.median(rate)), float(np.median(rate / peer)))
+                 for program, rate in rates.items()]  # fmt: skip
+    table = Table(rows=rows, names=("model", "program", "fits", "rate", "ratio"))
     table["rate"].unit, table["rate"].format, table["rate"].description = "1 / s", ".3g", "fits in a second"
-    write(table, options.output, processor=processor(), device=engine.device_name, versions=versions())
+    table["ratio"].format, table["ratio"].description = ".3g", "over least_squares in the same round"
+    write(
+        table, options.output, memory_growth_mb=round(growth, 1), processor=processor(), device=engine.device_name,
+        versions=versions(),
+    )  # fmt: skip
 
 
-def timed(work: Callable[[int], None], count: int) -> float:
-    """Return fits per second, kernels compiled before: the best of three runs, for other programs use the machine."""
-    work(min(count, 50))
-    best = np.inf
-    for _ in range(3):
-        begun = time.perf_counter()
-        work(count)
-        best = min(best, time.perf_counter() - begun)
-    return count / best
+def timed(ways: dict[str, tuple[Callable[[int], None], int]]) -> dict[str, np.ndarray]:
+    """Return fits per second of each program in each round; kernels are compiled before."""
+    rates = {name: np.empty(ROUNDS) for name in ways}
+    for work, count in ways.values():
+        work(min(count, 50))
+    for k in range(ROUNDS):
+        for name, (work, count) in ways.items():
+            begun = time.perf_counter()
+            work(count)
+            rates[name][k] = count / (time.perf_counter() - begun)
+    return rates
+
+
+def growth_mb(work: Callable[[int], None], count: int) -> float:
+    """Return by how much the peak of the memory grows from a tenth of the fits to all of them, MB."""
+    peaks = []
+    for n in (count // 10, count):
+        work(n)
+        peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    return peaks[1] - peaks[0]
 
 
 def peers(raw: np.ndarray, quiet, model: FlareModel) -> dict[str, Callable[[int], None]]:

@@ -238,7 +238,7 @@ def test_bounded_intervals_agree_with_brute_force() -> None:
     for k in range(len(raw)):
         # The variance is that of the fit before the last, so that the reduction of this one differs by little.
         reduction = Reduction.of(m, x, m.counts(float(np.exp(found.log_k[k])), found.amplitudes[k]))
-        y = reduction.sums((raw[k] - x.recorded_dn)[None])[0][0]
+        y = reduction.weights @ (raw[k] - x.recorded_dn)
 
         def gain(columns: np.ndarray, y: np.ndarray = y) -> float:
             return float(y @ y - scipy.optimize.nnls(columns / np.linalg.norm(columns, axis=0), y)[1] ** 2)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mauvecl.results.measurements.flare_model import FlareModel, derived_values
 from mauvecl.results.measurements.nonnegative import BoundedProfile, bounded_intervals, with_bounds
 from mauvecl.results.measurements.profile import Profile, covariance, covariance_of, intervals
-from mauvecl.results.measurements.reduction import Reduction, check_distinct, usable_variance
+from mauvecl.results.measurements.reduction import Exposures, Reduction, check_distinct, usable_variance
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import Probability, Temperature, Wavelength
@@ -197,19 +197,21 @@ def fit(
     >>> [round(float(x), 2) for x in found.estimates[0, :2]]
     [9000.0, 0.5]
     """
-    excess, left_out = checked_excess(frames, expectation, levels, skipped_nm)
+    exposures, left_out = checked_exposures(frames, expectation, levels, skipped_nm)
 
     def reduction_of(added_dn: Float | None) -> Reduction:
         return Reduction.of(model, expectation, added_dn, nuisances, left_out)
 
-    log_k, linear = _pilot(excess, model, reduction_of(None))
+    log_k, linear = _pilot(exposures, model, reduction_of(None))
     parts: list[tuple[NDArray[np.intp], dict[str, Any]]] = []
     for step in range(REFITS):
         parts = []
         for rows, reduction in variance_groups(expectation, model, log_k, linear, reduction_of):
             for start in range(0, rows.size, BATCH):
                 some = rows[start : start + BATCH]
-                parts.append((some, _fitted(excess[some], model, reduction, levels if step == REFITS - 1 else ())))
+                last = step == REFITS - 1
+                one = (_fitted if last else _estimated)(exposures, some, model, reduction, levels)
+                parts.append((some, one))
         for some, one in parts:
             log_k[some], linear[some] = one["log_k"], one["amplitudes"]
     order = np.argsort(np.concatenate([rows for rows, _ in parts]))
@@ -223,11 +225,11 @@ def fit(
     return Measurement(model.names, model.units, model.bounds, levels=tuple(levels), dof=int(dof.min()), **joined)
 
 
-def checked_excess(
+def checked_exposures(
     frames: ArrayLike, expectation: Expectation, levels: Sequence[float], skipped_nm: Sequence[tuple[float, float]]
-) -> tuple[Float, NDArray[np.bool_]]:
-    """Return frames less the quiescent mean, and the pixels that are not used; raises InputError as `fit` does."""
-    raw = np.atleast_2d(np.asarray(frames, np.float64))
+) -> tuple[Exposures, NDArray[np.bool_]]:
+    """Return exposures, and the pixels that are not used; raises InputError as `fit` does."""
+    raw = np.atleast_2d(np.asarray(frames))
     if raw.ndim != 2 or not len(raw) or raw.shape[1] != expectation.wavelength_nm.size:
         raise InputError(
             f"frames of the shape {raw.shape}",
@@ -235,7 +237,7 @@ def checked_excess(
             key="frames",
             value=raw.shape,
         )
-    if not np.isfinite(raw).all():
+    if raw.dtype.kind not in "iuf" or not np.isfinite(raw).all():
         raise InputError("frames hold undefined values", "finite numbers", key="frames")
     if not levels:
         raise InputError.of("levels", levels, "at least one probability")
@@ -243,15 +245,16 @@ def checked_excess(
     left_out = np.zeros(nm.size, np.bool_)
     for low, high in skipped_nm:
         left_out |= (nm >= low) & (nm <= high)
-    return raw - expectation.recorded_dn, left_out
+    return Exposures(raw, expectation.recorded_dn), left_out
 
 
-def _pilot(excess: Float, model: FlareModel, reduction: Reduction) -> tuple[Float, Float]:
+def _pilot(exposures: Exposures, model: FlareModel, reduction: Reduction) -> tuple[Float, Float]:
     """Fit all frames with the variance of the quiescent star."""
-    log_k, linear = np.empty(len(excess)), np.empty((len(excess), len(model.linear)))
-    for start in range(0, len(excess), BATCH):
-        some = slice(start, start + BATCH)
-        best = Profile(reduction, reduction.sums(excess[some])[0]).best()
+    n = len(exposures.raw)
+    log_k, linear = np.empty(n), np.empty((n, len(model.linear)))
+    for start in range(0, n, BATCH):
+        some = np.arange(start, min(start + BATCH, n))
+        best = Profile(reduction, exposures.sums(reduction, some)).best()
         log_k[some], linear[some] = best.log_k, best.linear
     return log_k, linear
 
@@ -281,15 +284,23 @@ def variance_groups(
         yield rows, reduction_of(mean)
 
 
-def _fitted(excess: Float, model: FlareModel, reduction: Reduction, levels: Sequence[float]) -> dict[str, Any]:
+def _estimated(
+    exposures: Exposures, rows: NDArray[np.intp], model: FlareModel, reduction: Reduction, levels: Sequence[float]
+) -> dict[str, Any]:
+    """Return the parameters of `Measurement` for some frames of one variance."""
+    profile = Profile(reduction, exposures.sums(reduction, rows))
+    best = with_bounds(reduction, profile.sums, profile.best())
+    return {"log_k": best.log_k, "amplitudes": best.linear}
+
+
+def _fitted(
+    exposures: Exposures, rows: NDArray[np.intp], model: FlareModel, reduction: Reduction, levels: Sequence[float]
+) -> dict[str, Any]:
     """Return the attributes of `Measurement` for some frames of one variance."""
-    sums, rest = reduction.sums(excess)
+    sums, rest = exposures.sums_and_rest(reduction, rows)
     profile = Profile(reduction, sums)
     at_nodes = profile.gain_at_nodes()
     best = profile.best(at_nodes)
-    if not levels:
-        best = with_bounds(reduction, sums, best)
-        return {"log_k": best.log_k, "amplitudes": best.linear}
     allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
     ends = [intervals(model, profile, best, at_nodes, one) for one in allowed]
     low, high = (np.stack([one[side] for one in ends]) for side in (0, 1))

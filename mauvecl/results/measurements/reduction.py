@@ -7,9 +7,10 @@ spectra (generalised least squares).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import scipy
@@ -31,6 +32,8 @@ EVERY = 4
 LEAST = 1e-11
 #: Pixels within this many standard deviations of saturation in a frame are not used.
 NEAR_SIGMA = 5.0
+#: Number of frames per block, small enough for a processor's cache.
+FRAMES_AT_ONCE = 64
 #: Smallest share of S/N^2 that must remain after marginalisation over the unknowns.
 LEAST_KEPT = 1e-10
 
@@ -130,14 +133,13 @@ class Reduction(MeanSums):
         free = nuisances.free if nuisances else 0
         return cls(model.hot @ weights.T, model.fixed @ weights.T, model.log_k, variance, weights, rows, free)
 
-    def sums(self, excess_dn: Float) -> tuple[Float, Float]:
-        """Return the sums of frames less the quiescent mean, (n, n_sum), and chi-squared of the residuals, (n,)."""
-        sums = excess_dn @ self.weights.T
+    def rest(self, excess_dn: Float, sums: Float) -> Float:
+        """Return chi-squared of the residuals of frames less the quiescent mean, shape (n,)."""
         used = self.variance > 0.0
         inverse = np.divide(1.0, self.variance, out=np.zeros_like(self.variance), where=used)
-        whole = excess_dn**2 @ inverse
         unknown = excess_dn @ self.rows.T
-        return sums, whole - np.einsum("nk,nk->n", unknown, unknown) - np.einsum("nk,nk->n", sums, sums)
+        explained = np.einsum("nk,nk->n", unknown, unknown) + np.einsum("nk,nk->n", sums, sums)
+        return np.asarray(excess_dn**2 @ inverse - explained)
 
     @property
     def statistics(self) -> tuple[Linear, ...]:
@@ -148,6 +150,30 @@ class Reduction(MeanSums):
     def n_used(self) -> int:
         """Number of used pixels."""
         return int((self.variance > 0.0).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Exposures:
+    """Raw frames, shape (n, n_pixel), and the quiescent mean; sums are taken block by block, without a copy of all."""
+
+    raw: NDArray[Any]
+    mean_dn: Float
+
+    def sums(self, reduction: Reduction, rows: NDArray[np.intp]) -> Float:
+        """Return the sums of some frames, shape (n, n_sum)."""
+        return np.concatenate([excess @ reduction.weights.T for excess in self._excess(rows)])
+
+    def sums_and_rest(self, reduction: Reduction, rows: NDArray[np.intp]) -> tuple[Float, Float]:
+        """Return the sums of some frames, and chi-squared of what they leave, shape (n,)."""
+        parts = []
+        for excess in self._excess(rows):
+            sums = excess @ reduction.weights.T
+            parts.append((sums, reduction.rest(excess, sums)))
+        return np.concatenate([sums for sums, _ in parts]), np.concatenate([rest for _, rest in parts])
+
+    def _excess(self, rows: NDArray[np.intp]) -> Iterator[Float]:
+        for start in range(0, rows.size, FRAMES_AT_ONCE):
+            yield self.raw[rows[start : start + FRAMES_AT_ONCE]] - self.mean_dn
 
 
 def drawn_sums(values: NDArray[np.float32], reduction: Reduction) -> Float:

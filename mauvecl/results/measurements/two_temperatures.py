@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.results.measurements.fit import LEVELS, Forecast, Measurement, checked_excess, fit, variance_groups
+from mauvecl.results.measurements.fit import LEVELS, Forecast, Measurement, checked_exposures, fit, variance_groups
 from mauvecl.results.measurements.flare_model import Derived, FlareModel, derived_values
 from mauvecl.results.measurements.nonnegative import BoundedProfile, bounded_intervals
 from mauvecl.results.measurements.profile import BestFit
@@ -104,7 +104,7 @@ def fit_two_temperatures(
     if any(one.ratio is not None for one in model.derived):
         raise InputError("a model with a Balmer jump", "blackbodies, with lines or without", key="model")
     single = fit(frames, expectation, model, nuisances, levels=levels, skipped_nm=skipped_nm)
-    excess, left_out = checked_excess(frames, expectation, levels, skipped_nm)
+    exposures, left_out = checked_exposures(frames, expectation, levels, skipped_nm)
 
     def reduction_of(added_dn: Float | None) -> Reduction:
         return Reduction.of(model, expectation, added_dn, nuisances, left_out)
@@ -112,7 +112,7 @@ def fit_two_temperatures(
     allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
     parts, order, whole = [], [], TwoTemperatures(model)
     for rows, reduction in variance_groups(expectation, model, single.log_k, single.amplitudes, reduction_of):
-        sums, rest = reduction.sums(excess[rows])
+        sums, rest = exposures.sums_and_rest(reduction, rows)
         found = _Search(model, reduction, sums, allowed).measured()
         best, low, high, second, estimates = found
         chi2 = rest + np.einsum("nk,nk->n", sums, sums) - best.gain
