@@ -15,7 +15,7 @@ from mauvecl.schema.errors import InputError
 from .earth import GRAVITY, Vectors, subsatellite_point, to_j2000, unit
 from .elements import Elements
 from .sun_and_moon import Bodies
-from .time_grid import TimeGrid
+from .time_grid import TimeGrid, utc_text
 
 Kind = Literal["auto", "tle", "mean"]
 #: Days from the epoch beyond which reports state the possible error of SGP4.
@@ -58,8 +58,12 @@ class Orbit:
 
     def resolved(self, times: TimeGrid) -> Literal["tle", "mean"]:
         """Return the kind of propagation that a plan uses."""
+        return self.resolved_at(self.farthest_d(times))
+
+    def resolved_at(self, days: float) -> Literal["tle", "mean"]:
+        """Return the kind of propagation for times up to `days` from the elements' epoch."""
         if self.kind == "auto":
-            return "mean" if self.farthest_d(times) > MEAN_FROM_D else "tle"
+            return "mean" if abs(days) > MEAN_FROM_D else "tle"
         return self.kind
 
     def farthest_d(self, times: TimeGrid) -> float:
@@ -102,20 +106,35 @@ class Orbit:
     def track(self, times: TimeGrid) -> Track:
         """Propagate the orbit to the times of a plan; raises InputError if SGP4 fails at one of them."""
         midnight, days = times.julian
-        if self.resolved(times) == "mean":
-            position, velocity = self._mean(midnight, days)
-        else:
-            error, position, velocity = self.elements.satellite.sgp4_array(midnight, days)
-            if np.any(error):
-                raise InputError(
-                    f"orbital elements of epoch {self.elements.epoch} cannot be followed to "
-                    f"{times.iso(float(times.seconds[np.argmax(error != 0)]))} (SGP4 error "
-                    f"{int(error[np.argmax(error != 0)])})",
-                    "newer ones or the mean orbit",
-                    key="elements",
-                    value=self.elements.epoch,
-                )
-        return Track(times, np.asarray(position), np.asarray(velocity))
+        return Track(times, *self.states(midnight, days, self.resolved(times)))
+
+    def states(
+        self, midnight: NDArray[np.float64], days: NDArray[np.float64], kind: Literal["tle", "mean"]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return positions (km) and velocities (km/s) in SGP4's frame, shape (n, 3) each.
+
+        Parameters
+        ----------
+        midnight, days : ndarray, shape (n,)
+            Parts of the Julian date, UTC.
+        kind : {"tle", "mean"}
+            Propagation by SGP4, or the mean orbit.
+
+        Raises InputError if SGP4 fails at one of the times.
+        """
+        if kind == "mean":
+            return self._mean(midnight, days)
+        error, position, velocity = self.elements.satellite.sgp4_array(midnight, days)
+        if np.any(error):
+            first = int(np.argmax(error != 0))
+            raise InputError(
+                f"orbital elements of epoch {self.elements.epoch} cannot be followed to "
+                f"{utc_text(float(midnight[first] + days[first]))} (SGP4 error {int(error[first])})",
+                "newer ones or the mean orbit",
+                key="elements",
+                value=self.elements.epoch,
+            )
+        return np.asarray(position), np.asarray(velocity)
 
     def _mean(
         self, midnight: NDArray[np.float64], days: NDArray[np.float64]

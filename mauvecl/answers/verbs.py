@@ -300,7 +300,16 @@ VERBS: dict[str, Verb] = {
 
     mauvecl analyse light-curve-1.fits --star M3V --magnitude 9 --distance 5
     """,
-            ("data", *SIZE, "flare.temperature_k", "search.false_alarms", "search.per", "run.seed"),
+            (
+                "data",
+                "orbit.tle",
+                "orbit.kind",
+                *SIZE,
+                "flare.temperature_k",
+                "search.false_alarms",
+                "search.per",
+                "run.seed",
+            ),
             without="observation.exposure_s",
         ),
         Verb(

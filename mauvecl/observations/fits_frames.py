@@ -164,7 +164,8 @@ class FitsFile(FrameFile):
             return np.ma.masked_equal(values, missing) if isinstance(missing, int) else values
 
         one = np.shape(read(0, min(1, n_rows)))
-        return Values(found.name, (n_rows, *one[1:]), read, str(found.unit or "").strip(), self.what)
+        width = 0 if small else 2 * int(hdu.header["NAXIS1"])
+        return Values(found.name, (n_rows, *one[1:]), read, str(found.unit or "").strip(), self.what, width)
 
 
 def _piece(hdu: Any, start: int, stop: int) -> Any:

@@ -70,6 +70,8 @@ class Frames:
         Time scale of the dates, such as "utc" or "tdb"; empty if unknown.
     position : str
         Where the times are measured, as FITS TREFPOS has it, such as "TOPOCENTER" or "BARYCENTER"; empty if unknown.
+    direction_deg : (float, float) or None
+        Right ascension and declination (ICRS) that barycentric times refer to.
     name : str
         Name of the star or the file.
     instrument : str
@@ -89,6 +91,7 @@ class Frames:
     reference_mjd: float | None = None
     scale: str = ""
     position: str = ""
+    direction_deg: tuple[float, float] | None = None
     name: str = "frames"
     instrument: str = ""
     remarks: tuple[str, ...] = ()
@@ -236,6 +239,16 @@ class Frames:
     def with_remarks(self, remarks: tuple[str, ...]) -> Self:
         """Return the frames with additional remarks."""
         return replace(self, remarks=(*self.remarks, *remarks))
+
+    @property
+    def time_keywords(self) -> dict[str, str | float]:
+        """Keywords of FITS (standard 4.0, section 9) for epoch, scale and place of the times; those that are known."""
+        known: dict[str, str | float | None] = {
+            "MJDREF": self.reference_mjd, "TIMESYS": self.scale.upper(), "TREFPOS": self.position,
+        }  # fmt: skip
+        if self.direction_deg is not None:
+            known |= {"TREFDIR": "RA_OBJ,DEC_OBJ", "RA_OBJ": self.direction_deg[0], "DEC_OBJ": self.direction_deg[1]}
+        return {key: value for key, value in known.items() if value not in (None, "")}
 
     def date(self, time_s: Moment) -> str:
         """Return a time as an ISO 8601 date, or as seconds if the times have no date."""

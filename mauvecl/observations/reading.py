@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.files.parsing import as_text
 from mauvecl.host.files.size_limits import limit_bytes, open_regular, read_bytes, unpacked
@@ -23,7 +23,7 @@ from mauvecl.observations.folder_frames import FolderFile, keywords_of
 from mauvecl.observations.frames import Frames
 from mauvecl.observations.long_tables import spectra_of_rows
 from mauvecl.observations.mapping import FrameMapping
-from mauvecl.observations.reduction import whole_or_reduced
+from mauvecl.observations.reduction import Light, PixelStatistics, weighted_sums, whole_or_reduced
 from mauvecl.observations.stored_frames import StoredFile, is_store, open_hdf5, open_store, stored_in_fits
 from mauvecl.observations.time_system import TimeSystem, mjd_of, position_of, scale_of, seconds_from_first
 from mauvecl.observations.values import FrameFile, TableFile, Values, converted, unit_in
@@ -64,19 +64,71 @@ def read_frames(path: str | Path, mapping: FrameMapping | str | Path | None = No
     mapping : FrameMapping or path, optional
         Where the quantities are. Files of mauvecl, TESS, Kepler and lightkurve need none.
     """
-    place, words = without_columns(path)
-    given = FrameMapping.read(mapping) if isinstance(mapping, str | Path) else mapping
-    with open_frames(place, given, words[0] if words else None) as (file, how):
-        return frames_in(file, how, place.stem)
+    with _frame_file(path, mapping) as (file, how, stem):
+        return _frames_in(file, how, stem)
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedFrames:
+    """Spectra reduced to weighted sums.
+
+    Attributes
+    ----------
+    light_curves : tuple of Frames
+        One for each row of the weights.
+    pixels : PixelStatistics
+        Light and noise of each pixel of the file.
+    """
+
+    light_curves: tuple[Frames, ...]
+    pixels: PixelStatistics
+
+
+@validated
+def reduce_frames(
+    path: str | Path, weights: ArrayLike | None = None, mapping: FrameMapping | str | Path | None = None
+) -> ReducedFrames:
+    """Read spectra in pieces and keep weighted sums of their pixels, however large the file is.
+
+    Parameters
+    ----------
+    path : str or Path
+        As of `read_frames`.
+    weights : array_like, shape (n_weight, n_pixel), optional
+        Weights of the pixels, in the order of the file; by default the sum over all pixels.
+    mapping : FrameMapping or path, optional
+    """
+    with _frame_file(path, mapping) as (file, how, stem):
+        _, flux, error, _ = _light(found := Quantities.of(file, how), how)
+        if len(flux.shape) != 2:
+            raise InputError.of("flux", flux.shape, "spectra, shape (n_frame, n_pixel)", where=file.what)
+        given = None if weights is None else np.asarray(weights, np.float64)
+        sums = weighted_sums(flux, error, found.quality, given)
+        curves = tuple(
+            _frames_in(file, how, stem, lambda *_, k=k: sums.light(k, flux.what, found.quality))
+            for k in range(sums.sums.shape[1])
+        )
+        return ReducedFrames(curves, sums.pixels)
 
 
 @contextmanager
-def open_frames(
-    path: Path, mapping: FrameMapping | None, name: str | None = None
+def _frame_file(
+    path: str | Path, mapping: FrameMapping | str | Path | None
+) -> Iterator[tuple[FrameFile, FrameMapping, str]]:
+    """Open what a path names, and return where its quantities are and its name without its ending."""
+    place, words = without_columns(path)
+    given = FrameMapping.read(mapping) if isinstance(mapping, str | Path) else mapping
+    name = words[0] if words else None if given is None or given.hdu is None else str(given.hdu)
+    with _open_frames(place, given, name) as (file, how):
+        yield file, how, place.stem
+
+
+@contextmanager
+def _open_frames(
+    path: Path, mapping: FrameMapping | None, name: str | None
 ) -> Iterator[tuple[FrameFile, FrameMapping]]:
     """Open a file with frames, and return where its quantities are."""
     what = f"file {path.name!r}"
-    name = name or (None if mapping is None or mapping.hdu is None else str(mapping.hdu))
     if path.is_dir():
         what = f"folder {path.name!r}"
         if is_store(path):
@@ -193,8 +245,10 @@ def _wavelength(file: FrameFile, mapping: FrameMapping) -> Values | None:
     return file.find(mapping.wavelength)
 
 
-def frames_in(file: FrameFile, mapping: FrameMapping, stem: str) -> Frames:
-    """Build frames from a file and the names of its quantities."""
+def _frames_in(
+    file: FrameFile, mapping: FrameMapping, stem: str, read: Callable[..., Light] = whole_or_reduced
+) -> Frames:
+    """Build frames from a file and the names of its quantities; `read` returns their light."""
     what = file.what
     found = Quantities.of(file, mapping)
     n = found.time[0].n_rows
@@ -219,7 +273,7 @@ def frames_in(file: FrameFile, mapping: FrameMapping, stem: str) -> Frames:
         temperature = converted(found.temperature, mapping.temperature_unit, "deg_C", "temperature_unit").numbers()
     elif isinstance(nominal := file.header.get("CCD-TEMP"), int | float):
         temperature = np.full(n, float(nominal))
-    light, sd, flags, more = whole_or_reduced(flux, error, found.quality)
+    light, sd, flags, more = read(flux, error, found.quality)
     remarks += more
     if len(light.shape) == 1:
         wavelength = None
@@ -234,7 +288,7 @@ def frames_in(file: FrameFile, mapping: FrameMapping, stem: str) -> Frames:
         None if sd is None else sd[kept],
         exposure_s=None if exposure_s is None else exposure_s[kept],
         quality=None if flags is None else np.where(np.isfinite(flags), flags, 1)[kept],
-        name=mapping.name or str(file.header.get("OBJECT", "") or stem),
+        name=mapping.name or str(file.header.get("OBJECT", "") or file.header.get("star", "") or stem),
         wavelength_nm=wavelength,
         temperature_c=None if temperature is None else temperature.reshape(n)[kept],
         unit=unit,
@@ -242,6 +296,7 @@ def frames_in(file: FrameFile, mapping: FrameMapping, stem: str) -> Frames:
         reference_mjd=dates.epoch_mjd,
         scale=dates.scale,
         position=dates.position,
+        direction_deg=dates.direction_deg,
     )
     if dates.at != 0.5:
         made = made.shifted((0.5 - dates.at) * made.exposure_s)
@@ -316,8 +371,8 @@ def _vacuum_nm(wavelength: Values, given: str | None) -> Float:
     nm = converted(wavelength, plain, "nm", "wavelength_unit")
     rows = np.atleast_2d(nm.rows(0, 1) if len(nm.shape) == 2 else nm.numbers())[0]
     if len(nm.shape) == 2:
-        for start in range(0, nm.n_rows, nm.piece_rows):
-            if not np.allclose(nm.rows(start, min(start + nm.piece_rows, nm.n_rows)), rows, rtol=1e-9, atol=0.0):
+        for part in nm.pieces:
+            if not np.allclose(nm.rows(part.start, part.stop), rows, rtol=1e-9, atol=0.0):
                 raise InputError(f"{wavelength.what}: the wavelengths change from frame to frame",
                                  "the same in every frame", key="wavelength", value=wavelength.name)  # fmt: skip
     return vacuum_from_air(rows) if given and given.endswith(" air") else rows

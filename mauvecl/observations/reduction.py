@@ -58,6 +58,11 @@ class WeightedSums:
     pixels: PixelStatistics
     dead: int
 
+    def light(self, number: int, what: str, quality: Values | None) -> Light:
+        """Return the sums of one weight with their errors, the quality of the frames and remarks."""
+        error = None if self.errors is None else self.errors[:, number]
+        return self.sums[:, number], error, _flags(quality), dead_pixel_remarks(self.dead, what)
+
 
 def weighted_sums(
     flux: Values, error: Values | None, quality: Values | None, weights: Float | None = None
@@ -79,15 +84,11 @@ def weighted_sums(
     live = live_pixels(finite, n, flux.what)
     sums = np.empty((n, len(given)))
     errors = None if error is None else np.empty_like(sums)
-    for part in _parts(flux):
+    for part in flux.pieces:
         sums[part] = _piece(flux, quality, part)[:, live] @ given[:, live].T
         if error is not None and errors is not None:
             errors[part] = np.sqrt(error.rows(part.start, part.stop)[:, live] ** 2 @ given[:, live].T ** 2)
     return WeightedSums(sums, errors, statistics, int((~live).sum()))
-
-
-def _parts(flux: Values) -> list[slice]:
-    return [slice(k, min(k + flux.piece_rows, flux.n_rows)) for k in range(0, flux.n_rows, flux.piece_rows)]
 
 
 def _piece(flux: Values, quality: Values | None, part: slice) -> Float:
@@ -105,7 +106,7 @@ def _flags(quality: Values | None) -> Float | None:
         return None
     if len(quality.shape) == 1:
         return quality.numbers()
-    rows = (quality.rows(part.start, part.stop) for part in _parts(quality))
+    rows = (quality.rows(part.start, part.stop) for part in quality.pieces)
     return np.concatenate([np.where((one != 0).all(axis=1), np.abs(one).max(axis=1), 0.0) for one in rows])
 
 
@@ -117,7 +118,7 @@ def _statistics(
     finite, count, pairs = np.zeros((3, n_pixel), np.int64)
     total, squares, stated = np.zeros((3, n_pixel))
     before = np.full((1, n_pixel), np.nan)
-    for part in _parts(flux):
+    for part in flux.pieces:
         values = _piece(flux, quality, part)
         finite += np.isfinite(values).sum(axis=0)
         if quality is not None and len(quality.shape) == 1:
@@ -143,13 +144,13 @@ def whole_or_reduced(flux: Values, error: Values | None, quality: Values | None)
     limit = limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")
     if len(flux.shape) == 1 or n_bytes <= limit:
         light = np.empty(flux.shape)
-        for part in _parts(flux):
+        for part in flux.pieces:
             light[part] = _piece(flux, quality, part)
         return light, None if error is None else error.numbers(), _flags(quality), ()
     found = weighted_sums(flux, error, quality)
-    remarks: tuple[str, ...] = (
+    remarks = (
         f"{flux.what} has {n_bytes / 2**20:.0f} MiB of spectra, more than {limit >> 20} MiB: they were summed over "
         "wavelength while they were read; MAUVECL_LARGEST_CONTENT_MIB sets the limit",
     )
-    remarks += dead_pixel_remarks(found.dead, flux.what)
-    return found.sums[:, 0], None if found.errors is None else found.errors[:, 0], _flags(quality), remarks
+    light, sd, flags, more = found.light(0, flux.what, quality)
+    return light, sd, flags, (*remarks, *more)

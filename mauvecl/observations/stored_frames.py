@@ -81,7 +81,7 @@ class StoredFile(FrameFile):
         self.parts["error"] = Values("error", shape, self._error, "adu", what)
         if "temperature_c" in of:
             self.parts["temperature"] = Values.of("temperature", each * float(of["temperature_c"]), "deg_C", what)
-        self.parts["quality"] = Values("quality", (n,), self._saturated, "", what)
+        self.parts["quality"] = Values("quality", (n,), self._saturated, "", what, 8 * shape[1])
 
     @property
     def names(self) -> list[str]:

@@ -36,6 +36,7 @@ class TimeSystem:
     unit: str  # TIMEUNIT; empty if it is not stated
     at: float  # part of a frame that times refer to: 0 start, 0.5 middle, 1 end
     offset: float  # TIMEOFFS, to be added to times, in their unit
+    direction_deg: tuple[float, float] | None  # of TREFDIR; None if it is not stated
 
     @classmethod
     def of(cls, header: Mapping[str, Any], what: str) -> TimeSystem:
@@ -49,7 +50,8 @@ class TimeSystem:
         default = "utc" if any(key.startswith("MJDREF") for key in header) else ""
         position = str(header.get("TREFPOS", "") or header.get("TIMEREF", "")).strip()
         return cls(epoch, scale_of(stated) or default, position_of(position), str(header.get("TIMEUNIT", "")).strip(),
-                   0.5 if at is None else at, _number(header, "TIMEOFFS", what) or 0.0)  # fmt: skip
+                   0.5 if at is None else at, _number(header, "TIMEOFFS", what) or 0.0,
+                   _direction(header, what))  # fmt: skip
 
 
 def scale_of(text: str) -> str:
@@ -86,6 +88,13 @@ def _reference(header: Mapping[str, Any], what: str) -> float | None:
         if whole is not None:
             return whole + zero
     return None
+
+
+def _direction(header: Mapping[str, Any], what: str) -> tuple[float, float] | None:
+    """Return the direction that TREFDIR names by two keywords, of longitude and latitude."""
+    first, _, second = (part.strip() for part in str(header.get("TREFDIR", "")).partition(","))
+    ra, dec = (_number(header, key, what) for key in (first, second))
+    return None if ra is None or dec is None else (ra, dec)
 
 
 def mjd_of(texts: Sequence[str], scale: str, name: str, what: str) -> Float:

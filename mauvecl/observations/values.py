@@ -20,7 +20,7 @@ from mauvecl.schema.text import shortened
 Float = NDArray[np.float64]
 
 #: Size of the pieces in which files are read, bytes of double precision.
-PIECE_BYTES = 16 * 2**20
+PIECE_BYTES = 4 * 2**20
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +32,7 @@ class Values:
     read: Callable[[int, int], Any]  # rows `start` to `stop - 1`, as the file has them
     unit: str = ""
     what: str = ""  # the file, for messages
+    row_bytes: int = 0  # what reading a row takes, if that is more than its values
 
     @classmethod
     def of(cls, name: str, values: Any, unit: object = None, what: str = "") -> Values:
@@ -46,7 +47,13 @@ class Values:
     @property
     def piece_rows(self) -> int:
         """Number of rows of a piece."""
-        return max(1, PIECE_BYTES // (8 * max(1, int(np.prod(self.shape[1:])))))
+        return max(1, PIECE_BYTES // max(1, self.row_bytes, 8 * int(np.prod(self.shape[1:]))))
+
+    @property
+    def pieces(self) -> list[slice]:
+        """Rows of each piece."""
+        step = self.piece_rows
+        return [slice(k, min(k + step, self.n_rows)) for k in range(0, self.n_rows, step)]
 
     def rows(self, start: int, stop: int) -> Float:
         """Return rows as numbers; NaN where they are missing."""
@@ -62,16 +69,18 @@ class Values:
     def numbers(self) -> Float:
         """Return all rows as numbers, read in pieces."""
         found = np.empty(self.shape)
-        for start in range(0, self.n_rows, self.piece_rows):
-            stop = min(start + self.piece_rows, self.n_rows)
-            found[start:stop] = self.rows(start, stop)
+        for part in self.pieces:
+            found[part] = self.rows(part.start, part.stop)
         return found
 
     def texts(self) -> list[str] | None:
         """Return the rows as texts, or None if they are numbers."""
         if self.n_rows and np.ma.asarray(self.read(0, 1)).dtype.kind not in "OUS":
             return None
-        values: Any = np.ma.asarray(self.read(0, self.n_rows))
+        if not self.n_rows:
+            return []
+        pieces = [np.ma.asarray(self.read(part.start, part.stop)) for part in self.pieces]
+        values: Any = pieces[0] if len(pieces) == 1 else np.ma.concatenate(pieces)  # type: ignore[no-untyped-call]
         if values.dtype.kind == "O" and all(isinstance(one, str) for one in values):
             values = values.astype(str)
         if values.dtype.kind not in "US":

@@ -22,6 +22,12 @@ class DataChoice(Section):
         None
     )
 
+    barycentric: Annotated[
+        str | None,
+        Help("Target for which times are converted to the Solar System's barycentre (TDB)", "name or coordinates"),
+        Flag("--barycentric"),
+    ] = None
+
 
 def resolve_data_paths(data: dict[str, Any], folder: Path) -> None:
     """Resolve the paths of observed frames against a folder, in place."""

@@ -115,7 +115,8 @@ def test_fits_file_has_the_columns_of_lightkurve(found):
         # `lightkurve.read` takes a file for a generic one only where CREATOR or ORIGIN is missing, and needs a time.
         assert "ORIGIN" not in hdus[0].header
         assert table.header["MJDREFI"] == 61041
-        assert table.header["TIMESYS"] == "UTC"
+        assert (table.header["TIMESYS"], table.header["TREFPOS"]) == ("UTC", "TOPOCENTER")
+        assert hdus[0].header["CCD-TEMP"] == 21.0
         assert table.columns.names[:6] == ["TIME", "CADENCENO", "QUALITY", "FLUX", "FLUX_ERR", "MEAN"]
         assert table.columns["TIME"].unit == "d"
         light = found.stares[0].light

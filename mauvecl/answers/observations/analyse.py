@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from mauvecl.answers.answer import Answer
+from mauvecl.host.orbit.orbit import Orbit
+from mauvecl.host.orbit.targets import Target
 from mauvecl.host.stars.source import Source
 from mauvecl.observations.analysis import Analysis, analyse_frames
+from mauvecl.observations.barycentre import barycentric
 from mauvecl.observations.event_spectrum import EventSpectrum
 from mauvecl.observations.events import ObservedEvent
 from mauvecl.observations.frame_model import FrameModel
@@ -340,14 +343,14 @@ class AnalyseAnswer(Answer):
     def events(self) -> QTable:
         """One row per event, in order of time."""
         frames = self.analysis.frames
-        about = {"star": frames.name, "time_scale": frames.scale, "position": frames.position, "unit": frames.unit,
-                 "time_zero_mjd": frames.reference_mjd, "threshold": self.analysis.threshold}  # fmt: skip
-        return table_of(EVENTS, self.rows, study=self.study.text(), **about)
+        about = {"star": frames.name, "unit": frames.unit, "threshold": self.analysis.threshold}
+        return table_of(EVENTS, self.rows, study=self.study.text(), **frames.time_keywords, **about)
 
     @property
     def frames(self) -> QTable:
         """One row per frame: flux, level, noise, and why it is not searched."""
-        return table_of(FRAMES, [self.analysis], star=self.analysis.frames.name, unit=self.analysis.frames.unit)
+        frames = self.analysis.frames
+        return table_of(FRAMES, [self.analysis], star=frames.name, unit=frames.unit, **frames.time_keywords)
 
     @property
     def completeness(self) -> QTable:
@@ -415,6 +418,12 @@ class AnalyseAnswer(Answer):
         return []
 
 
+def _orbit(study: Study, frames: Frames) -> Orbit | None:
+    """Return the orbit of the satellite that took the frames, or None if it is not known."""
+    is_mauve = "mauve" in frames.instrument.lower()
+    return study.orbit.orbit() if is_mauve or study.orbit.tle is not None else None
+
+
 @validated
 def analyse(
     study: Study,
@@ -428,7 +437,8 @@ def analyse(
     Parameters
     ----------
     study : Study
-        Its sections `data` and `search`: `data.file` is read, `search.false_alarms` are allowed for a detection.
+        Its sections `data` and `search`: `data.file` is read, `search.false_alarms` are allowed for a detection. With
+        `data.barycentric` times become those at the Solar System's barycentre, by the satellite's orbit.
         Fainter events are candidates, down to one false alarm per star-day.
     engine, progress : optional
         Not used: nothing is drawn on a device.
@@ -439,6 +449,8 @@ def analyse(
         if study.data.file is None:
             raise InputError("no observed frames are given", "data.file, or frames", key="data.file")
         frames = read_frames(study.data.file, study.data.mapping)
+    if study.data.barycentric is not None:
+        frames = barycentric(frames, Target.of(study.data.barycentric), _orbit(study, frames))
     search = study.search
     model = frame_model(study, frames)
     jitters = search.spreads() or None

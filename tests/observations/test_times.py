@@ -1,0 +1,192 @@
+"""Times: FITS keywords, dates, and the Solar System's barycentre against an independent route."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import erfa
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+from astropy.time import Time
+from refusals import refused
+
+from mauvecl import Study, analyse
+from mauvecl.host.orbit.orbit import Orbit
+from mauvecl.host.orbit.targets import Target
+from mauvecl.host.orbit.time_grid import TimeGrid
+from mauvecl.observations.barycentre import barycentric
+from mauvecl.observations.frames import Frames
+from mauvecl.observations.mapping import FrameMapping
+from mauvecl.observations.reading import read_frames
+
+RNG = np.random.default_rng(29)
+TIME = np.arange(200) * 30.0 + 15.0
+FLUX = RNG.normal(1000, 5, TIME.size)
+AU_MIC = Target("AU Mic", 311.2897, -31.3409, "given")
+#: Days near the epoch of the embedded elements, and far from them.
+NEAR, FAR = "2026-09-16T03:00:00", "2027-03-01T00:00:00"
+
+
+def _frames(start: str, position: str, scale: str = "utc") -> Frames:
+    mjd = float(Time(start, scale=scale).mjd)
+    return Frames.of(TIME, FLUX, reference_mjd=mjd, scale=scale, position=position, name="AU Mic")
+
+
+def _geocentric_s(start: str) -> np.ndarray:
+    """Return barycentric TDB less UTC for an observer at the geocentre, s, by ERFA alone."""
+    mjd = Time(start, scale="utc").mjd
+    days = TIME / 86_400
+    # 37 leap seconds since 2017, and TT - TAI of 32.184 s.
+    tt = mjd + days + 69.184 / 86_400
+    tdb_tt = erfa.dtdb(2_400_000.5, tt, 0.0, 0.0, 0.0, 0.0)
+    _, barycentric_au = erfa.epv00(2_400_000.5, tt + tdb_tt / 86_400)
+    ra, dec = np.radians([AU_MIC.ra_deg, AU_MIC.dec_deg])
+    star = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    # Light time for 1 au (IAU 2012, 149 597 870.7 km; c = 299 792.458 km/s).
+    return 69.184 + tdb_tt + barycentric_au["p"] @ star * 149_597_870.7 / 299_792.458
+
+
+def _late_s(frames: Frames, start: str) -> np.ndarray:
+    assert frames.reference_mjd is not None
+    return (frames.reference_mjd - float(Time(start, scale="utc").mjd)) * 86_400 + frames.time_s - TIME
+
+
+@pytest.mark.parametrize("start", [NEAR, FAR])
+def test_barycentric_times_of_the_geocentre_are_those_of_erfa(start: str) -> None:
+    found = barycentric(_frames(start, "GEOCENTER"), AU_MIC)
+    # A modified Julian date in double precision resolves a microsecond.
+    np.testing.assert_allclose(_late_s(found, start), _geocentric_s(start), atol=3e-6)
+    assert (found.scale, found.position) == ("tdb", "BARYCENTER")
+    assert found.direction_deg == (AU_MIC.ra_deg, AU_MIC.dec_deg)
+
+
+@pytest.mark.parametrize(("start", "kind"), [(NEAR, "tle"), (FAR, "mean")])
+def test_the_satellites_place_counts_with_its_light_travel_time(start: str, kind: str) -> None:
+    found = barycentric(_frames(start, "TOPOCENTER"), AU_MIC, Orbit())
+    grid = TimeGrid(start, TIME.size * 30 / 86_400, 30.0)
+    assert Orbit().resolved(grid) == kind
+    expected = Orbit().track(grid).position_km @ AU_MIC.direction / 299_792.458
+    assert np.ptp(expected) > 5e-3
+    np.testing.assert_allclose(_late_s(found, start) - _geocentric_s(start), expected, atol=5e-6)
+    words = "good to 23 ms" if kind == "mean" else "along the track"
+    assert words in found.remarks[0]
+
+
+def test_other_scales_give_the_same_instants() -> None:
+    utc = barycentric(_frames(NEAR, "GEOCENTER"), AU_MIC)
+    tt = Frames.of(TIME, FLUX, reference_mjd=float(Time(NEAR, scale="utc").tt.mjd), scale="tt", position="GEOCENTER")
+    found = barycentric(tt, AU_MIC)
+    assert found.reference_mjd is not None
+    assert utc.reference_mjd is not None
+    assert (found.reference_mjd - utc.reference_mjd) * 86_400 == pytest.approx(0.0, abs=2e-6)
+    np.testing.assert_allclose(found.time_s, utc.time_s, atol=1e-6)
+
+
+def test_nothing_is_downloaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    def download(*_: Any, **__: Any) -> None:
+        raise AssertionError("a download")
+
+    for place in ("astropy.utils.data.download_file", "astropy.utils.iers.iers.download_file"):
+        monkeypatch.setattr(place, download)
+    later = Frames.of(TIME, FLUX, reference_mjd=70_000.0, scale="utc", position="TOPOCENTER")
+    assert barycentric(later, AU_MIC, Orbit()).position == "BARYCENTER"
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [({"reference_mjd": None}, "epoch"), ({"scale": ""}, "scale"), ({"position": ""}, "position"),
+     ({"position": "MARS"}, "position"), ({"position": "TOPOCENTER"}, "orbit.tle")],
+)  # fmt: skip
+def test_times_of_unknown_kind_have_no_barycentric_ones(change: dict[str, Any], key: str) -> None:
+    given = {"reference_mjd": 61_000.0, "scale": "utc", "position": "GEOCENTER"} | change
+    with refused(key):
+        barycentric(Frames.of(TIME, FLUX, **given), AU_MIC)
+
+
+def test_barycentric_times_stay_as_they_are() -> None:
+    once = barycentric(_frames(NEAR, "GEOCENTER"), AU_MIC)
+    again = barycentric(once, AU_MIC)
+    np.testing.assert_array_equal(again.time_s, once.time_s)
+    assert "barycentric already" in again.remarks[-1]
+
+
+#: Keywords of a header, and the MJD of time zero, the scale, the place, and seconds added to each time.
+KEYWORDS: list[tuple[dict[str, Any], float | None, str, str, float]] = [
+    ({"MJDREFI": 61000, "MJDREFF": 0.25, "TIMESYS": "TT", "TREFPOS": "GEOCENTER"}, 61_000.25, "tt", "GEOCENTER", 0),
+    ({"MJDREF": 61000.5}, 61_000.5, "utc", "", 0),
+    ({"JDREF": 2461000.5, "TIMESYS": "TAI"}, 61_000.0, "tai", "", 0),
+    ({"JDREFI": 2461000, "JDREFF": 0.5, "TIMESYS": "IAT"}, 61_000.0, "tai", "", 0),
+    ({"BJDREFI": 2457000, "TIMESYS": "TDB", "TIMEREF": "SOLARSYSTEM"}, 56_999.5, "tdb", "BARYCENTER", 0),
+    ({"MJDREF": 61000, "TIMESYS": "UTC(NIST)"}, 61_000.0, "utc", "", 0),
+    ({"MJDREF": 61000, "TIMESYS": "TDT"}, 61_000.0, "tt", "", 0),
+    ({"MJDREF": 61000, "TIMESYS": "ET", "TREFPOS": "topocenter"}, 61_000.0, "tt", "TOPOCENTER", 0),
+    ({"MJDREF": 61000, "TIMEOFFS": 7.5}, 61_000.0, "utc", "", 7.5),
+    ({"MJDREF": 61000, "TIMEPIXR": 0.0}, 61_000.0, "utc", "", 15.0),
+    ({"MJDREF": 61000, "TIMEPIXR": 1.0}, 61_000.0, "utc", "", -15.0),
+    ({"TIMESYS": "TDB"}, None, "tdb", "", 0),
+    ({}, None, "", "", 0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("keywords", "mjd", "scale", "position", "shift_s"), KEYWORDS)
+def test_time_keywords_of_fits_are_read(
+    tmp_path: Path, keywords: dict[str, Any], mjd: float | None, scale: str, position: str, shift_s: float
+) -> None:
+    hdu = fits.table_to_hdu(Table({"TIME": TIME, "FLUX": FLUX}))
+    hdu.header.update(keywords | {"TIMEUNIT": "s"})
+    hdu.writeto(tmp_path / "a.fits")
+    frames = read_frames(tmp_path / "a.fits")
+    assert (frames.scale, frames.position) == (scale, position)
+    zero = 0.0 if frames.reference_mjd is None or mjd is None else (frames.reference_mjd - mjd) * 86_400
+    np.testing.assert_allclose(frames.time_s + zero, TIME + shift_s, atol=2e-5)
+    assert (frames.reference_mjd is None) == (mjd is None)
+
+
+@pytest.mark.parametrize(("key", "value"), [("MJDREF", "new"), ("TIMEPIXR", 3.0), ("TIMEOFFS", "x"), ("MJDREFI", True)])
+def test_wrong_time_keywords_are_named(tmp_path: Path, key: str, value: Any) -> None:
+    hdu = fits.table_to_hdu(Table({"TIME": TIME, "FLUX": FLUX}))
+    hdu.header.update({"TIMEUNIT": "s", key: value})
+    hdu.writeto(tmp_path / "a.fits")
+    with refused(key):
+        read_frames(tmp_path / "a.fits")
+
+
+def test_dates_are_times(tmp_path: Path) -> None:
+    dates = Time(61_000.0 + TIME / 86_400, format="mjd", scale="tdb").isot
+    Table({"when": dates, "flux": FLUX}).write(tmp_path / "a.csv")
+    frames = read_frames(tmp_path / "a.csv", FrameMapping(time="when", flux="flux", scale="tdb"))
+    assert frames.reference_mjd == pytest.approx(61_000 + 15 / 86_400, abs=1e-9)
+    np.testing.assert_allclose(frames.time_s, TIME - 15, atol=2e-3)
+    frames = read_frames(tmp_path / "a.csv", FrameMapping(time="when", flux="flux"))
+    assert frames.scale == "utc"
+    assert "taken for UTC" in frames.remarks[0]
+
+
+@pytest.mark.parametrize("ending", ["fits", "ecsv"])
+def test_columns_of_astropys_times_are_read(tmp_path: Path, ending: str) -> None:
+    when = Time(61_000.0, TIME / 86_400, format="mjd", scale="tdb")
+    Table({"time": when, "flux": FLUX}).write(tmp_path / f"a.{ending}")
+    frames = read_frames(tmp_path / f"a.{ending}")
+    assert frames.scale == "tdb"
+    assert frames.reference_mjd == pytest.approx(61_000 + 15 / 86_400, abs=1e-9)
+    np.testing.assert_allclose(frames.time_s, TIME - 15, atol=2e-5)
+
+
+def test_tables_of_an_analysis_state_epoch_scale_and_place(tmp_path: Path) -> None:
+    hdu = fits.table_to_hdu(Table({"TIME": TIME, "FLUX": FLUX}))
+    hdu.header.update({"TIMEUNIT": "s", "MJDREF": 61_299.0, "TREFPOS": "TOPOCENTER", "INSTRUME": "mauve"})
+    hdu.writeto(tmp_path / "a.fits")
+    settings = {"data": {"file": str(tmp_path / "a.fits"), "barycentric": "AU Mic"}}
+    answer = analyse(Study.build(settings, "test"))
+    meta = answer.events.meta
+    assert (meta["TIMESYS"], meta["TREFPOS"], meta["TREFDIR"]) == ("TDB", "BARYCENTER", "RA_OBJ,DEC_OBJ")
+    answer.frames.write(tmp_path / "frames.ecsv")
+    again = read_frames(tmp_path / "frames.ecsv")
+    given = answer.analysis.frames
+    assert (again.scale, again.position, again.direction_deg) == ("tdb", "BARYCENTER", given.direction_deg)
+    assert again.reference_mjd == pytest.approx(given.reference_mjd, abs=1e-10)
+    np.testing.assert_allclose(again.time_s, given.time_s - given.time_s[0], atol=2e-5)
+    np.testing.assert_allclose(again.flux, given.flux)
