@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -42,3 +42,14 @@ def refused(
     for fact in facts:
         assert fact in str(error), str(error)
     assert "\n" not in str(error)
+
+
+#: A call that raises, the key that its error names, and numbers and names of its sentence.
+Row = tuple[Callable[[], object], str, *tuple[str, ...]]
+
+
+def check(row: Row) -> None:
+    """Check that the call of a row raises its error."""
+    call, key, *facts = row
+    with refused(key, *facts):
+        call()

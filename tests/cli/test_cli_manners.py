@@ -117,22 +117,29 @@ def test_pipes_have_no_colour_and_errors_go_to_stderr(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("library", "--json"),
-        ("detect", "--star", "G2V", "-m", "8", "-a", "0.1", "-n", "100000", "--no-pictures", "--json"),
-        ("exposure", "--snr", "10", "--at", "300", "--star", "G2V", "-m", "7.4", "--json"),
-    ],
-    ids=lambda words: words[0],
-)
-def test_json_is_alone_on_standard_output(words: tuple[str, ...], tmp_path: Path) -> None:
+def test_json_is_alone_on_standard_output(tmp_path: Path) -> None:
+    """What OpenCL drivers print goes past Python: hence a process of its own."""
+    words = (
+        "detect",
+        "--star",
+        "G2V",
+        "-m",
+        "8",
+        "-a",
+        "0.1",
+        "-n",
+        "10000",
+        "--fap",
+        "0.01",
+        "--no-pictures",
+        "--json",
+    )
     assert json.loads(started(*words, folder=tmp_path).stdout)
 
 
 @pytest.mark.long
 def test_quiet_prints_neither_progress_nor_files(tmp_path: Path) -> None:
-    words = ("detect", "--star", "G2V", "-m", "8", "-a", "0.1", "-n", "100000", "--no-pictures")
+    words = ("detect", "--star", "G2V", "-m", "8", "-a", "0.1", "-n", "10000", "--fap", "0.01", "--no-pictures")
     loud, quiet = (started(*words, *more, folder=tmp_path) for more in ((), ("--quiet",)))
     assert "detection.ecsv" in loud.stdout + loud.stderr
     assert "detection.ecsv" not in quiet.stdout + quiet.stderr

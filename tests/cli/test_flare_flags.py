@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 import typer
-from commands import ended, run
+from commands import run
 from typer.main import get_command
 
 from mauvecl import Study
@@ -24,22 +23,6 @@ def test_flags_set_the_spectrum(tmp_path: Path) -> None:
     assert light.balmer_jump == 2.5
     assert light.lines == {"Mg II": 0.03, "280.5": 0.01}
     assert light.line_fluxes == {"H beta": 1e-13}
-
-
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (("--line", "Mg II"), "--line"),
-        (("--line", "Mg II=x"), "expected a number"),
-        (("--balmer-jump", "0.2"), "--balmer-jump 0.2"),
-        (("--second-area", "0.2"), "second_temperature_k"),
-        (("--flare-file", "missing.txt"), "missing.txt"),
-    ],
-)
-def test_wrong_flag_is_named(words: tuple[str, ...], text: str, tmp_path: Path) -> None:
-    code, _, told = ended("detect", *STAR, *words, folder=tmp_path)
-    assert code == 2
-    assert text in told
 
 
 def test_every_verb_with_flares_takes_the_flags() -> None:

@@ -166,13 +166,13 @@ KEYS = st.one_of(
 )
 
 
-@many(70)
+@many(40)
 @given(key=KEYS, value=st.one_of(VALUES, TEXTS))
 def test_settings_never_crash(folder: Path, key: str, value: str) -> None:
     check(folder, *ASK, "--set", f"{key}={value}")
 
 
-@many(50)
+@many(30)
 @given(key=st.sampled_from(keys()), value=VALUES, junk=st.one_of(st.just(b""), st.binary(max_size=20)))
 def test_studies_never_crash(folder: Path, key: str, value: str, junk: bytes) -> None:
     study = folder / "study.toml"
@@ -186,7 +186,7 @@ INSTRUMENT_KEYS = (
 )  # fmt: skip
 
 
-@many(40)
+@many(25)
 @given(key=st.sampled_from(INSTRUMENT_KEYS), value=VALUES)
 def test_instruments_never_crash(folder: Path, key: str, value: str) -> None:
     (folder / "mine.toml").write_text(f"extends = 'mauve'\n{key} = {value}\n")
@@ -199,7 +199,7 @@ FLAGS = st.sampled_from(
 )  # fmt: skip
 
 
-@many(60)
+@many(40)
 @given(flag=FLAGS, value=st.one_of(NUMBERS, TEXTS))
 def test_flags_never_crash(folder: Path, flag: str, value: str) -> None:
     if flag == "--output":
@@ -298,7 +298,7 @@ SPOILS = {
 }
 
 
-@many(50)
+@many(30)
 @given(kind=st.integers(0, 2), ending=st.sampled_from([".txt", ".ecsv", ".fits", ".csv", ".gz", ""]), **SPOILS)
 def test_spectra_never_crash(
     folder: Path, kind: int, ending: str, place: float, splice: bytes, cut: int, pack: bool
@@ -308,7 +308,7 @@ def test_spectra_never_crash(
     check(folder, *ASK[:-4], "--magnitude", "7.4", "--star", str(file))
 
 
-@many(40)
+@many(25)
 @given(kind=st.integers(0, 2), ending=st.sampled_from([".csv", ".ecsv", ".fits", ".txt"]), **SPOILS)
 def test_flare_tables_never_crash(
     folder: Path, kind: int, ending: str, place: float, splice: bytes, cut: int, pack: bool

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import ended
 
 import mauvecl
 from mauvecl import Engine, Instrument, Sky, Source, Study
@@ -95,38 +94,6 @@ def test_errors_carry_key_value_and_what_is_expected(call, key, value) -> None: 
         assert error.value == value
     assert (error.expected or "") in str(error)
     assert FLAG.search(str(error)) is None
-
-
-@pytest.mark.parametrize(
-    ("words", "begins"),
-    [
-        (("detect", "--fap", "2"), "--fap 2.0, expected"),
-        (("detect", "--fap=2"), "--fap 2.0, expected"),
-        (("detect", "-m99"), "--magnitude 99.0, expected"),
-        (("detect", "-a", "-3"), "--amplitude -3.0, expected"),
-        (("detect", "--flare-temperature", "1"), "--flare-temperature 1.0, expected"),
-        (("detect", "--geometry", "beside"), "--geometry 'beside', expected"),
-        (("detect", "--set", "x"), "--set 'x', expected"),
-        (("detect", "--cluster", "x"), "--cluster 'x', expected"),
-        (("snr", "--temperature", "99"), "--temperature 99.0, expected"),
-        (("stare", "--star", "G2V", "-m", "7", "--distance", "-5"), "--distance -5.0, expected"),
-        (("visible", "--earth-limb", "x"), "--earth-limb 'x', expected"),
-        (("visible",), "no targets, expected names or coordinates, such as --look-at 'eps Eri'"),
-        (("plan",), "the plan has no targets, expected some, such as --targets targets.csv"),
-        (("exposure", "--star", "G2V"), "no wanted S/N, expected --snr and --at"),
-    ],
-)
-def test_the_command_line_names_flags(words: tuple[str, ...], begins: str, tmp_path: Path) -> None:
-    code, _, told = ended(*words, folder=tmp_path)
-    assert code == 2
-    assert told.startswith(f"mauvecl: {begins}")
-    assert "`" not in told
-
-
-def test_value_of_a_study_file_keeps_its_key(tmp_path: Path) -> None:
-    (tmp_path / "s.toml").write_text("[run]\nfap = 2\n")
-    code, _, told = ended("detect", "s.toml", "--seed", "3", folder=tmp_path)
-    assert (code, told) == (2, "mauvecl: s.toml: run.fap = 2, expected a number above 0 and below 1\n")
 
 
 def test_remedies_become_flags() -> None:

@@ -49,22 +49,3 @@ def test_table_of_targets_is_distinguished_from_an_answer(tmp_path: Path) -> Non
     assert not holds_study(Path("targets.csv"))
     assert holds_study(Path("study.toml"))
     run("visible", "targets.ecsv", "--days", "1", "--no-pictures", folder=tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (("visible",), "no targets, expected names or coordinates, such as --look-at 'eps Eri'"),
-        (("visible", "--look-at", "Vega", "--sun", "wide"), "'wide', expected 0 to 180 deg, or none"),
-        (("visible", "--look-at", "Vega", "--declination", "3"), "--declination '3', expected low:high"),
-        (("visible", "--look-at", "Vega", "--tle", "none.tle"), "orbit file 'none.tle' does not exist"),
-        (("plan",), "the plan has no targets, expected some, such as --targets targets.csv"),
-        (("plan", "missing.csv"), "table of targets 'missing.csv' does not exist"),
-    ],
-)
-def test_bad_flags_exit_with_code_2(words: tuple[str, ...], told: str, tmp_path: Path) -> None:
-    done = run(*words, folder=tmp_path, code=2)
-    assert done.stderr.startswith("mauvecl: ")
-    assert told in done.stderr
-    assert done.stderr.count("\n") == 1
-    assert done.stdout == ""

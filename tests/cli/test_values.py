@@ -55,29 +55,3 @@ def test_every_numeric_flag_refuses_text(tmp_path: Path) -> None:
         assert (code, out) == (2, ""), (verb, flag)
         assert told.startswith(f"mauvecl: {flag} 'many', expected a "), told
         assert told.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (["detect", "--geometry", "beside"], "--geometry 'beside', expected 'added' or 'replaces'"),
-        (["detect", "--tails", "guessed"], "--tails 'guessed', expected 'counted' or 'sampled'"),
-        (["limit", "--known", "light_loss,luck"], "unknowns.known names 'luck', expected some of "),
-        (["snr", "--star", "G2V", "-m", "7", "--at", "30"], "wavelength = 30.0 nm, expected 200.1 to 699.8 nm"),
-        (["stare", "--gap", "10"], "--gap '10', expected two times in s"),
-        (["stare", "--energy", "1e33", "--amplitude", "0.1"], "--energy is given beside --amplitude"),
-        (["detect", "--star", "G2V,M3V,", "-m", "7"], "library spectrum '' is unknown"),
-        (["detect", "--star", "G2V,M33V", "-m", "7,8"], "library spectrum 'M33V' is unknown"),
-        (["serve", "--port", "99999"], "--port '99999', expected 1 to 65535"),
-        (["detect", "--output", __file__, "-n", "1e5"], "is a file, expected the name of a folder"),
-        (["detect", "--instrument", "."], "instrument '.' is a folder, expected a name or a TOML file"),
-        (
-            ["detect", "--star", "G2V", "-m", "7", "--geometry", "replaces", "--photosphere-temperature", "2"],
-            "--photosphere-temperature 2.0, expected 1000 to 200000 K",
-        ),
-    ],
-    ids=lambda given: " ".join(given) if isinstance(given, list) else "",
-)
-def test_bad_values_name_their_flag(words: list[str], sentence: str, tmp_path: Path) -> None:
-    code, _, told = ended(*words, folder=tmp_path)
-    assert (code, sentence in told) == (2, True), told

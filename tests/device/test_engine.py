@@ -81,6 +81,22 @@ CASES = {
 #: Cases whose statistics are tested at width 1: joint and separate draws, stacks and frames, with processes or without.
 #: Raw spectra, which use the same draws, are tested in all cases.
 ONE_BY_ONE = ("stack", "apart, electrons, frames", "priors, electrons, frames", "jitter, one frame, rays")
+#: Cases whose statistics are tested: every recipe, stacks and frames, uneven pixels, every process.
+COMPARED = (
+    "stack",
+    "one frame",
+    "cold",
+    "at the rail",
+    "apart, cold",
+    "apart, electrons, frames",
+    "uneven",
+    "uneven, pairs of two ways",
+    "cosmic rays, frames",
+    "priors",
+    "priors, electrons, frames",
+    "jitter, cold",
+    "jitter, one frame, rays",
+)
 #: Cases of `make check`: a joint draw, and separate draws frame by frame.
 SHORT = ("stack", "apart, electrons, frames")
 
@@ -153,8 +169,7 @@ def _reference_raw(name: str) -> tuple[np.ndarray, np.ndarray]:
     return reference.realise(scene, INDEX, SEED), reference.clipped(scene, INDEX, SEED).sum(axis=(1, 2))
 
 
-# Statistics are undefined without noise.
-@pytest.mark.parametrize("name", long_but([name for name in CASES if name != "noiseless"], *SHORT))
+@pytest.mark.parametrize("name", long_but(COMPARED, *SHORT))
 def test_statistics_equal_reference(engine: Engine, name: str) -> None:
     check_statistics(engine, name)
 
@@ -425,30 +440,3 @@ def test_progress_is_reported_and_may_stop(engine: Engine) -> None:
     # The engine works on.
     stopping._tiles._progress = None
     assert stopping.realise(quiet, count=3, seed=1).shape[0] == 3
-
-
-@pytest.mark.parametrize(
-    ("options", "refusal"),
-    [
-        ({"count": 0, "seed": 1}, ("count", "0")),
-        ({"count": 1, "seed": -1}, ("seed", "-1")),
-        ({"count": 1, "seed": 2**64}, ("seed", "18446744073709551616")),
-        ({"count": 1, "seed": 1, "start": -1}, ("start", "-1")),
-        ({"count": 1, "seed": 1, "mode": "fast"}, ("mode", "'fast'")),
-    ],
-)
-def test_impossible_requests_are_refused(engine: Engine, options: dict, refusal: tuple[str, ...]) -> None:
-    (quiet, *_), _ = case("stack")
-    with refused(*refusal):
-        engine.realise(quiet, **options)
-
-
-def test_statistics_and_scenarios_are_checked(engine: Engine) -> None:
-    (quiet, *flares), _ = case("stack")
-    with refused("statistic", "'chi3'"):
-        engine.detect(quiet, flares, realisations=10, seed=1, statistics=("chi3",))
-    with refused("flares"):
-        engine.detect(quiet, [], realisations=10, seed=1, statistics=("matched",))
-    (other, *_), _ = case("one frame")
-    with refused("n_frames"):
-        engine.detect(quiet, [other], realisations=10, seed=1)

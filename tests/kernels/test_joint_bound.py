@@ -136,14 +136,6 @@ def test_smallest_poisson_means() -> None:
         prepare([x], processes=Processes(qe_scale=Uniform(0.9, 1.1)))
 
 
-def test_priors_outside_the_tested_region_raise() -> None:
-    """Where the expectation may be drawn jointly and its dark at the prior's other end may not."""
-    x = toy(8, 1, dark=2225.0, read=2.0, light=0.0)
-    prepare([x], processes=Processes(detector_temperature=Uniform(19.0, 23.0)))
-    with refused("detector_temperature"):
-        prepare([x], processes=Processes(detector_temperature=Uniform(-60.0, 23.0)))
-
-
 @pytest.mark.parametrize("quartic", [False, True])
 def test_factors_follow_the_cumulants(quartic: bool) -> None:
     """The twin's draw under factors on light and dark is the polynomial of the cumulants at these factors."""

@@ -7,7 +7,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from refusals import refused
 
 from mauvecl.device.probes import Probes
 from mauvecl.noise import reference
@@ -173,8 +172,3 @@ def test_reference_has_the_same_bits(probes: Probes) -> None:
     order = np.argsort(word.astype(np.float64) + (finer & np.uint32(0x7FFFFF)) / 2**23 * (word < 2**31), kind="stable")
     low = order[word[order] < 2**31]
     assert (np.diff(found[low]) >= 0).all()
-
-
-def test_prior_truncated_too_far_raises() -> None:
-    with refused("low", "9.9e+06", "100000"):
-        Normal(1.0, 1e-7, 1.99, 3.0)

@@ -89,20 +89,20 @@ class TestSampled:
 
     @pytest.mark.long
     def test_repeated_estimates_scatter_by_their_errors(self):
-        """Twenty seeds of the default bank at half an orbit: their scatter, and a direct draw of the noise.
+        """Twelve seeds of the default bank at half an orbit: their scatter, and a direct draw of the noise.
 
-        Chi-squared of 19 degrees at three thresholds, and the mean of the seeds within 4 standard errors at two where
+        Chi-squared of 11 degrees at three thresholds, and the mean of the seeds within 4 standard errors at two where
         alarms can be counted: fails by chance once in 10^3 runs. The stated error of the rate at one false alarm per
         star-month is below 5 % for every seed.
         """
         stare = Stare.of(5000.0)
         search = Search(SearchChoice().white_bank(5.0), stare)
-        repeats = [sample_rate(search, seed=seed) for seed in range(20)]
+        repeats = [sample_rate(search, seed=seed) for seed in range(12)]
         for u in (4.25, 5.0, 6.5):
             k = LADDER.index(u)
             p, error = (np.array([getattr(tail, name)[k] for tail in repeats]) for name in ("probability", "error"))
             scatter = np.sum((p - p.mean()) ** 2) / np.mean(error**2)
-            assert special.chdtri(19, 1 - 1e-4) < scatter < special.chdtri(19, 1e-4)
+            assert special.chdtri(11, 1 - 1e-4) < scatter < special.chdtri(11, 1e-4)
         month = per_day(1.0, "month")
         assert max(tail.log_rate(tail.threshold(month).value)[1] for tail in repeats) < 0.05
         rng, n = np.random.default_rng(9), 6000
@@ -110,7 +110,7 @@ class TestSampled:
         for u in (3.5, 4.0):
             p = np.array([tail.probability[LADDER.index(u)] for tail in repeats])
             q = np.mean(maxima > u)
-            assert abs(p.mean() - q) < 4 * np.hypot(p.std() / np.sqrt(20), np.sqrt(q * (1 - q) / n))
+            assert abs(p.mean() - q) < 4 * np.hypot(p.std() / np.sqrt(12), np.sqrt(q * (1 - q) / n))
 
     def test_rate_of_one_filter_equals_the_closed_form(self):
         """Independent frames: templates shorter than a frame leave P = 1 - (1 - Q)^n."""

@@ -19,7 +19,6 @@ from mauvecl.noise.unknowns import (
     default_processes,
     default_spreads,
 )
-from mauvecl.schema.errors import InputError
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.sections import Unknowns
 from mauvecl.study.stare_section import StareQuestion
@@ -83,9 +82,3 @@ def test_default_values_of_documented_set() -> None:
 def test_stares_take_every_change_of_the_registry(row: object) -> None:
     stare = Stare.of(6000.0, **{row.course: {row.name: 0.01}})  # type: ignore[attr-defined]
     assert any(stare.jitters.values()) or stare.unknowns
-
-
-def test_jitter_outside_the_registry_is_refused() -> None:
-    with pytest.raises(InputError) as error:
-        Stare.of(6000.0, jitters={"star": 0.01})
-    assert error.value.expected == "one of light, sky, temperature"

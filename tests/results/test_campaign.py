@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from refusals import refused
 from scipy import stats
 
 from mauvecl.answers.detection.detect import detect
@@ -53,15 +52,6 @@ def test_long_campaigns_are_joined_from_stretches() -> None:
     assert abs(rate[0] / rate[1] - 1) < 4 * np.sqrt(2 / (20_000 * 4096 * rate[0]))
 
 
-@pytest.mark.parametrize(
-    ("fap", "frames", "stack", "step", "key"),
-    [(0.0, 10, 1, 1, "fap"), (0.1, 10, 20, 1, "step"), (0.1, 10, 2, 3, "step"), (0.1, 10, 2, 0, "step")],
-)
-def test_impossible_campaigns_raise(fap: float, frames: int, stack: int, step: int, key: str) -> None:
-    with refused(key):
-        campaign(fap, frames, stack, step=step)
-
-
 @pytest.mark.parametrize("wanted", [1e-4, 0.01, 0.5])
 @pytest.mark.parametrize(("frames", "stack"), [(17_280, 1), (17_280, 10), (7, 7)])
 def test_false_alarm_probability_per_test_is_the_inverse(wanted: float, frames: int, stack: int) -> None:
@@ -85,22 +75,6 @@ def test_overlapping_stacks_allow_more_per_test() -> None:
     assert back.value == pytest.approx(0.05, abs=4 * np.sqrt(2 * 0.05 * 0.95 / 20_000))
     # Ten of 20 000 settle nothing.
     assert per_test(5e-4, 600, 10, step=1).overlapping is None
-
-
-@pytest.mark.parametrize(
-    ("campaign_asked", "refusal"),
-    [
-        ({"fap": 0.01}, ("campaign.fap",)),
-        ({"frames": 10, "fap": 2.0}, ("campaign.fap", "2")),
-        ({"frames": 17_280, "alarms": 1e5}, ("campaign.alarms", "100000", "1728")),
-    ],
-)
-def test_impossible_rates_raise(campaign_asked: dict, refusal: tuple[str, ...], engine: Engine) -> None:
-    def ask() -> None:
-        detect(Study.build({"campaign": campaign_asked}, "test"), engine)
-
-    with refused(*refusal):
-        ask()
 
 
 def test_detection_reports_test_and_campaign(engine: Engine) -> None:

@@ -170,16 +170,6 @@ def test_tail_samples_are_reproducible_extremes(engine: Engine) -> None:
 
 
 @pytest.mark.long
-def test_rare_tails_raise(found: Detection) -> None:
-    with refused("fap", "10000000"):
-        found.threshold(1e-5)
-    found.threshold(1e-4)
-    for fap in (0.0, 1.0, -1.0, np.nan):
-        with refused("fap"):
-            found.threshold(fap)
-
-
-@pytest.mark.long
 def test_table_has_all_rows(found: Detection) -> None:
     table = found.table(fap=1e-3)
     assert len(table) == len(AMPLITUDES) * len(STATISTICS)
@@ -189,15 +179,6 @@ def test_table_has_all_rows(found: Detection) -> None:
     np.testing.assert_allclose(chi2["mean"], chi2["expected"], rtol=5e-4)
     assert table.meta["realisations"] == N
     assert all(table[name].info.description for name in ("probability", "threshold", "expected"))
-
-
-def test_unsimulated_statistics_raise(engine: Engine) -> None:
-    quiet, flare = star(amplitudes=(0.24,), payload=instrument(part=True))
-    found = engine.detect(quiet, [flare], realisations=1000, seed=1, statistics=("matched",))
-    with refused("statistic", "'chi2'"):
-        found.threshold(0.5, "chi2")
-    with refused("flare", "1"):
-        found.distribution("matched", 1)
 
 
 def test_saturated_pixels_are_left_out(engine: Engine) -> None:
@@ -247,28 +228,6 @@ def test_own_weights_define_a_statistic(engine: Engine) -> None:
     delta = flares[3].signal_dn - quiet.signal_dn
     assert theory.mean == pytest.approx(float(slope.weights @ delta))
     assert found.dof("slope") == 1
-
-
-@pytest.mark.parametrize(
-    ("weights", "name", "refusal"),
-    [
-        (np.ones(5), "mine", ("weights", "5")),
-        (np.zeros(198), "mine", ("weights",)),
-        (np.full(198, np.nan), "mine", ("weights", "198")),
-        (np.ones((2, 99)), "mine", ("weights", "2", "99")),
-        (np.ones(198), "chi2", ("statistics",)),
-    ],
-)
-def test_impossible_weights_raise(engine: Engine, weights: np.ndarray, name: str, refusal: tuple[str, ...]) -> None:
-    quiet, flare = star(amplitudes=(0.1,), payload=instrument(part=True))
-    with refused(*refusal):
-        engine.detect(quiet, [flare], realisations=10, seed=1, statistics=(Linear(name, weights),))
-
-
-def test_uv_excess_needs_uv(engine: Engine) -> None:
-    quiet, flare = star(amplitudes=(0.1,), payload=instrument(output_min_nm=400.0, output_max_nm=500.0))
-    with refused("statistic", "200-360"):
-        engine.detect(quiet, [flare], realisations=10, seed=1, statistics=("uv_excess",))
 
 
 @pytest.mark.long

@@ -25,7 +25,7 @@ from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.registry import STATISTICS
 
 N, FAP = 4000, 0.05
-STUDIES = 12
+STUDIES = 8
 SEED = 14
 
 
@@ -155,8 +155,7 @@ def check_answers(found: Detection, statistic: str, k: int, null: Sorted, flare:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("number", [*range(3), 5])
-@pytest.mark.parametrize("width", [1, 16])
+@pytest.mark.parametrize(("width", "number"), [(16, 0), (16, 1), (16, 2), (16, 5), (1, 0), (1, 1)])
 def test_snr_equals_that_of_sorting(width: int, number: int) -> None:
     """Means, spreads and quantiles per pixel and element, against the S/N of the raw spectra themselves."""
     (quiet, *_), how = study(number)

@@ -148,25 +148,6 @@ def test_detection_reports_sampled_tails(engine: Engine) -> None:
     assert sampled.threshold(1e-9) == engine.detect(quiet, flares, tails="sampled", **kind).threshold(1e-9)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("options", "fact"),
-    [
-        ({"recipe": "apart"}, "apart"),
-        ({"mode": "frames"}, "frames"),
-        ({"processes": Processes(jitter=Uniform(0.0, 0.05))}, "priors"),
-    ],
-)
-def test_impossible_tilts_raise(engine: Engine, options: dict, fact: str) -> None:
-    quiet, flare = star(amplitudes=(0.1,), payload=instrument(**PART))
-    found = engine.detect(quiet, [flare], realisations=100, seed=1, statistics=("chi2",), tails="sampled", **options)
-    with refused("tails", fact):
-        found.threshold(1e-6)
-    plain = engine.detect(quiet, [flare], realisations=100, seed=1, statistics=("chi2",), tails="sampled")
-    with refused("fap", "1e-12"):
-        plain.threshold(1e-12)
-
-
 #: Realisations, and the false-alarm probability, where something else is compared.
 FEWER, ONE_IN = 1_000_000, 1e-4
 
@@ -198,11 +179,3 @@ def test_sum_in_dn_is_tilted_in_its_unit(engine: Engine) -> None:
     sampled = tail(found, fap, "own", seed=3)
     beyond = found.distribution("own").above(sampled.threshold.value)
     assert abs(beyond - fap * n) < 4.5 * np.hypot(np.sqrt(fap * n), sampled.relative_error * fap * n)
-
-
-def test_too_many_exposures_raise(engine: Engine) -> None:
-    quiet, flare = star(amplitudes=(0.1,), payload=instrument(**PART))
-    kind = {"realisations": 100, "seed": 1, "statistics": ("chi2",), "tails": "sampled"}
-    found = engine.detect(quiet, [flare], comparison=Comparison(40), **kind)
-    with refused("tails", "40"):
-        found.threshold(1e-6)

@@ -6,7 +6,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from refusals import refused
 from scipy import stats
 
 from mauvecl import Engine, Expectation, FlareModel, Instrument, Source, TwoBlackbodies, expect, fit
@@ -80,9 +79,3 @@ def test_second_temperature_of_a_single_blackbody_is_unconstrained(engine: Engin
     assert np.isinf(found.high[0, :, second]).sum() >= 15
     assert (found.low[0, :, 0] <= 9000.0).sum() >= 15
     assert (found.estimates >= np.array(found.bounds)).all()
-
-
-def test_model_with_a_jump_raises() -> None:
-    quiet, two, _ = expectations()
-    with refused("model"):
-        fit_two(two.recorded_dn, quiet, model(jump=True))

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from refusals import refused
 
 from mauvecl.host.expectation import Expectation, expect
 from mauvecl.host.instrument.instrument import Instrument
@@ -123,31 +122,6 @@ def test_degrees_of_freedom() -> None:
     assert STATISTICS["chi2"].dof(s) == quiet.wavelength_nm.size - 1
     assert STATISTICS["chi2_element"].dof(s) == quiet.element_wavelength_nm.size - 1
     assert STATISTICS["matched"].dof(s) == 1
-
-
-def test_invalid_nuisances_raise() -> None:
-    quiet, flare = pair()
-    n = quiet.wavelength_nm.size
-    with refused("nuisances", "'dust'"):
-        Nuisances.of(quiet, {"dust": 1.0})
-    for sd in (0.0, -1.0, float("nan")):
-        with refused("sd"):
-            Nuisances.of(quiet, {"dark": sd})
-    with refused("own"):
-        Nuisances.of(quiet, {"own": 1.0}, {"own": np.zeros(n)})
-    with refused("own"):
-        Nuisances.of(quiet, {"own": 1.0}, {"own": np.ones(3)})
-    twice = Nuisances.of(quiet, {"light": FREE, "own": FREE}, {"own": 2.0 * quiet.recorded_light_dn})
-    with refused("nuisances"):
-        STATISTICS["chi2"].subtracted_rows(Setting(quiet, ~quiet.saturated, nuisances=twice))
-    shape = flare.signal_dn - quiet.signal_dn
-    same = Setting(quiet, ~quiet.saturated, nuisances=Nuisances.of(quiet, {"own": FREE}, {"own": shape}))
-    with refused("statistic"):
-        Matched().weights_per_dn(same, flare)
-    s = setting(quiet, {"dark": 1.0})
-    for name in ("chi2_pair", "paper"):
-        with refused("statistic"):
-            STATISTICS[name].check(s)
 
 
 @pytest.mark.long
