@@ -9,6 +9,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING
 
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import Column
 
 from ..files.ecsv import Numbers, parse_numbers
 
@@ -36,6 +37,30 @@ def _names() -> dict[str, str]:
             names.setdefault(other.casefold(), key)
     names.pop("", None)
     return names
+
+
+def _ratios(quality: str) -> str:
+    """Return the ratios of an entry on the ultraviolet: "190-210: 0.1 (S/N 5), ...; ..." gives "0.1, ..."."""
+    return ", ".join(part.split()[0] for part in quality.split("; ")[0].split(": ")[1].split(", "))
+
+
+#: Columns of the table of embedded spectra as people read it.
+COLUMNS = (
+    Column("name", heading="name"),
+    Column("alias", heading="also"),
+    Column("spectral_type", heading="type"),
+    Column("star", heading="star"),
+    Column("temperature_k", heading="K"),
+    Column("uv_quality", heading="UV at 190-210, 240-260, 290-310 nm", format=_ratios),
+    Column("noisy_below_nm", heading="noisy below", format=lambda below: f"{below} nm" if below else ""),
+    Column("licence", heading="licence"),
+)
+#: Columns of that of the user's own.
+OWN_COLUMNS = (
+    Column("name", heading="name"),
+    Column("origin", heading="origin"),
+    Column("treatment", heading="notes"),
+)
 
 
 def library_table() -> Table:

@@ -12,6 +12,7 @@ from typing import Any
 from mauvecl.host.files.parsing import read_text
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import Column
 from mauvecl.study.study_text import read_embedded_study
 
 #: Name of the run record in a folder, and its key that holds the digest of all others.
@@ -31,6 +32,10 @@ class FileFault:
 
     file: str
     state: str
+
+
+#: Columns of the table of faults.
+FAULT_COLUMNS = (Column("file", heading="file"), Column("state", heading="what"))
 
 
 def digest_of(path: Path) -> str:

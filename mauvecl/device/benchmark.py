@@ -9,6 +9,7 @@ from typing import Any
 from mauvecl.device.engine import Engine, devices
 from mauvecl.device.errors import DeviceError
 from mauvecl.device.selftest import toy
+from mauvecl.schema.tables import Column
 
 PIXELS = 1600
 
@@ -28,6 +29,24 @@ def chi2_rate(engine: Engine, seconds: float = 0.5) -> float:
     while (spent := work(count)) < seconds / 4:
         count *= 4
     return count * PIXELS / min(spent, work(count))
+
+
+#: Columns of the table of devices.
+COLUMNS = (
+    Column("number", heading="number"),
+    Column("platform", heading="device", format=lambda platform, name: f"{platform}: {name}", others=("name",)),
+    Column("driver", heading="driver"),
+    Column("kind", heading="kind"),
+    Column("compute_units", heading="units"),
+    Column("global_memory", unit="byte", heading="GiB", format=lambda size: f"{size / 2**30:.1f}"),
+    Column("promise", heading="promise"),
+    Column("rate", unit="1 / s", heading="rate", format=lambda rate, error: error or _rate(rate), others=("error",)),
+    Column("default", heading="chosen", format=lambda chosen: "default" if chosen else ""),
+)
+
+
+def _rate(rate: float | None) -> str:
+    return "" if rate is None else f"{rate:.2g} /s"
 
 
 def list_devices(*, measure: bool = True) -> list[dict[str, Any]]:

@@ -28,6 +28,7 @@ from mauvecl.results.counts.tally import Tally
 from mauvecl.results.requests.channels import ChannelPlan, plan_channels
 from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.results.snr import Counts, elements, observers
+from mauvecl.schema.tables import Column
 from mauvecl.statistics.nuisances import as_nuisances
 from mauvecl.statistics.registry import STATISTICS
 
@@ -56,6 +57,14 @@ class Check:
     name: str
     passed: bool
     result: str
+
+
+#: Columns of the table of checks.
+COLUMNS = (
+    Column("passed", heading="result", format=lambda passed: "PASS" if passed else "FAIL"),
+    Column("name", heading="check"),
+    Column("result", heading="found"),
+)
 
 
 def toy(

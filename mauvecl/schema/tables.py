@@ -65,16 +65,20 @@ class Column:
 
 @dataclass(frozen=True)
 class View:
-    """A table as people read it: a title and some of its columns. Without a table, the title is a sentence."""
+    """A table as people read it: a title and some of its columns. Without a table, the title is a sentence.
+
+    The table may also be a list of records: values by the columns' names.
+    """
 
     title: str
     columns: Sequence[Column] = ()
-    table: Table | None = None
+    table: Table | Sequence[Mapping[str, Any]] | None = None
 
     def texts(self, hidden: Collection[str] = ()) -> tuple[list[str], list[list[str]]]:
         """Return headings and cells, without `hidden` columns."""
         shown = [one for one in self.columns if one.heading and one.name not in hidden]
-        found = [] if self.table is None else records(self.table)
+        table = [] if self.table is None else self.table
+        found = table if isinstance(table, Sequence) else records(table)
         return [one.heading for one in shown], [[one.text(record) for one in shown] for record in found]
 
 

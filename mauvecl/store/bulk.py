@@ -19,6 +19,7 @@ from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import FirstRealisation, Realisations
+from mauvecl.schema.tables import Column
 from mauvecl.store.export import Selection, export
 from mauvecl.store.layout import CRC_BYTES, Chunk, Store, StoredScene, crc, digest
 from mauvecl.study.cases import Case
@@ -267,6 +268,14 @@ class Fault:
     key: str
     state: str
     mended: bool
+
+
+#: Columns of the table of faults.
+FAULT_COLUMNS = (
+    Column("key", heading="file"),
+    Column("state", heading="what"),
+    Column("mended", heading="repaired", format=lambda mended: "repaired" if mended else ""),
+)
 
 
 @validated

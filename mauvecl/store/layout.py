@@ -25,6 +25,7 @@ from mauvecl.host.files.parsing import toml
 from mauvecl.host.files.size_limits import read_bytes
 from mauvecl.runs.locks import differing_keys
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import Column, percent
 from mauvecl.store.description import describe, study_in
 from mauvecl.study.cases import cases
 from mauvecl.study.labels import full_label
@@ -77,6 +78,16 @@ class StoredScene:
     def chunk_rows(self, realisations: int) -> int:
         """Return the number of realisations per chunk."""
         return max(min(CHUNK_BYTES // self.row_bytes, realisations), 1)
+
+
+#: Columns of the table of arrays.
+ARRAY_COLUMNS = (
+    Column("array", heading="array"),
+    Column("star", heading="star"),
+    Column("amplitude", heading="flare", format=percent("g")),
+    Column("shape", heading="shape", format=lambda shape: " x ".join(map(str, shape))),
+    Column("type", heading="type"),
+)
 
 
 def scenes(study: Study) -> list[StoredScene]:

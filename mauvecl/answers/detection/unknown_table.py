@@ -47,6 +47,8 @@ COLUMNS = (
     Column("plain", description="the same where it is unknown and the statistic does not know of it",
            heading="S/N, not looked for", format=".3g"),
     Column("marginalised", description="the same, marginalised", heading="S/N, marginalised", format=".3g"),
+    Column("detected", description="detection probability of the marginalised statistic at the header's false alarms",
+           heading="then detected", format=percent(".3g")),
     Column("smallest", description="flare amplitude that is detected, marginalised, at the header's power and false "
            "alarms", heading="smallest flare", format=percent(".3g")),
 )  # fmt: skip
@@ -95,8 +97,8 @@ class UnknownAnswer(Answer):
         """One row per star, flare and unknown."""
         names = [column.name for column in COLUMNS]
         rows = [
-            dict(zip(names, (star, amplitude, unknown, c.known, c.plain, c.marginal, self.smallest(star, unknown)),
-                     strict=True))
+            dict(zip(names, (star, amplitude, unknown, c.known, c.plain, c.marginal,
+                             float(power(c.marginal, self.study.run.fap)), self.smallest(star, unknown)), strict=True))
             for (star, amplitude), costs in self.costs.items()
             for unknown, c in costs.items()
         ]  # fmt: skip
@@ -135,6 +137,6 @@ def unknown_table(study: Study, unknowns: Mapping[str, NuisanceChoice] = SHOWN) 
     return UnknownAnswer(study, costs, tuple(quiets))
 
 
-def power(snr: NDArray[np.float64], fap: float) -> NDArray[np.float64]:
+def power(snr: float | NDArray[np.float64], fap: float) -> NDArray[np.float64]:
     """Return the detection probability of a normal statistic with some S/N, shape of the S/N."""
     return np.asarray(special.ndtr(snr + special.ndtri(fap)))

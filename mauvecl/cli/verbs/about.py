@@ -28,30 +28,17 @@ def devices(
 
     Example: mauvecl devices
     """
-    from mauvecl.device.benchmark import list_devices
+    from mauvecl.device.benchmark import COLUMNS, list_devices
+    from mauvecl.schema.tables import View
 
     records = list_devices() if rate else list_devices(measure=False)
     if as_json:
         print(json.dumps(records, indent=2))
         return
-    from mauvecl.cli.console import show_table
+    from mauvecl.cli.console import show_view
 
-    cells = [
-        (
-            str(number),
-            f"{record['platform']}: {record['name']}",
-            record["driver"],
-            record["kind"],
-            str(record["compute_units"]),
-            f"{record['global_memory'] / 2**30:.1f}",
-            record["promise"],
-            record["error"] or ("" if record["rate"] is None else f"{record['rate']:.2g} /s"),
-            "default" if record["default"] else "",
-        )
-        for number, record in enumerate(records)
-    ]
-    columns = ("number", "device", "driver", "kind", "units", "GiB", "promise", "rate", "chosen")
-    show_table("OpenCL devices; choose with --device NUMBER or part of a name", columns, cells)
+    numbered = [{"number": number} | record for number, record in enumerate(records)]
+    show_view(View("OpenCL devices; choose with --device NUMBER or part of a name", COLUMNS, numbered))
 
 
 def selftest(
@@ -68,9 +55,10 @@ def selftest(
     from dataclasses import asdict
 
     from mauvecl.answers import files
-    from mauvecl.cli.console import Meter, show, show_table
+    from mauvecl.cli.console import Meter, show, show_view
     from mauvecl.device import selftest
     from mauvecl.device.engine import Engine
+    from mauvecl.schema.tables import View
 
     started = time.perf_counter()
     folder = None if output is None else files.make_folder(output)
@@ -83,8 +71,8 @@ def selftest(
     if as_json:
         print(json.dumps(selftest.read_outcome(engine.device) or [asdict(check) for check in checks], indent=2))
     else:
-        cells = [("PASS" if check.passed else "FAIL", check.name, check.result) for check in checks]
-        show_table(f"Self-test of {engine.device_name}, driver {engine.driver}", ("result", "check", "found"), cells)
+        title = f"Self-test of {engine.device_name}, driver {engine.driver}"
+        show_view(View(title, selftest.COLUMNS, [asdict(check) for check in checks]))
         outcome = f"{failed} of {len(checks)} checks FAILED" if failed else f"All {len(checks)} checks passed"
         show([f"{outcome} in {seconds:.0f} s. Promise: {engine.device.promise}."])
     if folder is not None:

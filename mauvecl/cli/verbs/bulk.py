@@ -75,7 +75,9 @@ def realise(study: Study, session: Session) -> None:
 
 
 def _tell(store: Store, place: Path, session: Session) -> None:
-    from mauvecl.cli.console import show_table
+    from mauvecl.cli.console import show_view
+    from mauvecl.schema.tables import View
+    from mauvecl.store.layout import ARRAY_COLUMNS
     from mauvecl.study.assumptions import assumption_line
     from mauvecl.study.messages import collect_messages
 
@@ -97,16 +99,11 @@ def _tell(store: Store, place: Path, session: Session) -> None:
             {"assumed": assumed, "messages": messages, "store": str(place), "bytes": store.n_bytes, "arrays": rows}
         )
         return
-    show_table(
+    title = (
         f"Raw spectra, DN; seed {store.study.run.seed}. Rows of the same number share their random numbers, rows of "
-        "different number are independent.",
-        ("array", "star", "flare", "shape", "type"),
-        [
-            (row["array"], row["star"], f"{100 * float(str(row['amplitude'])):g} %",
-             " x ".join(str(n) for n in (store.rows, *scene.row)), row["type"])
-            for row, scene in zip(rows, store.scenes, strict=True)
-        ],
-    )  # fmt: skip
+        "different number are independent."
+    )
+    show_view(View(title, ARRAY_COLUMNS, rows))
     if not session.quiet:
         seconds = time.perf_counter() - session.started
         session.say([f"Wrote {store.n_bytes / 2**20:.0f} MiB to {place} in {seconds:.1f} s."])
@@ -135,8 +132,9 @@ def verify(
     Example: mauvecl verify frames.zarr --repair
     """
     from mauvecl.answers.checked import is_answer
-    from mauvecl.cli.console import Meter, show, show_table
+    from mauvecl.cli.console import Meter, show, show_view
     from mauvecl.schema.errors import InputError
+    from mauvecl.schema.tables import View
 
     if is_answer(store):
         if repair or redraw or rows is not None:
@@ -160,8 +158,7 @@ def verify(
         print(json.dumps([asdict(fault) for fault in faults], indent=2))
     else:
         if faults:
-            cells = [(fault.key, fault.state, "repaired" if fault.mended else "") for fault in faults]
-            show_table(f"Not as it was written: {store}", ("file", "what", "repaired"), cells)
+            show_view(View(f"Not as it was written: {store}", bulk.FAULT_COLUMNS, [asdict(one) for one in faults]))
         told = "with what was written" if not redraw else "with what the engine draws"
         show([f"{len(faults) - left} repaired, {left} left as found." if faults else f"Everything agrees {told}."])
     if left:
@@ -170,14 +167,15 @@ def verify(
 
 def _verify_answer(folder: Path, *, as_json: bool) -> None:
     """Print what is not as the run record has it; exit code 1 if anything."""
-    from mauvecl.answers.checked import verify_answer
-    from mauvecl.cli.console import show, show_table
+    from mauvecl.answers.checked import FAULT_COLUMNS, verify_answer
+    from mauvecl.cli.console import show, show_view
+    from mauvecl.schema.tables import View
 
     faults = verify_answer(folder)
     if as_json:
         print(json.dumps([asdict(fault) for fault in faults], indent=2))
     elif faults:
-        show_table(f"Not as it was written: {folder}", ("file", "what"), [(one.file, one.state) for one in faults])
+        show_view(View(f"Not as it was written: {folder}", FAULT_COLUMNS, [asdict(one) for one in faults]))
     else:
         show(["Every file agrees with the run record, and the record with its own digest."])
     if faults:

@@ -33,38 +33,20 @@ def library(context: typer.Context, as_json: JsonFlag = False) -> None:
     """
     if context.invoked_subcommand is not None:
         return
-    from mauvecl.host.stars.catalogue import library_table
-    from mauvecl.schema.tables import records
+    from mauvecl.host.stars.catalogue import COLUMNS, OWN_COLUMNS, library_table
+    from mauvecl.schema.tables import View, records
 
     table = library_table()
     if as_json:
         print(json.dumps(records(table), indent=2))
         return
-    from mauvecl.cli.console import show_table
+    from mauvecl.cli.console import show_view
 
-    ours = table[table["kept"] == "embedded"]
-    columns = (
-        "name",
-        "also",
-        "type",
-        "star",
-        "K",
-        "UV at 190-210, 240-260, 290-310 nm",
-        "noisy below",
-        "licence",
-    )
-    cells = []
-    for row in ours:
-        ratios = ", ".join(part.split()[0] for part in row["uv_quality"].split("; ")[0].split(": ")[1].split(", "))
-        noisy = f"{row['noisy_below_nm']} nm" if row["noisy_below_nm"] else ""
-        first = tuple(row[n] for n in ("name", "alias", "spectral_type", "star", "temperature_k"))
-        cells.append((*first, ratios, noisy, row["licence"]))
-    show_table("Embedded spectra (UV: mean flux over that at 540-560 nm); origin, citation: --json", columns, cells)
+    title = "Embedded spectra (UV: mean flux over that at 540-560 nm); origin, citation: --json"
+    show_view(View(title, COLUMNS, table[table["kept"] == "embedded"]))
     yours = table[table["kept"] == "yours"]
     if len(yours):
-        show_table(
-            "Your own", ("name", "origin", "notes"), [(row["name"], row["origin"], row["treatment"]) for row in yours]
-        )
+        show_view(View("Your own", OWN_COLUMNS, yours))
 
 
 @app.command()

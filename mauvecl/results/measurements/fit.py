@@ -17,6 +17,7 @@ from mauvecl.results.measurements.reduction import Exposures, Reduction, check_d
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import Probability, Temperature, Wavelength
+from mauvecl.schema.tables import Column, table_of
 from mauvecl.statistics.nuisances import Nuisances
 
 if TYPE_CHECKING:
@@ -137,16 +138,21 @@ class Measurement:
 
     def table(self, frame: int = 0) -> Table:
         """Return the estimates and intervals of one frame, one row per quantity."""
-        from astropy.table import Table
-
-        table = Table({"quantity": list(self.names), "unit": list(self.units), "estimate": self.estimates[frame]})
-        table["error"] = self.errors[frame]
+        values = [
+            Column("quantity", lambda _: list(self.names), description="what is measured"),
+            Column("unit", lambda _: list(self.units), description="of estimate, error and interval"),
+            Column("estimate", self.estimates.__getitem__, description="estimate"),
+            Column("error", self.errors.__getitem__, description="standard error"),
+        ]
         for level, low, high in zip(self.levels, self.low, self.high, strict=True):
-            percent = f"{100 * level:.4g}"
-            table[f"low_{percent}"], table[f"high_{percent}"] = low[frame], high[frame]
+            share = f"{100 * level:.4g}"
+            for end, bound in (("low", low), ("high", high)):
+                text = f"{share} % interval, {'lower' if end == 'low' else 'upper'} end"
+                values.append(Column(f"{end}_{share}", bound.__getitem__, description=text))
+        chi2, p_value = float(self.chi2[frame]), float(self.p_value[frame])
+        table = table_of(values, [frame], chi2=chi2, dof=self.dof, p_value=p_value)
         for name in table.colnames[2:]:
-            table[name].format = ".4g"
-        table.meta |= {"chi2": float(self.chi2[frame]), "dof": self.dof, "p_value": float(self.p_value[frame])}
+            table[name].info.format = ".4g"
         return table
 
 

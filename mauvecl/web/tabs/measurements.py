@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mauvecl.answers.measurements.expected import expected_measurements, forecast_model, models_of
+from mauvecl.answers.measurements.measure import COLUMNS
 from mauvecl.results.measurements.flare_model import FlareModel
+from mauvecl.schema.tables import View, records
 from mauvecl.study.nuisances import NuisanceChoice
-from mauvecl.web.closed_forms import percent, short
+from mauvecl.web.closed_forms import short
 from mauvecl.web.figures import Canvas
 from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
@@ -85,12 +88,6 @@ class Errors(Picture):
         return PictureData(text, sources)
 
 
-def _number(value: float, digits: int) -> str:
-    """Format a number, with a power of ten only if it is very small or large."""
-    text = f"{value:.{digits}g}"
-    return f"{float(text):,.0f}" if "e+" in text and abs(value) < 1e7 else text
-
-
 def _error(one: ExpectedMeasurement) -> str:
     return f"{short(one.ahead.errors[0])} K"
 
@@ -144,17 +141,23 @@ class Measurement(Tab):
     simulations = {"measure": "Simulate fits"}  # noqa: RUF012
     files = {"measure": "measure", "fits": "measure"}  # noqa: RUF012
 
-    def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
+    def shown(self, closed: ClosedForms, answers: Answers) -> View:
         each, fits = expected(closed), simulated(answers)
-        first = next(iter(each.values()))
-        heads = ["quantity", "value", *(f"error, {name}" for name in each)]
-        counted = None if fits is None else fits.rows()
-        rows = [heads if counted is None else [*heads, "scatter of fits", "95 % intervals hold the truth"]]
-        for q, (name, unit) in enumerate(zip(first.fitted.names, first.fitted.units, strict=True)):
-            unit = unit.replace("erg / (cm2 s)", "erg/cm²/s")
-            row = [f"{name} ({unit})" if unit else name, _number(first.ahead.values[q], 4)]
-            row += [_number(one.ahead.errors[q], 2) for one in each.values()]
-            if counted is not None:
-                row += [_number(counted["scatter"][q], 2), percent(float(counted["coverage_95"][q]))]
-            rows.append(row)
-        return rows
+        known = next(iter(each.values()))
+        table = [
+            {"quantity": name, "unit": unit, "truth": value, **dict(zip(each, errors, strict=True))}
+            for name, unit, value, *errors in zip(
+                known.fitted.names,
+                known.fitted.units,
+                known.ahead.values,
+                *(one.ahead.errors for one in each.values()),
+                strict=True,
+            )
+        ]
+        counted = () if fits is None else ("scatter", "coverage_95")
+        if fits is not None:
+            table = [row | counts for row, counts in zip(table, records(fits.rows()), strict=True)]
+        verb = {one.name: one for one in COLUMNS}
+        errors = [replace(verb["error"], name=name, heading=f"error, {name}") for name in each]
+        columns = [verb["quantity"], verb["unit"], verb["truth"], *errors, *(verb[name] for name in counted)]
+        return View(self.title, columns, table)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from mauvecl.answers.verbs import VERBS
-from mauvecl.schema.tables import without_empty
+from mauvecl.schema.tables import View, without_empty
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -127,10 +127,16 @@ class Tab(ABC):
 
     def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
         """Return a small table as text with a header row; empty if there is nothing to report."""
-        if self.answer not in answers:
+        shown = self.shown(closed, answers)
+        if shown is None:
             return []
-        headings, cells = without_empty(*answers[self.answer].views[self.view].texts(FIXED))
+        headings, cells = without_empty(*shown.texts(FIXED))
         return [headings, *cells]
+
+    def shown(self, closed: ClosedForms, answers: Answers) -> View | None:
+        """Return the table below the pictures: by default a view of the simulated answer, if there is one."""
+        view: View | None = answers[self.answer].views[self.view] if self.answer in answers else None
+        return view
 
     def study(self, name: str, closed: ClosedForms, answers: Answers) -> Study:
         """Return the study that reproduces one of `files`: by default that of the answer it needs."""

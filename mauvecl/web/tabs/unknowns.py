@@ -6,12 +6,12 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import special
 
 from mauvecl.answers.detection.unknown_cost import spoken, unknown_cost
+from mauvecl.answers.detection.unknown_table import COLUMNS, power
 from mauvecl.noise.unknowns import NUISANCES, Amplitude
+from mauvecl.schema.tables import View
 from mauvecl.study.nuisances import NuisanceChoice
-from mauvecl.web.closed_forms import percent
 from mauvecl.web.figures import Canvas
 from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
@@ -41,11 +41,6 @@ def costs(closed: ClosedForms) -> tuple[float, list[Row]]:
 
 def _spread(prior: object) -> float | str:
     return prior.sd if isinstance(prior, Amplitude) and np.isfinite(prior.sd) else "free"
-
-
-def chance(snr: float, fap: float) -> float:
-    """Return the detection probability of a matched statistic with this S/N."""
-    return float(special.ndtr(snr + special.ndtri(fap)))
 
 
 class Cost(Picture):
@@ -93,9 +88,12 @@ class Unknown(Tab):
     )
     pictures = (Cost(),)
 
-    def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
+    def shown(self, closed: ClosedForms, answers: Answers) -> View:
         known, rows = costs(closed)
-        fap = closed.question.fap
-        heads = ["unknown", "S/N, not looked for", "S/N, marginalised", "then detected"]
         given: list[Row] = [("nothing: everything is known", known, known), *rows]
-        return [heads] + [[n, f"{a:.3g}", f"{b:.3g}", percent(chance(b, fap))] for n, a, b in given]
+        fap = closed.question.fap
+        table = [
+            {"unknown": name, "plain": plain, "marginalised": marginal, "detected": float(power(marginal, fap))}
+            for name, plain, marginal in given
+        ]
+        return View(self.title, [one for one in COLUMNS if one.name in table[0]], table)
