@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from mauvecl.answers.answer import Answer
+from mauvecl.answers.observations.neighbour_flares import COLUMNS as BLENDS
+from mauvecl.answers.observations.neighbour_flares import blended_stars, neighbour_flares
 from mauvecl.host.orbit.orbit import Orbit
 from mauvecl.host.orbit.targets import Target
 from mauvecl.host.stars.source import Source
@@ -327,11 +329,20 @@ class AnalyseAnswer(Answer):
 
     @property
     def messages(self) -> list[str]:
-        return [*([self.white] if self.white else []), *self.analysis.messages]
+        near = [
+            text
+            for case in (self.observed if self.study.has_neighbours else ())
+            if case.neighbours is not None
+            for text in case.neighbours.messages(case.label, case.instrument)
+        ]
+        return [*near, *([self.white] if self.white else []), *self.analysis.messages]
 
     @property
     def uses(self) -> tuple[Use, ...]:
         """Parts of the study that this answer uses: the instrument only for spectra of its pixels."""
+        blended: tuple[Use, ...] = ("instrument", "sky", "flare")
+        if self.study.has_neighbours:
+            return (*self.USES, *blended)
         return (*self.USES, *(("instrument", "sky") if self.analysis.spectra is not None else ()))
 
     @property
@@ -390,7 +401,13 @@ class AnalyseAnswer(Answer):
         tables = {"events": self.events, "frames": self.frames, "completeness": self.completeness,
                   "limits": self.limits, "noise": self.noise}  # fmt: skip
         of_spectra = {"measured": self.measured, "noise-per-pixel": self.pixels}
-        return tables | (of_spectra if self.analysis.spectra is not None else {})
+        blends = {"neighbour-flares": self.neighbour_flares} if self.study.has_neighbours else {}
+        return tables | (of_spectra if self.analysis.spectra is not None else {}) | blends
+
+    @cached_property
+    def neighbour_flares(self) -> QTable:
+        """One row per event and star in the fibre: the flare of that star which would look like the event."""
+        return neighbour_flares(self.study, self.rows)
 
     @property
     def views(self) -> list[View]:
@@ -404,9 +421,21 @@ class AnalyseAnswer(Answer):
         return [
             View(title, EVENTS, self.events) if one.events else View(nothing),
             *([View("Measured in the summed spectra of each event", MEASURED, self.measured)] if one.spectra else []),
+            *self._blends,
             View("Smallest flares that would have been detected, by injecting into these frames", LIMITS, self.limits),
             View("Noise of quiescent frames", NOISE, self.noise),
         ]
+
+    @property
+    def _blends(self) -> list[View]:
+        if not self.study.has_neighbours or not self.analysis.events:
+            return []
+        flare = self.study.flare
+        title = (
+            f"Flares of each star in the fibre that would look like these events: {flare.light().describe()}, "
+            f"amplitudes in the {flare.band} band, the light taken for that of all stars in the fibre"
+        )
+        return [View(title, BLENDS, self.neighbour_flares)]
 
     @property
     def remarks(self) -> list[str]:
@@ -454,6 +483,9 @@ def analyse(
     search = study.search
     model = frame_model(study, frames)
     jitters = search.spreads() or None
+    if study.has_neighbours:
+        # What is wrong with the star or its neighbours is refused before the search.
+        blended_stars(study)
     analysis = analyse_frames(
         frames, false_alarms=search.false_alarms, per=search.per, shape=search.shape, seed=study.run.seed,
         model=model if isinstance(model, FrameModel) else None, rank=search.sums, jitters=jitters,

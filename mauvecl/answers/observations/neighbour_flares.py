@@ -1,0 +1,87 @@
+"""Flares of neighbours that would look like an observed event."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from mauvecl.host.stars.flare import check_scales
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import Column, number, percent, table_of
+from mauvecl.study.cases import cases
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.answers.observations.analyse import EventRow
+    from mauvecl.host.stars.source import Source
+    from mauvecl.study.cases import Case
+    from mauvecl.study.study import Study
+
+
+@dataclass(frozen=True, eq=False)
+class BlendedStar:
+    """A star in the fibre: the target itself, or a neighbour within the fibre's radius."""
+
+    name: str
+    separation_arcsec: float
+    rise: float  # rise of all stars' light by a flare of unit amplitude on this star, relative to their light
+
+    def amplitude(self, event: EventRow) -> float:
+        """Return the amplitude of a flare on this star that raises the light as much as an event."""
+        return event.event.amplitude / self.rise if self.rise else float("inf")
+
+
+def blended_stars(study: Study) -> list[BlendedStar]:
+    """Return the stars in the fibre of a study's star, the star itself first.
+
+    Raises InputError unless the study has a single star.
+    """
+    if len(study.star) != 1:
+        raise InputError(
+            f"neighbours of observed frames with {len(study.star)} stars",
+            "the star that was observed, such as `star=G2V` with its magnitude",
+            key="star",
+            value=[star.library or str(star.file) for star in study.star],
+        )
+    (case,) = cases(study, swept=False)
+    check_scales(study.flare.light())
+    near, quiet = case.neighbours, case.quiet
+    assert near is not None
+    total = float((quiet.source_electrons + quiet.neighbour_electrons).sum())
+    stars = [BlendedStar(case.label, 0.0, _electrons(case, case.source) / total)]
+    for one in near.within(case.instrument):
+        rise = near.share * _electrons(case, one.source) / total
+        stars.append(BlendedStar(one.name, one.separation_arcsec, rise))
+    return stars
+
+
+def _electrons(case: Case, source: Source) -> float:
+    """Return the electrons per frame that a flare of unit amplitude adds to a star if all of its light enters."""
+    f = case.study.flare
+    flaring = source.flaring(1.0, spectrum=f.light(), band=f.band)
+    with_it, without = case.expect(flaring, source)
+    return float((with_it.source_electrons - without.source_electrons).sum())
+
+
+#: Columns of the table, for pairs of an event and a star.
+COLUMNS = (
+    Column("date", lambda pair: pair[0].date, "", "of the brightest frame of the event", "event at",
+           lambda text: text[:22], kind=str),
+    Column("ampl_rec", lambda pair: pair[0].event.amplitude, "", "largest rise of the light of all stars",
+           "rise of all light", percent(".3g")),
+    Column("star", lambda pair: pair[1].name, "", "star on which the flare would be", "star", kind=str),
+    Column("separation", lambda pair: pair[1].separation_arcsec, "arcsec", "from the observed star", "arcsec", ".4g"),
+    Column("amplitude", lambda pair: pair[1].amplitude(pair[0]), "", "rise of this star alone, in the flare's band, at "
+           "the brightest frame, for a flare that looks like the event", "flare of the star", percent(".4g")),
+    Column("equivalent_duration",
+           lambda pair: pair[0].event.equivalent_duration_s / pair[0].event.amplitude * pair[1].amplitude(pair[0]), "s",
+           "of that flare, in the flare's band", "ED (s)", number(".4g")),
+)  # fmt: skip
+
+
+def neighbour_flares(study: Study, events: Iterable[EventRow]) -> QTable:
+    """Return the flares of each star in the fibre that would look like each event."""
+    stars = blended_stars(study)
+    return table_of(COLUMNS, [(event, star) for event in events for star in stars], study=study.text())
