@@ -10,6 +10,11 @@ programs take turns; ratios are medians over rounds. Memory: growth of the peak 
 
 from __future__ import annotations
 
+import os
+
+# As the command line does: multiplications of small matrices lose by several threads.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import argparse
 import importlib.metadata
 import resource
@@ -29,7 +34,7 @@ from mauvecl.results.measurements.reduction import Reduction, drawn_sums
 
 #: Fits of the slower ways, and rounds.
 FRAMES, SLOW, ROUNDS = 10_000, 100, 5
-BLOCK = 16_384
+BLOCK, PART = 16_384, 2_500
 
 
 def main() -> None:
@@ -60,9 +65,12 @@ def main() -> None:
                     fit_sums(drawn_sums(values, reduction), model, reduction)
 
         def frames(count: int, lit=lit, model=model) -> None:
-            for start in range(0, count, BLOCK):
-                raw = engine.realise(lit, start=start, count=min(BLOCK, count - start), seed=1)
-                fit(raw, quiet, model)
+            def drawn(start: int) -> np.ndarray:
+                return engine.realise(lit, start=start, count=min(PART, count - start), seed=1)
+
+            with ThreadPoolExecutor(1) as ahead:
+                for raw in ahead.map(drawn, range(0, count, PART)):
+                    fit(raw, quiet, model)
 
         raw = engine.realise(lit, count=SLOW, seed=1)
         ways = {"mauvecl, estimates": (sums, options.count), "mauvecl, intervals": (frames, FRAMES)}
