@@ -17,6 +17,7 @@ from scipy import special
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Unit
+from mauvecl.schema.messages import Message
 from mauvecl.schema.physical import Duration, Exposure, SkyBrightness
 from mauvecl.schema.tables import Column, table_of
 
@@ -554,12 +555,13 @@ def expect(
     drawn = np.sqrt(plain.variance_dn2) / (n_frames * plain.gain_dn_per_electron)
     messages += negative_means_message(source, instrument, electrons, drawn, order)
     if signal == "paper" and plain.sky_electrons.any():
-        messages.append("S/N counts the zodiacal light as signal, as the MauveSim paper does.")
+        messages.append(Message("S/N counts the zodiacal light as signal, as the MauveSim paper does.", "paper signal"))
     if n_frames * instrument.frame_s > exposure * (1 + 1e-9):
-        messages.append(
+        text = (
             f"The exposure of {exposure:g} s is rounded up to {plain.exposure_s:g} s, "
             f"{n_frames} frame{'s' if n_frames > 1 else ''} of {instrument.frame_s:g} s."
         )
+        messages.append(Message(text, "rounded up"))
     if any(note.startswith("dereddened") for note in source.notes) and not any("redden" in h for h in source.history):
         messages.append(
             f"{source.name} was dereddened by its archive: it is brighter in the ultraviolet than as observed, unless "
@@ -620,14 +622,16 @@ def _saturation(x: Expectation) -> tuple[str, ...]:
         f"{100 * touched:.3g} % of exposures (closed form)"
     )
     if not x.saturated.any():
-        return (f"SATURATED at times: pixels of {name} come near {x.ceiling_dn:.0f} DN, and {often}.",)
+        text = f"SATURATED at times: pixels of {name} come near {x.ceiling_dn:.0f} DN, and {often}."
+        return (Message(text, "saturated"),)
     # First and last wavelength of each run of saturated pixels.
     steps = np.flatnonzero(np.diff(np.concatenate([[0], x.saturated.astype(np.int8), [0]])))
     runs = [f"{x.wavelength_nm[a]:.1f}-{x.wavelength_nm[b - 1]:.1f}" for a, b in steps.reshape(-1, 2)]
-    return (
+    text = (
         f"SATURATED: {int(x.saturated.sum())} of {x.saturated.size} pixels at {', '.join(runs)} nm reach "
-        f"{x.ceiling_dn:.0f} DN in a {x.frame_s:g} s frame of {name}; {advice}; {often}.",
+        f"{x.ceiling_dn:.0f} DN in a {x.frame_s:g} s frame of {name}; {advice}; {often}."
     )
+    return (Message(text, "saturated"),)
 
 
 def _faint_enough(electrons: Float, name: str) -> Float:

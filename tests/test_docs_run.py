@@ -40,6 +40,8 @@ REDUCED = {
     "visible": "--no-pictures --days 5",
     "plan": "--no-pictures --days 5 --completeness 'closed form' --report html",
     "calibrate": "--no-pictures",
+    "measure": "--no-pictures --fits 50",
+    "devices": "--no-rate",
     "realise": "-n 1000",
 }
 #: The same for commands whose own flags would contradict these.
@@ -49,6 +51,7 @@ INSTEAD = {
     "gaussian --star": f"{_FEWER} --sweep magnitude=6,8 --sweep exposure=5",
     "detect --fap 1e-8 --tails sampled": "--no-pictures -n 10000 --star G2V -m 7.4 --statistic matched",
     "realise --star G2V --magnitude 7.4 --amplitude 0.24 --exposure 5": "-n 10000",
+    "measure --star M3V --magnitude 9 --amplitude 2 --snr-per-bin": "--no-pictures --fits 10 --duration 400",
 }
 #: Python draws fewer as well.
 FEWER = {"1_000_000": "100_000", "injections.count=100": "injections.count=20"}

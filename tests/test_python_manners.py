@@ -10,6 +10,7 @@ from typing import Any
 import astropy.units as u
 import numpy as np
 import pytest
+from refusals import refused
 
 import mauvecl
 from mauvecl import (
@@ -32,7 +33,6 @@ from mauvecl import (
     simulate,
     snr,
 )
-from mauvecl.schema.errors import InputError
 
 
 def study(**settings: object) -> Study:
@@ -124,26 +124,24 @@ def test_whole_numbers_can_be_floats_and_tuples_single_values(engine: Engine) ->
 
 
 @pytest.mark.parametrize(
-    ("ask", "sentence"),
+    ("ask", "key", "value", "expected"),
     [
-        (lambda e, q, f: e.detect("G2V", [f], realisations=100, seed=1), "quiet = 'G2V', expected an Expectation"),
-        (lambda e, q, f: e.detect(q, ["flare"], realisations=100, seed=1), r"flares\[0\] = 'flare'"),
-        (lambda e, q, f: e.detect(q, [q, 0.24], realisations=100, seed=1), r"flares\[1\] = 0.24"),
-        (lambda e, q, f: e.snr(Source.from_library("G2V"), realisations=100, seed=1), "expectation = .*Source 'G2V'"),
-        (lambda e, q, f: e.realise("G2V", count=3, seed=1), "expectation = 'G2V', expected an Expectation"),
-        (lambda e, q, f: e.detect(q, f, realisations=1.5, seed=1), "realisations = 1.5, expected a whole number"),
-        (lambda e, q, f: e.detect(q, f, realisations="many", seed=1), "realisations = 'many', expected a whole number"),
-        (lambda e, q, f: Pool().snr("G2V", realisations=10, seed=1), "expectation = 'G2V', expected an Expectation"),
-        (lambda e, q, f: expect(7.4, "mauve", exposure=5), "source = 7.4, expected a Source or text"),
-        (lambda e, q, f: expect("G2V", "mauve", exposure=5), "expected a magnitude"),
-        (lambda e, q, f: expect("G2V", 3, exposure=5), "instrument = 3, expected an Instrument or text or a path"),
-        (lambda e, q, f: expect("G2V", "mauve", exposure=5, sky="dark"), "sky = 'dark', expected a Sky or 5 to 35 mag"),
+        (lambda e, q, f: e.detect("G2V", [f], realisations=100, seed=1), "quiet", "G2V", "an Expectation"),
+        (lambda e, q, f: e.detect(q, ["flare"], realisations=100, seed=1), "flares", "flare", "an Expectation"),
+        (lambda e, q, f: e.detect(q, [q, 0.24], realisations=100, seed=1), "flares", 0.24, "an Expectation"),
+        (lambda e, q, f: e.realise("G2V", count=3, seed=1), "expectation", "G2V", "an Expectation"),
+        (lambda e, q, f: e.detect(q, f, realisations=1.5, seed=1), "realisations", 1.5, "a whole number"),
+        (lambda e, q, f: e.detect(q, f, realisations="many", seed=1), "realisations", "many", "a whole number"),
+        (lambda e, q, f: Pool().snr("G2V", realisations=10, seed=1), "expectation", "G2V", "an Expectation"),
+        (lambda e, q, f: expect(7.4, "mauve", exposure=5), "source", 7.4, "a Source or text"),
+        (lambda e, q, f: expect("G2V", "mauve", exposure=5), "magnitude", None, "a magnitude"),
+        (lambda e, q, f: expect("G2V", 3, exposure=5), "instrument", 3, "an Instrument or text or a path"),
+        (lambda e, q, f: expect("G2V", "mauve", exposure=5, sky="dark"), "sky", "dark", "a Sky or 5 to 35 mag"),
     ],
 )
-def test_impossible_calls_raise(engine: Engine, ask: Callable[..., Any], sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence) as refused:
+def test_impossible_calls_raise(engine: Engine, ask: Callable[..., Any], key: str, value: Any, expected: str) -> None:
+    with refused(key, value=value, expected=expected):
         ask(engine, *pair())
-    assert "\n" not in str(refused.value)
 
 
 def test_names_are_accepted_for_stars_and_instruments() -> None:
@@ -190,7 +188,7 @@ def test_pictures_are_drawn_into_given_axes(engine: Engine, name: str) -> None:
     # One panel needs no grid, with or without a colour bar.
     if len(own.axes) > 1 and name != "map":
         figure = plt.figure()
-        with pytest.raises(InputError, match="not of a grid"):
+        with refused("ax"):
             made.plot(ax=figure.add_axes((0, 0, 1, 1)), **how)
         plt.close(figure)
 

@@ -267,8 +267,9 @@ def test_wrong_fields_of_records_raise(record: type[Record]) -> None:
 def test_attributes_cannot_be_set() -> None:
     study = mauvecl.Study()
     for thing, name in ((study, "star"), (study.run, "fap"), (mauvecl.Instrument.load("mauve"), "light_loss")):
-        with pytest.raises(InputError, match=name):
+        with pytest.raises(InputError) as error:
             setattr(thing, name, 1)
+        assert error.value.key == name
 
 
 def test_python_reports_missing_and_superfluous_arguments() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from mauvecl.noise.cumulants import Cumulants, stack_is_exact
 from mauvecl.noise.unknowns import PROCESSES
+from mauvecl.schema.messages import Message, of_kind
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -19,8 +20,8 @@ if TYPE_CHECKING:
 NOISY_DN = 1.0
 #: Tolerance for the rounding of a prior's limits.
 TINY = 1e-9
-#: First word of messages on saturation, and their largest number in an answer.
-SATURATED = "SATURATED"
+#: Kind of messages on saturation, and their largest number in an answer.
+SATURATED = "saturated"
 MAX_SATURATED = 12
 
 
@@ -31,7 +32,7 @@ def collect_messages(expectations: list[Expectation], processes: Processes | Non
     """
     texts = [message for x in expectations for message in (*_without_light(x), *x.messages, *_coarse(x))]
     outside = off_centre(expectations, processes) if processes else []
-    return worst_first([*(f"OUTSIDE THE PRIOR: {text}." for text in outside), *texts])
+    return worst_first([*(Message(f"OUTSIDE THE PRIOR: {text}.", "outside the prior") for text in outside), *texts])
 
 
 def off_centre(expectations: list[Expectation], processes: Processes) -> list[str]:
@@ -56,20 +57,24 @@ def _without_light(x: Expectation) -> tuple[str, ...]:
     if electrons >= 1.0:
         return ()
     return (
-        f"NO LIGHT: {x.name} gives {electrons:.2g} electrons in all {x.wavelength_nm.size} pixels of an exposure of "
-        f"{x.exposure_s:g} s: there is nothing to see of it, and its S/N is 0.",
+        Message(
+            f"NO LIGHT: {x.name} gives {electrons:.2g} electrons in all {x.wavelength_nm.size} pixels of an exposure "
+            f"of {x.exposure_s:g} s: there is nothing to see of it, and its S/N is 0.",
+            "no light",
+        ),
     )
 
 
 def worst_first(messages: Iterable[str]) -> list[str]:
     """Remove duplicates, put messages on saturation first, and summarise these beyond `MAX_SATURATED`."""
     once = list(dict.fromkeys(messages))
-    saturated = [text for text in once if text.startswith(SATURATED)]
+    saturated = of_kind(once, SATURATED)
+    others = [text for text in once if text not in set(saturated)]
     rest = len(saturated) - MAX_SATURATED
     if rest > 0:
-        more = f"{SATURATED}: pixels of {rest} more stars, flares or exposures of this answer saturate."
-        saturated = [*saturated[:MAX_SATURATED], more]
-    return saturated + [text for text in once if not text.startswith(SATURATED)]
+        more = f"SATURATED: pixels of {rest} more stars, flares or exposures of this answer saturate."
+        return [*saturated[:MAX_SATURATED], Message(more, SATURATED), *others]
+    return [*saturated, *others]
 
 
 def _coarse(x: Expectation) -> tuple[str, ...]:
@@ -80,6 +85,10 @@ def _coarse(x: Expectation) -> tuple[str, ...]:
     if not pixels:
         return ()
     return (
-        f"In {pixels} of {x.wavelength_nm.size} pixels of {x.name} a frame has too little noise for its rounding to "
-        "whole DN to be like noise: closed forms take it for noise, and are wrong there; simulations round each frame.",
+        Message(
+            f"In {pixels} of {x.wavelength_nm.size} pixels of {x.name} a frame has too little noise for its rounding "
+            "to whole DN to be like noise: closed forms take it for noise, and are wrong there; simulations round each "
+            "frame.",
+            "rounding",
+        ),
     )

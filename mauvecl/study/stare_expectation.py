@@ -17,6 +17,7 @@ from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.noise.priors import Normal, Prior
 from mauvecl.noise.unknowns import CHANGING, COURSES, PROCESSES, STARE_PROCESSES, Changing, Course, default_spreads
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.messages import Message
 from mauvecl.study.stare_section import EventChoice
 
 if TYPE_CHECKING:
@@ -144,7 +145,11 @@ def unused_lines(case: Case) -> list[str]:
     lines = check_contributions(case.events, case.stare.start_s, frame_s)
     if exposure_s != frame_s:
         lines.insert(
-            0, f"A stare is made of frames of {frame_s:g} s: observation.exposure_s = {exposure_s:g} s is not used."
+            0,
+            Message(
+                f"A stare is made of frames of {frame_s:g} s: observation.exposure_s = {exposure_s:g} s is not used.",
+                "not used",
+            ),
         )
     return lines
 
@@ -166,10 +171,11 @@ def orbit_lines(case: Case) -> list[str]:
 
 def threshold_line(title: str, threshold: float) -> str:
     """Return the message for a threshold that is raised because of trends that the search does not remove."""
-    return (
+    return Message(
         f"FALSE ALARMS of {title} come from what is unknown of the stare, too: the search does not marginalise over "
         "all of it (see search.cycle, slope, offset and window_s). The threshold of "
-        f"{threshold:.2f} allows for it, so that alarms are as often as asked for to a factor of 1.5."
+        f"{threshold:.2f} allows for it, so that alarms are as often as asked for to a factor of 1.5.",
+        "false alarms",
     )
 
 

@@ -10,6 +10,7 @@ from astropy.table import QTable
 
 from mauvecl.answers.detection.maps import detection_map
 from mauvecl.device.engine import Engine
+from mauvecl.schema.messages import of_kind
 from mauvecl.study.study import Study
 
 N = 20_000
@@ -88,4 +89,4 @@ def test_map_reports_saturation(engine: Engine) -> None:
     asked = study({"quantity": "magnitude", "values": [-2.0, 6.0]}, {"quantity": "sky", "values": [22.0]})
     found = detection_map(asked, engine)
     assert np.isfinite(found.probability[:, 0, 1]).all()
-    assert any("SATURATED" in message for message in found.messages)
+    assert of_kind(found.messages, "saturated")

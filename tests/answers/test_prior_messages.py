@@ -19,6 +19,7 @@ from mauvecl.cli.app import app
 from mauvecl.device.engine import Engine
 from mauvecl.noise.unknowns import PROCESSES
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.messages import of_kind
 from mauvecl.study.study import Study
 
 #: Priors that contain the expectation's own value, and that do not.
@@ -43,7 +44,7 @@ VERBS: dict[str, tuple[Callable[[Study, Engine], Any], dict[str, Any]]] = {
 def said(verb: str, engine: Engine, **sections: Any) -> list[str]:
     ask, needs = VERBS[verb]
     study = small(**({"star": [{"library": "G2V", "magnitude": 7.4}]} | needs | sections))
-    return [text for text in ask(study, engine).messages if text.startswith("OUTSIDE THE PRIOR")]
+    return of_kind(ask(study, engine).messages, "outside the prior")
 
 
 def test_every_prior_is_tested() -> None:

@@ -12,6 +12,7 @@ from mauvecl.answers.detection.detect import detect
 from mauvecl.answers.detection.maps import detection_map
 from mauvecl.answers.limits.limits import limiting_magnitude
 from mauvecl.device.engine import Engine
+from mauvecl.schema.messages import of_kind
 
 NUISANCES: dict[str, dict[str, Any]] = {
     "known": {},
@@ -35,7 +36,7 @@ def test_lowered_statistic_is_reported_if_simulation_lowers_it(
     )
     answer = detect(study, engine)
     (one,) = answer.stars
-    named = {text.split(" falls by ")[0].split()[-1] for text in answer.messages if text.startswith("WRONG SIGN")}
+    named = {text.split(" falls by ")[0].split()[-1] for text in of_kind(answer.messages, "wrong sign")}
     for statistic in ("uv_excess", "matched"):
         null, flare = (one.detection.distribution(statistic, k) for k in (None, 0))
         gap, error = flare.mean - null.mean, np.hypot(flare.std, null.std) / 100
@@ -56,7 +57,7 @@ def test_cases_include_lowered_and_raised_statistics(engine: Engine) -> None:
             **NUISANCES["both"],
         )
         answer = detect(study, engine)
-        found[temperature_k] = any(text.startswith("WRONG SIGN") for text in answer.messages)
+        found[temperature_k] = bool(of_kind(answer.messages, "wrong sign"))
         if found[temperature_k]:
             assert answer.table["probability"][0] < 0.01 < 0.9 < answer.table["probability"][1]
     assert found == {4000.0: True, 10_000.0: False}
@@ -76,8 +77,8 @@ def test_maps_and_limits_report_the_same_as_detect(engine: Engine, temperature_k
         },
         **NUISANCES["both"],
     }
-    named = [t for t in detect(small(**sections), engine).messages if t.startswith("WRONG SIGN")]
-    of_map = [t for t in detection_map(small(**sections), engine).messages if t.startswith("WRONG SIGN")]
+    named = of_kind(detect(small(**sections), engine).messages, "wrong sign")
+    of_map = of_kind(detection_map(small(**sections), engine).messages, "wrong sign")
     assert len(of_map) == len(named)
     # Of magnitudes, one so bright that most pixels saturate turns the sign.
     for of in ("amplitude", "exposure"):

@@ -15,6 +15,7 @@ from mauvecl.answers.limits.search import LimitSearch
 from mauvecl.device.engine import Engine
 from mauvecl.host.expectation import Expectation
 from mauvecl.results.requests.fap_checks import NoThresholdError
+from mauvecl.schema.messages import of_kind
 from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 
@@ -61,8 +62,9 @@ def test_threshold_exists_unless_a_value_is_too_probable(engine: Engine, seed: i
         for statistic in found.statistics:
             if at > fap:
                 refused += 1
-                with pytest.raises(NoThresholdError, match="no threshold of"):
+                with pytest.raises(NoThresholdError) as error:
                     found.threshold(fap, statistic)
+                assert (error.value.key, error.value.value) == ("fap", fap)
                 (seen,) = found.detection_probability(fap, statistic)
                 assert np.isnan([seen.value, seen.low, seen.high]).all()
                 # Those that exist hold what they promise.
@@ -99,7 +101,7 @@ def test_sampled_threshold_raises_as_well(engine: Engine) -> None:
     light[pixel] -= 0.5 * math.sqrt(light[pixel])
     quiet, flare = replace(quiet, source_electrons=light), replace(flare, source_electrons=light + 1.0)
     found = engine.detect(quiet, [flare], realisations=N, seed=1, statistics=("matched",), tails="sampled")
-    with pytest.raises(NoThresholdError, match="no threshold of"):
+    with pytest.raises(NoThresholdError):
         found.threshold(1e-4, "matched")
     assert np.isnan(found.table(1e-4)["fap_error"]).all()
 
@@ -134,18 +136,18 @@ def test_answers_report_missing_thresholds(engine: Engine) -> None:
     magnitude = at_the_rail() + 0.001
     answer = detect(study(magnitude), engine)
     assert np.isnan(answer.table["probability"]).all()
-    assert any(text.startswith("NO THRESHOLD: no threshold of matched") for text in answer.messages)
+    assert of_kind(answer.messages, "no threshold")
     axes = {"x": {"quantity": "magnitude", "values": [magnitude, magnitude + 3.0]},
             "y": {"quantity": "amplitude", "values": [1e-5, 2e-5]}}  # fmt: skip
     found = detection_map(study(magnitude, map=axes), engine)
     np.testing.assert_array_equal(np.isnan(found.probability[0]), [[True, False], [True, False]])
-    assert any(text.startswith("NO THRESHOLD: in 2 of 4 cells") for text in found.messages)
-    assert not any("every pixel that counts saturates" in text for text in found.messages)
+    (message,) = of_kind(found.messages, "no threshold")
+    assert "2 of 4" in message
 
 
 def test_limit_without_threshold_raises(engine: Engine) -> None:
     magnitude = at_the_rail() + 0.001
     asked = study(magnitude, limit={"of": "amplitude", "power": 0.05})
     search = LimitSearch(Case(asked), "matched", engine)
-    with pytest.raises(NoThresholdError, match="no threshold of matched"):
+    with pytest.raises(NoThresholdError):
         search.simulated(1e-5, 1)

@@ -29,6 +29,7 @@ from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
 from mauvecl.runs.pool import map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.messages import Message, of_kind
 from mauvecl.schema.physical import DAY_S
 from mauvecl.schema.tables import Column, View, number, table_of
 from mauvecl.study.cases import Case
@@ -250,7 +251,7 @@ class PlanAnswer(Answer):
     @property
     def messages(self) -> list[str]:
         """What saturates, which targets have no answer and why, what is extrapolated, what is said of visibility."""
-        lines = [text for text in collect_messages(self.inputs) if text.startswith(SATURATED)]
+        lines = of_kind(collect_messages(self.inputs), SATURATED)
         for case in self.observed:
             if case.neighbours is not None:
                 lines += case.neighbours.messages(case.label, case.instrument)
@@ -271,10 +272,11 @@ class PlanAnswer(Answer):
                 )
         study = self.study
         if study.plan.completeness == "closed form" and (study.stare.has_unknowns or study.nuisances.usual):
-            lines.append(
+            text = (
                 "FALSE ALARMS may be more than stated: the closed form takes the stare for known, and it has unknowns; "
                 "plan.completeness = 'injections' allows for them."
             )
+            lines.append(Message(text, "false alarms"))
         if study.plan.along_orbit and study.processes.particle_processes:
             lines.append("The rate of particles in [processes] is not used: it follows the orbit (plan.along_orbit).")
         lines += self.seen.messages

@@ -253,10 +253,10 @@ def detect(
             progress(len(stars), len(prepared))
     costs = [text for case, one in zip(prepared, stars, strict=True) for text in _template_costs(case, one)]
     answer = DetectAnswer(study, stars)
-    blinding = [f"{text[:-1]} ({star.title})." for star in stars for text in star.detection.messages]
-    blinding += [f"{t[:-1]} ({star.title})." for star in stars for t in star.detection.without_threshold(run.fap)]
-    blinding += [f"{t[:-1]} ({star.title})." for star in stars for t in star.detection.lowered]
-    messages = [*blinding, *collect_messages(expectations, study.processes)]
+    blinding = [one.about(star.title) for star in stars for one in star.detection.messages]
+    blinding += [one.about(star.title) for star in stars for one in star.detection.without_threshold(run.fap)]
+    blinding += [one.about(star.title) for star in stars for one in star.detection.lowered]
+    messages: list[str] = [*blinding, *collect_messages(expectations, study.processes)]
     errors = answer.table["fap_error"][np.isfinite(answer.table["fap_error"])]
     if not countable(run.fap, run.realisations) and errors.size:
         messages.append(

@@ -13,6 +13,7 @@ from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
 from mauvecl.results.requests.fap_checks import check_fap
 from mauvecl.schema.calls import validated
+from mauvecl.schema.messages import Message, of_kind
 from mauvecl.schema.tables import Column, View, table_of
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.cases import Case, cases
@@ -230,16 +231,20 @@ def _blinded(values: Arrays) -> list[str]:
     cells = int(np.isnan(form).sum())
     if not cells:
         return []
-    return [f"SATURATED: every pixel that counts saturates in {cells} of {form.size} cells: no number there."]
+    text = f"SATURATED: every pixel that counts saturates in {cells} of {form.size} cells: no number there."
+    return [Message(text, SATURATED)]
 
 
 def _without_threshold(run: Run, values: Arrays) -> list[str]:
     """Return a sentence for each statistic on cells where no threshold has the false-alarm probability, if any."""
     missing = np.isnan(values["probability"]) & ~np.isnan(values["closed_form"])
     return [
-        f"NO THRESHOLD: in {int(there.sum())} of {there.size} cells no threshold of {statistic} has a false-alarm "
-        f"probability of {run.fap:g}, because one value is more probable, as saturated pixels give it: no number "
-        "there; `mauvecl detect` names the probabilities that thresholds have."
+        Message(
+            f"NO THRESHOLD: in {int(there.sum())} of {there.size} cells no threshold of {statistic} has a false-alarm "
+            f"probability of {run.fap:g}, because one value is more probable, as saturated pixels give it: no number "
+            "there; `mauvecl detect` names the probabilities that thresholds have.",
+            "no threshold",
+        )
         for statistic, there in zip(run.statistics, missing, strict=True)
         if there.any()
     ]
@@ -249,8 +254,11 @@ def _wrong_sign(case: Case, lowered: set[Lowered], cells: int) -> list[str]:
     """Return a sentence for each weighted sum on the cells whose flare lowers it, if any."""
     how = "marginalised over unknowns, " if case.study.nuisances != NuisanceChoice() else ""
     return [
-        f"WRONG SIGN: {how}{statistic} falls with the flare in {number} of {cells} cells, and only higher values are "
-        "alarms: its detection probability says nothing of the flare there."
+        Message(
+            f"WRONG SIGN: {how}{statistic} falls with the flare in {number} of {cells} cells, and only higher values "
+            "are alarms: its detection probability says nothing of the flare there.",
+            "wrong sign",
+        )
         for statistic in case.study.run.statistics
         if (number := sum(name == statistic for name, *_ in lowered))
     ]
@@ -280,7 +288,7 @@ def _map(
         quiet, flares = group[0].quiet, group[0].expect(*(one.flaring(one.amplitudes[0]) for one in group))
         if not quiet.saturated.all():
             lowered.update(_fill(values, cells, group[0], flares, engine))
-        return quiet, len(cells), [text for text in collect_messages(flares) if text.startswith(SATURATED)]
+        return quiet, len(cells), of_kind(collect_messages(flares), SATURATED)
 
     done = 0
     for quiet, count, texts in map_in_order(engine, filled, _groups(case.study.map, x, y)):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, Amplitude
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.messages import Message
 from mauvecl.statistics.linear import Matched
 from mauvecl.statistics.nuisances import Nuisances, join_names
 from mauvecl.statistics.statistic import Setting
@@ -72,11 +73,12 @@ def cost_lines(costs: Sequence[Cost], nuisances: NuisanceChoice) -> list[str]:
     named = nuisances != NuisanceChoice()
     which = spoken(nuisances) if named else f"the usual unknowns ({spoken(_or_documented(nuisances))})"
     others = f", the faintest of {len(shown)}," if len(shown) > 1 else ""
-    return [
+    text = (
         f"What unknowns cost: {faintest.of}{others} has a matched S/N of {faintest.known:.3g} with everything known; "
         f"with {which} it is {faintest.plain:.2g} by the plain statistic and {faintest.marginal:.3g} marginalised "
         "(closed forms)."
-    ]
+    )
+    return [Message(text, "cost of unknowns")]
 
 
 def marginal_lines(nuisances: NuisanceChoice) -> list[str]:

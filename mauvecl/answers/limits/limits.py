@@ -16,6 +16,7 @@ from mauvecl.answers.neighbour_list import share_columns
 from mauvecl.results.requests.fap_checks import check_fap
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.messages import Message, of_kind
 from mauvecl.schema.tables import INTERVAL, Column, View, interval, records, table_of
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.cases import Case, cases
@@ -228,7 +229,7 @@ class LimitAnswer(Answer):
             ]
         )
         costs = [one.cost for one in self.limits if one.cost is not None]
-        failed = [f"NO LIMIT: {text}." for text in self.failed]
+        failed = [Message(f"NO LIMIT: {text}.", "no limit") for text in self.failed]
         return [*failed, *stars, *marginal_lines(self.study.nuisances), *cost_lines(costs, self.study.nuisances)]
 
     def as_json(self) -> dict[str, Any]:
@@ -276,7 +277,7 @@ def solve(case: Case, statistic: str, engine: Engine | Pool) -> Limit:
         curve=question.curve(value.value),
         at=case.at,
         unknown=question.unknown(theory) if isinstance(question, MarginalLimitSearch) else None,
-        messages=tuple(m for m in collect_messages([quiet, flare]) if m.startswith(SATURATED)),
+        messages=tuple(of_kind(collect_messages([quiet, flare]), SATURATED)),
         quiet=quiet,
         cost=unknown_cost(where, quiet, flare, study.nuisances, study.run.comparison()),
     )

@@ -11,6 +11,7 @@ import numpy as np
 from mauvecl.answers.answer import Answer
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.messages import Message
 from mauvecl.schema.physical import DAY_S, Wavelength
 from mauvecl.schema.tables import Column, View, table_of
 from mauvecl.study.cases import Case, cases
@@ -169,9 +170,20 @@ def exposure(
     if not answered:
         raise failed[0]
     exposures, seen = zip(*answered, strict=True)
-    long = [f"{e.star} needs more than a day: {np.ceil(e.exposure_s / DAY_S):.0f} exposures of a day at most, added up."
-            for e in exposures if e.exposure_s > DAY_S]  # fmt: skip
-    messages = [*(f"NO ANSWER: {error}." for error in failed), *collect_messages(list(seen)), *long]
+    long = [
+        Message(
+            f"{e.star} needs more than a day: {np.ceil(e.exposure_s / DAY_S):.0f} exposures of a day at most, added "
+            "up.",
+            "long exposure",
+        )
+        for e in exposures
+        if e.exposure_s > DAY_S
+    ]
+    messages = [
+        *(Message(f"NO ANSWER: {error}.", "no answer") for error in failed),
+        *collect_messages(list(seen)),
+        *long,
+    ]
     return ExposureAnswer(study, exposures, tuple(messages), seen)
 
 

@@ -21,6 +21,7 @@ from mauvecl.lightcurve.stares.stare_requests import Arrays
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.messages import Message
 from mauvecl.schema.physical import DAY_S
 from mauvecl.schema.tables import INTERVAL, Column, View, interval, number, percent, stacked, table_of
 from mauvecl.statistics.intervals import Interval
@@ -164,27 +165,30 @@ class StarCompleteness(InCell):
     @property
     def messages(self) -> list[str]:
         """Where drawn stares alarm more or less often than normal noise, and where flares saturate."""
-        messages = []
+        messages: list[str] = []
         if not np.isnan(self.simulated.value) and not self.simulated.low <= self.asked <= self.simulated.high:
-            messages.append(
+            text = (
                 f"FALSE ALARMS of {self.title} are not those of normal noise: {self.simulated.value:.3g} per star-day "
                 f"at {self.checked:.2f} in drawn stares, {self.asked:.3g} by importance sampling: the search does not "
                 "marginalise over what changes in the stare (see [search] frame, cycle, window_s), or set "
                 'search.null = "counted".'
             )
+            messages.append(Message(text, "false alarms"))
         # The probability of at least this many alarms if the expected number is right.
         if scipy.special.gammainc(max(self.alarmed, 1e-300), self.expected) < LEAST_CHANCE:
-            messages.append(
+            text = (
                 f"FALSE ALARMS of {self.title} are more than were asked for: {self.alarmed} of the drawn stares have "
                 f"one at the threshold, {self.expected:.2g} should: set search.null = 'counted' with more search.nulls."
             )
+            messages.append(Message(text, "false alarms"))
         if self.shifted:
             messages.append(threshold_line(self.title, self.threshold.value))
         if self.injected.amplitudes.max() > self.saturates:
-            messages.append(
+            text = (
                 f"SATURATED: flares of {self.title} with an amplitude above {self.saturates:.3g} saturate a pixel, "
                 "which injections leave out."
             )
+            messages.append(Message(text, "saturated"))
         return messages
 
 

@@ -22,6 +22,7 @@ from mauvecl.lightcurve.stares.light_curves import Draw, LightCurves, StareExpec
 from mauvecl.runs.checkpoint import kept
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.messages import Message
 from mauvecl.schema.tables import Column, View, number, percent, records, table_of
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import place_columns
@@ -407,7 +408,8 @@ def stare(
     for one in drawn:
         cut = int(np.count_nonzero(one.staring.quality))
         if cut:
-            messages.insert(0, f"SATURATED: {cut} frames of the stare at {one.title}; their quality is 1.")
+            text = f"SATURATED: {cut} frames of the stare at {one.title}; their quality is 1."
+            messages.insert(0, Message(text, "saturated"))
     return StareAnswer(study, drawn, messages)
 
 
@@ -459,7 +461,7 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> SearchResu
         tail = kept(checkpoint, ("threshold", survey, study.text()), computed)
         threshold = float(tail["threshold"])
     except InputError as error:
-        return f"{case.label} is not searched: {error}."
+        return Message(f"{case.label} is not searched: {error}.", "not searched")
     scale = _log_energy(case)
     raised = alarms(survey, known.templates, draw(survey.components), threshold, scale)
     energies, nearest = [], []

@@ -19,6 +19,7 @@ from mauvecl.results.requests.fap_checks import NoThresholdError, Tails, check_a
 from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.schema.calls import validated
 from mauvecl.schema.fields import Range
+from mauvecl.schema.messages import Message
 from mauvecl.schema.tables import INTERVAL, Column, interval, number, table_of
 from mauvecl.statistics.detection_interval import detection_interval
 from mauvecl.statistics.intervals import Interval, central_counts, clopper_pearson
@@ -177,7 +178,7 @@ class Detection(Drawable, ContentEquality, Hypotheses):
             probabilities.append(detection_interval(above, counted.n, fap, shared))
         return probabilities
 
-    def without_threshold(self, fap: float) -> tuple[str, ...]:
+    def without_threshold(self, fap: float) -> tuple[Message, ...]:
         """Return a sentence for each statistic of which no threshold has a false-alarm probability."""
         sentences = []
         for statistic in self.statistics:
@@ -185,7 +186,7 @@ class Detection(Drawable, ContentEquality, Hypotheses):
                 try:
                     self._cut(fap, statistic, template)
                 except NoThresholdError as error:
-                    sentences.append(f"NO THRESHOLD: {error}.")
+                    sentences.append(Message(f"NO THRESHOLD: {error}.", "no threshold"))
         return tuple(dict.fromkeys(sentences))
 
     @staticmethod

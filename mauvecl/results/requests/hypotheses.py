@@ -14,6 +14,7 @@ from mauvecl.noise.factor_distributions import FactorDistributions
 from mauvecl.noise.scene import Scene
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.messages import Message
 from mauvecl.statistics.distributions import Form
 from mauvecl.statistics.linear import Linear, Matched
 from mauvecl.statistics.nuisances import Nuisances
@@ -110,16 +111,19 @@ class Hypotheses:
         return tuple(k for k, x in enumerate(self.flares) if x.saturated[used].all())
 
     @property
-    def messages(self) -> tuple[str, ...]:
+    def messages(self) -> tuple[Message, ...]:
         """Remarks on saturating flares."""
         return tuple(
-            f"SATURATED: flare {k + 1} saturates every pixel of {self.quiet.name} that counts: what is recorded no "
-            "longer depends on the flare, and no number is given."
+            Message(
+                f"SATURATED: flare {k + 1} saturates every pixel of {self.quiet.name} that counts: what is recorded no "
+                "longer depends on the flare, and no number is given.",
+                "saturated",
+            )
             for k in self.blinding
         )
 
     @cached_property
-    def lowered(self) -> tuple[str, ...]:
+    def lowered(self) -> tuple[Message, ...]:
         """Sentences on weighted sums that a flare lowers, so that it is never detected however bright it is."""
         sentences = []
         for name in self.statistics:
@@ -130,11 +134,12 @@ class Hypotheses:
                 if falls:
                     matched = Matched().closed_form(self.setting, flare, flare)
                     how = "marginalised over unknowns, " if self.nuisances else ""
-                    sentences.append(
+                    text = (
                         f"WRONG SIGN: {how}{name} falls by {falls:.3g} standard deviations with flare {k + 1} of "
                         f"{self.quiet.name}, and only higher values are alarms: its detection probability says nothing "
                         f"of the flare, which matched has at {matched.mean / matched.std:.3g}."
                     )
+                    sentences.append(Message(text, "wrong sign"))
         return tuple(sentences)
 
     def fall(self, statistic: str, flare: int) -> float:
