@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.measurements.measure import measure
     from mauvecl.answers.observations.analyse import analyse
     from mauvecl.answers.observations.calibrate import calibrate
+    from mauvecl.answers.observations.change import change
     from mauvecl.answers.signal.exposures import exposure, exposure_for
     from mauvecl.answers.signal.simulate import simulate
     from mauvecl.answers.signal.snr import snr
@@ -110,6 +111,7 @@ __all__ = [
     "analyse",
     "bulk",
     "calibrate",
+    "change",
     "departures",
     "detect",
     "detection_map",

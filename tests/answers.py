@@ -27,6 +27,7 @@ QUICK: dict[str, list[str]] = {
     "gaussian": ['sweep.axes=[{quantity="exposure", values=[50, 300]}]'],
     "map": ['map.x={quantity="magnitude", start=6, stop=8, steps=2}',
             'map.y={quantity="amplitude", start=0.1, stop=0.3, steps=2}'],
+    "change": ["nuisances.dark=0.1"],
     "visible": ['orbit.targets=["eps Eri", "AU Mic"]', "orbit.days=5"],
     "plan": ["plan.targets=[{name = 'eps Eri'}]", "orbit.days=31", "plan.completeness='closed form'"],
 }  # fmt: skip

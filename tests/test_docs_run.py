@@ -42,6 +42,7 @@ REDUCED = {
     "calibrate": "--no-pictures",
     "measure": "--no-pictures --fits 50",
     "devices": "--no-rate",
+    "change": "--no-pictures --set change.trials=10 --set change.steps=2 --set change.period_fap=0.1",
     "realise": "-n 1000",
 }
 #: The same for commands whose own flags would contradict these.

@@ -313,6 +313,20 @@ VERBS: dict[str, Verb] = {
             without="observation.exposure_s",
         ),
         Verb(
+            "change",
+            "observations.change",
+            """Find the smallest change between visits that can be seen.
+
+    Of lines, bands, Balmer jump, colour, or of a spectrum from a file; with `--periods`, which periods are recovered
+    from visits that the orbit allows.
+
+    Examples: mauvecl change --star M3V -m 9 --exposure 600 --nuisance dark=free --nuisance light=0.02
+
+    mauvecl change --star K5V -m 8 --exposure 300 --visits 40 --periods --look-at "eps Eri" --days 60
+    """,
+            ("change", "limit.power", "run.fap", "run.seed", *NUISANCES, *ORBIT, "orbit.targets", "sweep"),
+        ),
+        Verb(
             "calibrate",
             "observations.calibrate",
             """Fit an instrument to frames of standard stars and dark frames.

@@ -16,6 +16,7 @@ from mauvecl.schema.fields import AnyUnit
 from mauvecl.schema.records import input_error
 from mauvecl.schema.text import shortened
 from mauvecl.study.calibrations import CalibrateQuestion, drop_default_calibration, resolve_calibration_paths
+from mauvecl.study.changes import ChangeQuestion, drop_default_change, resolve_change_paths
 from mauvecl.study.data import DataChoice, drop_default_data, resolve_data_paths
 from mauvecl.study.flare_light import drop_default_spectrum, resolve_spectrum_paths
 from mauvecl.study.measurements import MeasureQuestion, drop_default_measure
@@ -81,6 +82,7 @@ class Study(Section):
     measure: MeasureQuestion = MeasureQuestion()
     data: DataChoice = DataChoice()
     calibrate: CalibrateQuestion = CalibrateQuestion()
+    change: ChangeQuestion = ChangeQuestion()
 
     @model_validator(mode="after")
     def _one_photosphere(self) -> Self:
@@ -127,6 +129,7 @@ class Study(Section):
         resolve_plan_paths(data, path.parent)
         resolve_data_paths(data, path.parent)
         resolve_calibration_paths(data, path.parent)
+        resolve_change_paths(data, path.parent)
         resolve_spectrum_paths(data, path.parent)
         return cls.build(data, path.name)
 
@@ -196,6 +199,7 @@ class Study(Section):
         drop_default_measure(data, self.measure)
         drop_default_data(data, self)
         drop_default_calibration(data, self)
+        drop_default_change(data, self)
         drop_default_spectrum(data, self.flare.spectrum)
         for section in ("processes", "campaign"):
             if not data[section]:

@@ -27,7 +27,7 @@ TOGETHER = 2
 #: Exit codes of the reading process.
 _REFUSED, _NO_ROOM = 2, 3
 #: What a source tells of itself beside its numbers.
-WORDS = ("name", "origin", "notes", "told", "measured_nm", "unscaled")
+WORDS = ("name", "origin", "notes", "messages", "measured_nm", "unscaled")
 _turns = threading.BoundedSemaphore(TOGETHER)
 
 
@@ -61,7 +61,7 @@ def read_limited(content: bytes) -> Source:
             words["name"],
             words["origin"],
             tuple(words["notes"]),
-            messages=tuple(words["told"]),
+            messages=tuple(words["messages"]),
             measured_nm=None if measured is None else (measured[0], measured[1]),
             unscaled=words["unscaled"],
         )

@@ -13,6 +13,7 @@ from mauvecl.answers.detection import maps
 from mauvecl.answers.detection.detect import DetectAnswer, detect
 from mauvecl.answers.limits.limits import limit
 from mauvecl.answers.measurements.measure import MeasureAnswer, measure
+from mauvecl.answers.observations.change import change
 from mauvecl.answers.signal.snr import SnrAnswer, snr
 from mauvecl.answers.stares.inject import InjectAnswer, inject
 from mauvecl.host.orbit.targets import Target
@@ -101,6 +102,7 @@ SIMULATIONS: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
     "limit": lambda study, pool: {"limit": limit(study, pool)},
     "map": lambda study, pool: {"map": map_around(study, pool)},
     "measure": lambda study, pool: {"measure": fits(study, pool)},
+    "change": lambda study, pool: {"change": change(study)},
     "completeness": lambda study, pool: {"completeness": completeness(study, pool)},
     "visible": lambda study, pool: _visible(study),
     "plan": lambda study, pool: {"plan": campaign_plan(study)},

@@ -24,6 +24,7 @@ STATED = {
     "simulate": USUAL + REST,
     "snr": USUAL + REST,
     "exposure": USUAL[:-2],
+    "change": USUAL + "everything known",
     "calibrate": USUAL[:-2],
     "analyse": "flares of the shape davenport2014; noise as measured; seed 1",
     "visible": ORBIT,

@@ -589,6 +589,8 @@ COMMANDS = {
     "map": ("map", [], "map.ecsv"),
     "measure": ("measure", [], "measure.ecsv"),
     "fits": ("measure", [], "fits.ecsv"),
+    "change": ("change", [], "change.ecsv"),
+    "indices": ("change", [], "indices.ecsv"),
     "completeness": ("inject", [], "completeness.ecsv"),
     "limits": ("inject", [], "limits.ecsv"),
     "visible": ("visible", [], "visible.ecsv"),

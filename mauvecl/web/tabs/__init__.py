@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mauvecl.web.tabs.change import Change
 from mauvecl.web.tabs.compare import Compare
 from mauvecl.web.tabs.completeness import Completeness
 from mauvecl.web.tabs.detection import Detection
@@ -26,6 +27,7 @@ TABS: dict[str, Tab] = {
         Limit(),
         Measurement(),
         Unknown(),
+        Change(),
         Completeness(),
         Visibility(),
         Plan(),

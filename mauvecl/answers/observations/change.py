@@ -1,0 +1,355 @@
+"""Smallest detectable changes of stars between visits, line indices, and periods that are recovered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.answers.answer import Answer, InCell
+from mauvecl.answers.campaigns.visible import visible
+from mauvecl.host.stars.source import Source
+from mauvecl.observations.changes.indices import INDICES, Change, IndexValue, covered_indices, flux_per_dn
+from mauvecl.observations.changes.periods import Recovery, recover_periods, visit_times_d
+from mauvecl.observations.changes.smallest import Smallest, error_of_change, error_of_index, smallest_change
+from mauvecl.schema.calls import validated
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import Column, View, number, percent, table_of
+from mauvecl.study.cases import Case, cases
+from mauvecl.study.labels import place_columns
+from mauvecl.study.messages import collect_messages
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from astropy.table import QTable, Table
+
+    from mauvecl.device.engine import Engine
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.runs.pool import Pool
+    from mauvecl.study.assumptions import Use
+    from mauvecl.study.study import Study
+
+#: Magnitudes around that of the star at which changes are computed.
+MAGNITUDES = np.arange(-4.0, 4.01, 0.5)
+#: Semi-amplitudes of the map of periods, in standard errors of a visit.
+AMPLITUDES = (0.4, 4.0)
+
+
+@dataclass(frozen=True, eq=False)
+class ChangeRow(InCell):
+    """One change of one star.
+
+    Attributes
+    ----------
+    change : Change
+    error, error_known : float
+        Standard error of one visit, with unknowns marginalised over and with everything known.
+    smallest : Smallest
+        In the unit of the change.
+    """
+
+    change: Change
+    error: float
+    error_known: float
+    smallest: Smallest
+
+
+@dataclass(frozen=True, eq=False)
+class IndexRow(InCell):
+    """One line index of one star, with its errors in one exposure."""
+
+    value: IndexValue
+    error: float
+    error_known: float
+    wavelength_nm: NDArray[np.float64]  # of the pixels
+    flux: NDArray[np.float64]  # mean of the exposure, erg s-1 cm-2 nm-1
+
+    @property
+    def snr(self) -> float:
+        """Index over its error; negative in absorption."""
+        return self.value.value / self.error_known
+
+
+@dataclass(frozen=True, eq=False)
+class PeriodRow(InCell):
+    """Recovered periods of one change of one star."""
+
+    change: Change
+    error: float
+    recovery: Recovery
+
+    def shares(self, which: str) -> NDArray[np.float64]:
+        """Return a value of the intervals of all cells, one row of periods after the other."""
+        return np.array([[getattr(one, which) for one in part] for part in self.recovery.recovered]).ravel()
+
+
+def _amount(value: float, unit: str) -> str:
+    if value != value or np.isinf(value):
+        return "hidden"
+    return f"{100 * value:.3g} %" if not unit else f"{value:.3g} {unit}"
+
+
+#: Columns of the table of changes.
+COLUMNS = (
+    Column("change", "change.name", "", "what changes", "change", kind=str),
+    Column("unit", "change.unit", "", "unit of the change and its errors; empty if relative", kind=str),
+    Column("error", "error", "", "standard error of one visit, unknowns marginalised; inf: hidden by them",
+           "error of a visit", _amount, ("unit",)),
+    Column("error_known", "error_known", "", "the same with everything known", "all known", _amount, ("unit",)),
+    Column("smallest", "smallest.one", "", "smallest detected difference of one visit from the others",
+           "smallest change", _amount, ("unit",)),
+    Column("smallest_scatter", "smallest.scatter", "", "smallest detected standard deviation between visits",
+           "smallest scatter", _amount, ("unit",)),
+    Column("meaning", "change.meaning", "", "what a change of one unit is", "of", kind=str),
+)  # fmt: skip
+#: Columns of the table of indices.
+INDEX_COLUMNS = (
+    Column("index", "value.index.name", "", "line or lines", "index", kind=str),
+    Column("flux", "value.value", "erg / (s cm2)", "flux in the band above the continuum; absorption is negative",
+           "flux", ".3g"),
+    Column("error", "error", "erg / (s cm2)", "standard deviation in one exposure with unknowns of finite spread; inf: "
+           "a free unknown changes it", "error", lambda value: f"{value:.2g}" if np.isfinite(value) else "free"),
+    Column("error_known", "error_known", "erg / (s cm2)", "the same with everything known", "all known", ".2g"),
+    Column("snr", "snr", "", "index over its error with everything known", "S/N, all known", ".3g"),
+    Column("equivalent_width", "value.equivalent_width_nm", "nm", "positive in emission", "EW (nm)", ".3g"),
+    Column("captured", "value.captured", "", "share of a line's flux that the index holds at this resolution",
+           "captured", percent(".0f")),
+    Column("band_low", lambda row: row.value.index.band_nm[0], "nm", "lower end of the band"),
+    Column("band_high", lambda row: row.value.index.band_nm[1], "nm", "upper end"),
+    Column("published", "value.index.published", "", "usual definition at higher resolution, with its source",
+           kind=str),
+)  # fmt: skip
+#: Columns of the changes against magnitude.
+MAGNITUDE_COLUMNS = (
+    Column("magnitude", "magnitude", "mag", "of the star in its band"),
+    Column("change", "row.change.name", "", "what changes", kind=str),
+    Column("unit", "row.change.unit", "", "of the change; empty if relative", kind=str),
+    Column("smallest", "row.smallest.one", "", "smallest detected difference of one visit from the others"),
+)
+#: Columns of the recovered periods.
+PERIOD_COLUMNS = (
+    Column("change", "change.name", "", "what varies", "change", kind=str),
+    Column("unit", "change.unit", "", "of the amplitude; empty if relative", kind=str),
+    Column("period", lambda row: np.tile(row.recovery.periods_d, row.recovery.amplitudes.size), "d", "of the sinusoid",
+           "period (d)", number(".3g")),
+    Column("amplitude", lambda row: row.error * np.repeat(row.recovery.amplitudes, row.recovery.periods_d.size), "",
+           "semi-amplitude", "semi-amplitude", _amount, ("unit",)),
+    Column("amplitude_errors", lambda row: np.repeat(row.recovery.amplitudes, row.recovery.periods_d.size), "",
+           "the same in standard errors of a visit", "in errors", ".3g"),
+    Column("recovered", lambda row: row.shares("value"), "", "share of periods that are recovered", "recovered",
+           percent(".0f")),
+    Column("recovered_low", lambda row: row.shares("low"), "", "its 95 % interval, lower end"),
+    Column("recovered_high", lambda row: row.shares("high"), "", "upper end"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class ChangeAnswer(Answer):
+    """The answer of `change`.
+
+    Attributes
+    ----------
+    study : Study
+    changes : list of ChangeRow
+        Every change of every star in every cell of the sweep.
+    indices : list of IndexRow
+    along : list of (float, ChangeRow)
+        Changes of stars at other magnitudes.
+    periods : list of PeriodRow
+        Empty unless the study asks for them.
+    expectations : list of Expectation
+    """
+
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "nuisances")
+    JSON: ClassVar[Mapping[str, str]] = {"rows": "table", "indices": "index_table"}
+
+    study: Study
+    changes: list[ChangeRow]
+    indices: list[IndexRow]
+    along: list[tuple[float, ChangeRow]]
+    periods: list[PeriodRow]
+    expectations: list[Expectation]
+
+    @property
+    def uses(self) -> tuple[Use, ...]:
+        """Parts of the study that this answer uses: orbit and seed only for periods."""
+        return (*self.USES, "orbit", "seed") if self.periods else self.USES
+
+    @property
+    def _place(self) -> tuple[Column, ...]:
+        return place_columns(self.study)
+
+    @cached_property
+    def table(self) -> QTable:
+        """One row per star, cell and change."""
+        about = {"visits": self.study.change.visits, "fap": self.study.run.fap, "power": self.study.limit.power}
+        return table_of((*self._place, *COLUMNS), self.changes, **about, study=self.study.text())
+
+    @cached_property
+    def index_table(self) -> QTable:
+        """One row per star, cell and line index."""
+        return table_of((*self._place, *INDEX_COLUMNS), self.indices)
+
+    @cached_property
+    def magnitude_table(self) -> QTable:
+        """One row per star, cell, change and magnitude."""
+        place = (column.of(lambda row: row["row"]) for column in self._place if column.name != "magnitude")
+        rows = [{"magnitude": magnitude, "row": row} for magnitude, row in self.along]
+        columns = (replace(one, get=_inner(str(one.get))) for one in MAGNITUDE_COLUMNS)
+        return table_of((*place, *columns), rows)
+
+    @cached_property
+    def period_table(self) -> QTable:
+        """One row per star, cell, change, amplitude and period."""
+        return table_of((*self._place, *PERIOD_COLUMNS), self.periods, fap=self.study.change.period_fap)
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """Changes, indices, changes against magnitude, and periods."""
+        found: dict[str, Table] = {"change": self.table, "indices": self.index_table}
+        if self.along:
+            found["magnitudes"] = self.magnitude_table
+        if self.periods:
+            found["periods"] = self.period_table
+        return found
+
+    @property
+    def views(self) -> list[View]:
+        asked, o = self.study.change, self.study.observation
+        visits = "two visits" if asked.visits == 2 else f"{asked.visits} visits"
+        title = (
+            f"Smallest changes between {visits} of {o.exposure_s:g} s, at a false-alarm probability of "
+            f"{self.study.run.fap:g} and a power of {self.study.limit.power:g}"
+        )
+        views = [
+            View(title, (*self._place, *COLUMNS), self.table),
+            View(f"Line indices in {o.exposure_s:g} s", (*self._place, *INDEX_COLUMNS), self.index_table),
+        ]
+        if self.periods:
+            first = self.period_table[self.period_table["change"] == self.periods[0].change.name]
+            title = f"Periods of {self.periods[0].change.name} that {asked.visits} visits recover"
+            views.append(View(title, (*self._place, *PERIOD_COLUMNS), first))
+        return views
+
+    @property
+    def messages(self) -> list[str]:
+        lines = collect_messages(self.expectations)
+        hidden = dict.fromkeys(f"{one.title}: {one.change.name}" for one in self.changes if np.isinf(one.error))
+        lines += [f"HIDDEN by what is unknown: {text}." for text in hidden]
+        left = [name for name in INDICES if name not in {one.value.index.name for one in self.indices}]
+        if left:
+            lines.append(f"The pixels do not cover the line indices {', '.join(left)}.")
+        lines.append(
+            "Bands of the line indices are wider than published ones, since Mauve resolves 13 nm: their widths are an "
+            "assumption; the table of indices names the published ones."
+        )
+        return lines
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return self.expectations
+
+
+def _inner(path: str) -> Callable[[dict[str, Any]], Any]:
+    """Return a function that follows a path of keys and attributes."""
+    first, *rest = path.split(".")
+
+    def get(row: dict[str, Any]) -> Any:
+        value = row[first]
+        for name in rest:
+            value = getattr(value, name)
+        return value
+
+    return get
+
+
+@validated
+def change(
+    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
+) -> ChangeAnswer:
+    """Compute the smallest changes of a study's stars between visits that are detected.
+
+    Parameters
+    ----------
+    study : Study
+        Its ``change`` says which changes, and how many visits; ``run.fap`` and ``limit.power`` at which probabilities;
+        ``nuisances`` what is unknown in each visit.
+    engine : Engine or Pool, optional
+        Not used: errors are closed forms, and periodograms are simulated on the host.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in stars and cells of the sweep.
+
+    Raises
+    ------
+    InputError
+        For an unknown change, or periods without a target.
+
+    Examples
+    --------
+    >>> from mauvecl import Study, change
+    >>> settings = ["star=[{library='M3V', magnitude=9}]", "observation.exposure_s=600", "change.of=['200-320']"]
+    >>> answer = change(Study().with_settings(settings))
+    >>> answer.table["change"].tolist()
+    ['200-320']
+    """
+    asked = study.change
+    file = None if asked.file is None else Source.read(asked.file)
+    prepared = cases(study)
+    times = _visits(study) if asked.periods else None
+    rows, indices, along, periods = [], [], list[tuple[float, ChangeRow]](), []
+    for done, case in enumerate(prepared, 1):
+        own = _changes(case, file)
+        rows += own
+        indices += _indices(case)
+        magnitude = case.star.magnitude
+        if magnitude is not None:
+            for step in MAGNITUDES:
+                moved = case.with_value("magnitude", float(magnitude + step))
+                along += [(float(magnitude + step), row) for row in _changes(moved, file)]
+        if times is not None:
+            recovery = recover_periods(
+                times, np.geomspace(asked.shortest_d, asked.longest_d, asked.steps),
+                np.geomspace(*AMPLITUDES, asked.steps), fap=asked.period_fap, trials=asked.trials, seed=study.run.seed,
+            )  # fmt: skip
+            # The recovery depends on the amplitude in errors alone, so that one map serves all changes.
+            periods += [PeriodRow(one.label, one.at, one.change, one.error, recovery) for one in own]
+        if progress is not None:
+            progress(done, len(prepared))
+    return ChangeAnswer(study, rows, indices, along, periods, [case.quiet for case in prepared])
+
+
+def _changes(case: Case, file: Source | None) -> list[ChangeRow]:
+    """Return the smallest detectable changes of a case's star."""
+    study, quiet, unknown = case.study, case.quiet, case.unknowns()
+    unit = smallest_change(1.0, study.change.visits, study.run.fap, study.limit.power)
+    rows = []
+    for name in study.change.of:
+        one = Change.named(name, case.source, quiet, case.instrument, study.observation.order, file, study.change.band)
+        error, known = error_of_change(one.counts_dn, quiet, unknown), error_of_change(one.counts_dn, quiet, None)
+        smallest = Smallest(error * unit.one, error * unit.scatter)
+        rows.append(ChangeRow(case.label, case.at, one, error, known, smallest))
+    return rows
+
+
+def _indices(case: Case) -> list[IndexRow]:
+    quiet, unknown = case.quiet, case.unknowns()
+    rows = []
+    for index in covered_indices(quiet):
+        value = IndexValue.of(index, quiet, case.instrument, case.study.observation.order)
+        error, known = (error_of_index(value.weights, quiet, one) for one in (unknown, None))
+        flux = flux_per_dn(quiet, case.instrument) * quiet.signal_dn
+        rows.append(IndexRow(case.label, case.at, value, error, known, quiet.wavelength_nm, flux))
+    return rows
+
+
+def _visits(study: Study) -> NDArray[np.float64]:
+    """Draw the times of visits to the first target of a study's orbit."""
+    if not study.orbit.targets:
+        raise InputError("periods need a target", "`orbit.targets`", key="orbit.targets")
+    first = study.orbit.model_copy(update={"targets": study.orbit.targets[:1]})
+    seen = visible(study.model_copy(update={"orbit": first}))
+    return visit_times_d(seen.visibility.windows(0), study.change.visits, study.observation.exposure_s, study.run.seed)
