@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, InCell
-from mauvecl.answers.campaigns.visible import visible
+from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.host.stars.source import Source
 from mauvecl.observations.changes.indices import INDICES, Change, IndexValue, covered_indices, flux_per_dn
 from mauvecl.observations.changes.periods import Recovery, recover_periods, visit_times_d
@@ -21,6 +21,7 @@ from mauvecl.schema.tables import Column, View, number, percent, table_of
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import place_columns
 from mauvecl.study.messages import collect_messages
+from mauvecl.study.orbits import targets_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -350,6 +351,6 @@ def _visits(study: Study) -> NDArray[np.float64]:
     """Draw the times of visits to the first target of a study's orbit."""
     if not study.orbit.targets:
         raise InputError("periods need a target", "`orbit.targets`", key="orbit.targets")
-    first = study.orbit.model_copy(update={"targets": study.orbit.targets[:1]})
-    seen = visible(study.model_copy(update={"orbit": first}))
-    return visit_times_d(seen.visibility.windows(0), study.change.visits, study.observation.exposure_s, study.run.seed)
+    o, target = study.orbit, targets_of(study)[0]
+    seen = Visibility.of(o.orbit().track(o.times()), np.array([target.direction]), o.limits.limits())
+    return visit_times_d(seen.windows(0), study.change.visits, study.observation.exposure_s, study.run.seed)
