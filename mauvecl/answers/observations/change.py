@@ -352,5 +352,5 @@ def _visits(study: Study) -> NDArray[np.float64]:
     if not study.orbit.targets:
         raise InputError("periods need a target", "`orbit.targets`", key="orbit.targets")
     o, target = study.orbit, targets_of(study)[0]
-    seen = Visibility.of(o.orbit().track(o.times()), np.array([target.direction]), o.limits.limits())
+    seen = Visibility.of(o.orbit().track(o.times()), np.array([target.direction]), o.limits)
     return visit_times_d(seen.windows(0), study.change.visits, study.observation.exposure_s, study.run.seed)
