@@ -20,11 +20,13 @@ from mauvecl.schema.tables import Column, View, records, stacked, table_of
 from mauvecl.web.tabs import TABS
 from mauvecl.web.tabs.tab import FIXED, Tab
 
+FLARES = Path(__file__).parents[1] / "data" / "flares"
 SLOW = {
     "measure": ["measure.fits=20"],
     "stare": ["stare.duration_s=2000", "stare.search=true"],
     "inject": ["stare.duration_s=3000", "injections.sizes=3", "injections.widths=2", "injections.count=20",
                "injections.positions=2", "search.nulls=0", "injections.fitted=0"],
+    "analyse": [f"data.file={FLARES / 'gj65_galex_nuv_5s.csv'}", f"data.mapping={FLARES / 'gj65.toml'}"],
 }  # fmt: skip
 #: Columns that only people read, or that are rows of the file.
 ONLY_SHOWN = {"verdict", "shares"}
