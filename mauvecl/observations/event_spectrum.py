@@ -160,29 +160,33 @@ def drifts(survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_
     """Return how much star, dark current and sky differ between parts of the frames and their surroundings.
 
     Measured from means of `n_frames` quiescent frames against the means before and after: the scatter beyond that of
-    noise, and what of it the noise may hide. The sky is not measured, but changes by its documented prior.
+    noise, and what of it the noise may hide. If there are fewer than `MIN_PARTS` such means, shorter ones are taken,
+    and changes are assumed to grow in proportion to time. The sky changes by its documented prior.
 
     Returns
     -------
     dict of str to float
-        Standard deviation by name; infinite if there are fewer than `MIN_PARTS` such means.
+        Standard deviation by name.
     """
     unknown = series.model.unknowns(series.light)
     names = ("light", "dark")
     white = np.array([unknown[name] for name in names]) / series.noise.used
     covariance = np.linalg.inv(white @ white.T)
     amplitudes = series.excess @ (covariance @ white / series.noise.used).T
-    numbers = survey.stare.numbers
     found = dict.fromkeys(names, np.inf)
-    part = numbers // n_frames
-    means = [amplitudes[here].mean(axis=0) for k in np.unique(part) if (here := (part == k) & ~taken).sum() == n_frames]
+    size, means = n_frames, list[Float]()
+    while size > 0 and len(means) < MIN_PARTS:
+        part = survey.stare.numbers // size
+        whole = np.bincount(part[~taken], minlength=int(part[-1]) + 1) == size
+        means = [amplitudes[(part == k) & ~taken].mean(axis=0) for k in np.flatnonzero(whole)]
+        size = size if len(means) >= MIN_PARTS else size // 2
     if len(means) >= MIN_PARTS:
         bends = np.diff(np.array(means), 2, axis=0) / 2
         for k, name in enumerate(names):
             # A mean less that of its neighbours has 3/2 of the variance of a mean.
-            expected = 1.5 * float(covariance[k, k]) / n_frames
+            expected = 1.5 * float(covariance[k, k]) / size
             beyond = max(float(np.mean(bends[:, k] ** 2)) - expected, 0.0)
-            found[name] = float(np.sqrt(beyond + 2 * expected * np.sqrt(2 / len(bends))))
+            found[name] = n_frames / size * float(np.sqrt(beyond + 2 * expected * np.sqrt(2 / len(bends))))
     if "sky" in unknown and isinstance(NUISANCES["sky"].prior, Amplitude):
         found["sky"] = NUISANCES["sky"].prior.sd
     return found

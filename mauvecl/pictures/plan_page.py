@@ -32,27 +32,28 @@ def report_html(answer: PlanAnswer) -> bytes:
         f"<!doctype html><html lang=en><meta charset=utf-8><title>Mauve: {escape(heading(answer))}</title>",
         f"<style>{STYLE}</style><h1>Mauve: yields of a campaign</h1>",
         f"<p>{escape(heading(answer))}; mauvecl {VERSION}.</p>",
-        _table(*answer.views[0].texts(), "numbers", link=True),
+        html_table(*answer.views[0].texts(), "numbers", link=True),
         f"<p class=from>{escape(LEGEND)}</p>",
-        _image(overview_png, answer, text="flares expected and energies of all targets"),
+        html_image(overview_png, answer, text="flares expected and energies of all targets"),
         *(f"<p>{escape(message)}</p>" for message in answer.messages),
     ]
     for k, one in enumerate(answer.planned):
-        lines = _table(("", "", "table: column"), target_lines(answer, k))
+        lines = html_table(("", "", "table: column"), target_lines(answer, k))
         parts.append(f"<section id=target-{k}><h2>{escape(one.name)}</h2>{lines}")
         if one.seen_h > 0:
-            parts.append(_image(target_png, answer, k, text=f"hours and energies of {one.name}"))
+            parts.append(html_image(target_png, answer, k, text=f"hours and energies of {one.name}"))
         parts.append("</section>")
     table = answer.assumptions
     rows = [tuple(str(cell) for cell in row) for row in table]
     parts.append(
-        f"<section><h2>What is assumed</h2><p class=from>Rows of assumptions.ecsv.</p>{_table(table.colnames, rows)}"
+        "<section><h2>What is assumed</h2><p class=from>Rows of assumptions.ecsv.</p>"
+        f"{html_table(table.colnames, rows)}"
         "</section></html>"
     )
     return "\n".join(parts).encode()
 
 
-def _table(names: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "", *, link: bool = False) -> str:
+def html_table(names: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "", *, link: bool = False) -> str:
     """Return a table; `link` makes the first cell of row k lead to the section of target k."""
     head = "".join(f"<th>{escape(name)}</th>" for name in names)
     body = ""
@@ -64,7 +65,8 @@ def _table(names: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "", 
     return f"<table class='{kind}'><tr>{head}</tr>{body}</table>"
 
 
-def _image(draw: Callable[..., bytes], *what: object, text: str) -> str:
+def html_image(draw: Callable[..., bytes], *what: object, text: str) -> str:
+    """Return an image with its content; nothing if matplotlib is not installed."""
     if not available():
         return ""
     content = base64.b64encode(draw(*what)).decode()

@@ -53,7 +53,7 @@ def overview_png(answer: PlanAnswer) -> bytes:
     plt = canvas()
     with plt.rc_context(STYLE):
         figure = overview(answer, None)
-        return _png(plt, figure)
+        return figure_png(plt, figure)
 
 
 def _overview(axes: Any, answer: PlanAnswer) -> None:
@@ -104,10 +104,11 @@ def target_png(answer: PlanAnswer, k: int) -> bytes:
     with plt.rc_context(STYLE):
         figure = plt.figure(figsize=(7.4, 5.4), layout="none")
         _panels(figure, answer, k)
-        return _png(plt, figure)
+        return figure_png(plt, figure)
 
 
-def _png(plt: Any, figure: Any) -> bytes:
+def figure_png(plt: Any, figure: Any) -> bytes:
+    """Return a figure as PNG with few colours, and close it."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from mauvecl.schema.fields import Flag, Help
 from mauvecl.schema.section import Section
@@ -21,6 +21,7 @@ class DataChoice(Section):
     mapping: Annotated[Path | None, Help("Where time, flux and error are in that file (TOML)"), Flag("--mapping")] = (
         None
     )
+    report: Annotated[Literal["html", "pdf"], Help("Form of the report"), Flag("--report")] = "html"
 
     barycentric: Annotated[
         str | None,

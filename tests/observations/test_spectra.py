@@ -27,7 +27,9 @@ Float = NDArray[np.float64]
 SHAPE = shape_of("davenport2014")
 N, FRAME_S = 720, 5.0
 TIME = (np.arange(N) + 0.5) * FRAME_S
-STUDY = Study(star=[{"library": "M3V", "magnitude": 9.0, "distance_pc": 5.0}])  # type: ignore[arg-type]
+# One false alarm per star-day needs few resampled frames.
+DAY: Any = {"per": "day"}
+STUDY = Study(star=[{"library": "M3V", "magnitude": 9.0, "distance_pc": 5.0}], search=DAY)  # type: ignore[arg-type]
 Prepared = tuple[CleanedSpectra, SeriesSurvey, SpectralSeries]
 
 
@@ -263,7 +265,7 @@ def test_answer_states_measurements_or_why_there_are_none() -> None:
     assert event["unmeasured"] == ""
     assert {"area", "energy bolometric"} <= {str(name) for name in answer.measured["quantity"]}
     assert set(answer.tables) >= {"measured", "noise-per-pixel"}
-    unnamed = analyse(Study(), frames=frames)
+    unnamed = analyse(Study(search=DAY), frames=frames)
     event = unnamed.events[k]
     assert np.isnan(event["energy"])
     assert "distance" in event["unmeasured"]
