@@ -46,6 +46,16 @@ def _without_comments(lines: list[str]) -> list[str]:
     return [above[-1].lstrip("# "), *data] if above and above[-1].count(",") == data[0].count(",") > 0 else data
 
 
+def _check_lengths(lines: list[str], named: str) -> None:
+    """Raise InputError for the first row with less cells than the first line, as of a file that is cut short."""
+    for number, line in enumerate(lines):
+        n, wanted = (one.count(",") + 1 for one in (line, lines[0]))
+        if n < wanted and '"' not in line and '"' not in lines[0]:
+            raise InputError(
+                f"{named} has {n} cells in row {number}", f"{wanted} as in the first line", key="file", value=n
+            )
+
+
 def text_table(text: str, named: str, commas: bool, expected: str = "CSV or ECSV") -> Table:
     """Parse a table from text."""
     # The import is slow and only needed here.
@@ -58,6 +68,8 @@ def text_table(text: str, named: str, commas: bool, expected: str = "CSV or ECSV
         return parse_ecsv(text, named)
     lines = _without_comments(text.splitlines()) if commas else text.splitlines()
     check_cells(lines, named)
+    if commas:
+        _check_lengths(lines, named)
     with parsing(named, expected), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return Table.read([*lines, ""], format="ascii.csv" if commas else "ascii")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -82,7 +83,12 @@ def _light_travel_s(when: Time, target: Target, orbit: Orbit | None) -> Float:
     from astropy.utils import iers
 
     # Old tables of the Earth's rotation do no harm: it is used twice, in opposite directions.
-    with iers.conf.set_temp("iers_degraded_accuracy", "ignore"), iers.conf.set_temp("auto_max_age", None):
+    with (
+        iers.conf.set_temp("iers_degraded_accuracy", "ignore"),
+        iers.conf.set_temp("auto_max_age", None),
+        warnings.catch_warnings(),
+    ):
+        warnings.filterwarnings("ignore", message=".*polar motions.*")
         utc = when.utc
         if orbit is None:
             observer = EarthLocation.from_geocentric(0.0, 0.0, 0.0, unit=u.m)

@@ -151,8 +151,8 @@ class Frames:
         cadence = float(np.median(step))
         if not cadence > 0 or (step < MIN_STEP * cadence).any():
             row = int(np.argmin(step))
-            raise _bad(name, "time", f"steps of {step[row]:g} s", f"frames that are at least {MIN_STEP:g} cadences "
-                       f"({MIN_STEP * cadence:g} s) apart")  # fmt: skip
+            least = f"frames that are at least {MIN_STEP:g} of the median step of {cadence:g} s apart"
+            raise _bad(name, "time", f"{step[row]:g} s from one frame to the next", least)
         if exposure is None:
             exposure = np.full(n, cadence)
         if not (np.isfinite(exposure) & (exposure > 0)).all():

@@ -12,12 +12,13 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.host.files.parsing import as_text
+from mauvecl.host.files.parsing import parsing
 from mauvecl.host.files.size_limits import limit_bytes, open_regular, read_bytes, unpacked
 from mauvecl.host.files.text_table import text_table
 from mauvecl.host.spectra.air import vacuum_from_air
 from mauvecl.host.spectra.fits_files import check_sums
 from mauvecl.host.spectra.formats import without_columns
+from mauvecl.host.spectra.text import text_of
 from mauvecl.observations.fits_frames import FitsFile, open_fits
 from mauvecl.observations.folder_frames import FolderFile, keywords_of
 from mauvecl.observations.frames import Frames
@@ -160,16 +161,30 @@ def _opened(path: Path, what: str, name: str | None, mapping: FrameMapping | Non
             with open_fits(file, what) as hdus:
                 if file.seek(0, io.SEEK_END) <= limit_bytes("MAUVECL_LARGEST_FILE_MIB"):
                     _checked(hdus, what)
-                opened = FitsFile(hdus, what)
-                yield stored_in_fits(opened, name) or FitsFile(hdus, what, name, _wanted(mapping))
+                with parsing(what, FORMATS):
+                    stored = stored_in_fits(FitsFile(hdus, what), name)
+                    found = stored or FitsFile(hdus, what, name, _wanted(mapping))
+                yield _filled(found)
         elif kind == "HDF5":
-            with open_hdf5(file, name, what) as stored:
-                yield stored
+            with open_hdf5(file, name, what) as scene:
+                yield scene
         else:
-            text = as_text(content or b"", what)
-            table = TableFile(text_table(text, what, path.suffix.lower() == ".csv", FORMATS), what)
+            try:
+                text = text_of(content or b"")
+            except InputError as error:
+                raise error.within(what) from error
+            if not text.strip():
+                raise InputError(f"{what} is empty", FORMATS, key="file")
+            table = TableFile(text_table(text, what, ".csv" in path.suffixes[-2:], FORMATS), what)
             table.header |= keywords_of([line for line in text.splitlines() if line[:1] in "#%!;"])
-            yield table
+            yield _filled(table)
+
+
+def _filled(file: FrameFile) -> FrameFile:
+    """Return a file; raise InputError if it has nothing with rows."""
+    if not file.names:
+        raise InputError(f"{file.what} has no table and no image", "a row for each frame", key="file")
+    return file
 
 
 def _checked(hdus: Any, what: str) -> None:
@@ -279,7 +294,9 @@ def _frames_in(
         wavelength = None
     kept = np.isfinite(time)
     if not kept.all():
-        remarks += (f"{np.count_nonzero(~kept)} rows of {what} have no time and were left out",)
+        n_left = int(np.count_nonzero(~kept))
+        words = "1 row has no time and was" if n_left == 1 else f"{n_left} rows have no time and were"
+        remarks += (f"{what}: {words} left out",)
     if not kept.any():
         raise InputError(f"{what}: no row has a time", "times", key="time")
     made = Frames.of(
