@@ -172,7 +172,7 @@ def numpy_lines() -> list[Line]:
             moved[unknown.of] = moved[unknown.of] + unknown.sd * rng.standard_normal() * unknown.curve
         c = known.copy()
         c[:, 3:] = flare
-        c[:, [0, 1, 3, 4]] *= 1 + moved["light"][:, None]
+        c[:, [0, 1, 3, 4, 5]] *= 1 + moved["light"][:, None]
         c[:, 2] *= np.exp(slope * moved["temperature"])
         return c
 
@@ -184,7 +184,7 @@ def numpy_lines() -> list[Line]:
         out = np.empty((n, FRAMES, 3), np.float32)
         for i, flare in enumerate(injected(n)):
             c = conditions(flare).astype(np.float32)
-            light = c[:, [0, 1, 3, 4]] @ spectra[[0, 1, 3, 4]]
+            light = c[:, [0, 1, 3, 4, 5]] @ spectra[[0, 1, 3, 4, 5]]
             sd = np.sqrt(x.gain_dn_per_electron.astype(np.float32) * light + x.read_noise_dn.astype(np.float32) ** 2)
             raw = light + rng.poisson(c[:, 2:3] * spectra[2]) + x.bias_dn
             raw += sd * rng.standard_normal(sd.shape, np.float32)

@@ -157,11 +157,21 @@ def observed_frames() -> None:
         fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns(columns)]).writeto(name)
 
 
+def neighbours() -> None:
+    """Write the table of neighbours that the page shows, one of the Gaia archive, and a light curve."""
+    (shown,) = re.findall(r"```\n(name,sep.*?)```", (ROOT / "docs" / "neighbours.md").read_text(encoding="utf-8"), re.S)
+    Path("near.csv").write_text(shown)
+    head, rows = "designation,ra,dec,phot_g_mean_mag,bp_rp", ("1,150,60,8.1,2.3", "2,150,60.003,9,0.85")
+    Path("gaia.csv").write_text("\n".join([head, *(f"Gaia DR3 {row}" for row in rows)]))
+    observed_frames()
+
+
 BROUGHT: dict[str, tuple[Callable[[], None], ...]] = {
     "README.md": (targets, observed_frames),
     "cluster.md": (study_of_ones_own,),
     "long-runs.md": (study_of_ones_own,),
     "my-instrument.md": (efficiency,),
+    "neighbours.md": (neighbours,),
     "my-star.md": (spectra,),
     "observations.md": (observed_frames,),
     "page.md": (study_of_ones_own,),
