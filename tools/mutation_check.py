@@ -202,7 +202,7 @@ MUTATIONS = {
             (NORMAL, "TO_FLOAT(w[${2 * i}]) + 0.5f", "TO_FLOAT(w[${2 * i}] & (uintv)0xffffff00u) + 0.5f"),
             (REFERENCE, "t = radius_word.astype", "t = (radius_word & np.uint32(0xFFFFFF00)).astype"),
         ),
-        "tests/kernels/test_normal.py::test_a_thousand_million_draws",
+        "tests/kernels/test_normal.py::test_thousand_million_draws",
     ),
     "the sky counted as signal": Mutation(
         (

@@ -37,7 +37,7 @@ def test_exposure_inverts_snr(per: str, frames: int, wavelength: float) -> None:
     assert more.frames == frames + 1
 
 
-def test_the_engine_finds_the_wanted_snr(engine: Engine) -> None:
+def test_engine_finds_the_wanted_snr(engine: Engine) -> None:
     """Mean S/N of realisations at the answer: 5 standard errors, and 1 % for the clipped root's curvature."""
     (found,) = exposure_for(study(), 20.0, 300.0).exposures
     asked = study(exposure_s=found.exposure_s)

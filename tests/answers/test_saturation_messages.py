@@ -78,7 +78,7 @@ def question(magnitude: float, changes: dict[str, float], **sections: Any) -> St
 
 @pytest.mark.parametrize("verb", VERBS)
 @pytest.mark.parametrize("low_nm", [250.0, 300.0])
-def test_a_star_that_saturates_is_reported(engine: Engine, tmp_path: Path, verb: str, low_nm: float) -> None:
+def test_star_that_saturates_is_reported(engine: Engine, tmp_path: Path, verb: str, low_nm: float) -> None:
     """Where some pixels are left, and where few or none are."""
     ask, needs = VERBS[verb]
     # A limit of magnitude searches its own star: one that no bright one satisfies.
@@ -92,7 +92,7 @@ def test_a_star_that_saturates_is_reported(engine: Engine, tmp_path: Path, verb:
 
 
 @pytest.mark.parametrize("verb", ["simulate", "detect", "map", "realise", "gaussian"])
-def test_a_flare_that_saturates_alone_is_reported(engine: Engine, tmp_path: Path, verb: str) -> None:
+def test_flare_that_saturates_alone_is_reported(engine: Engine, tmp_path: Path, verb: str) -> None:
     """The star does not saturate; its flare does, and the message names the flare."""
     ask, needs = VERBS[verb]
     range_nm = {"output_min_nm": 300.0, "output_max_nm": 340.0}

@@ -348,7 +348,7 @@ def test_any_key_can_be_set(tmp_path: Path) -> None:
     assert (study.star[0].magnitude, study.observation.exposure_s, study.sky.surface_brightness) == (5, 10, 21)
 
 
-def test_the_schema_describes_every_key(tmp_path: Path) -> None:
+def test_schema_describes_every_key(tmp_path: Path) -> None:
     schema = json.loads(run("schema", folder=tmp_path).stdout)
     assert set(schema["properties"]) == set(Study.model_fields)
 

@@ -47,7 +47,7 @@ def test_total_equals_the_integral(spectrum: FlareSpectrum) -> None:
 
 
 @pytest.mark.parametrize("spectrum", SPECTRA.values(), ids=SPECTRA)
-def test_a_coarse_grid_with_the_nodes_of_the_spectrum_keeps_lines_and_edges(spectrum: FlareSpectrum) -> None:
+def test_coarse_grid_with_the_nodes_of_the_spectrum_keeps_lines_and_edges(spectrum: FlareSpectrum) -> None:
     coarse, fine = (spectrum.grid(np.linspace(180.0, 750.0, n)) for n in (1141, 57_001))
     one, other = (np.trapezoid(spectrum.flux(grid), grid) for grid in (coarse, fine))
     assert one == pytest.approx(other, rel=1e-5)
@@ -106,18 +106,18 @@ def test_great_flare_of_ad_leo_is_read() -> None:
     np.testing.assert_allclose(shape, shape[0], rtol=2e-4)
 
 
-def test_a_short_flare_is_not_continued_unless_asked() -> None:
+def test_short_flare_is_not_continued_unless_asked() -> None:
     with refused("continue_at_k", "100"):
         ad_leo(912, continue_at_k=None)
 
 
-def test_a_coarse_spectrum_is_continued_from_its_last_point() -> None:
+def test_coarse_spectrum_is_continued_from_its_last_point() -> None:
     flare = ObservedFlare.from_arrays([150.0, 300.0, 500.0], [1.0, 2.0, 3.0], continue_at_k=8000.0)
     far = blackbody(np.array([500.0, flare.wavelength_nm[-1]]), 8000.0)
     assert flare.flux_flam[-1] == pytest.approx(3.0 * far[1] / far[0])
 
 
-def test_a_quiescent_spectrum_is_subtracted(tmp_path: Path) -> None:
+def test_quiescent_spectrum_is_subtracted(tmp_path: Path) -> None:
     nm, other = np.linspace(150.0, 800.0, 1301), np.linspace(190.0, 820.0, 2001)
     for name, at, flux in (("both", nm, 3e-14 * nm), ("star", other, 1e-14 * other)):
         np.savetxt(tmp_path / f"{name}.txt", np.column_stack([at, flux]))

@@ -116,7 +116,7 @@ def test_magnitude_of_the_sun() -> None:
     assert Source.from_library("Sun").magnitude("V") == pytest.approx(-26.76, abs=0.02)
 
 
-def test_the_response_of_v_is_per_photon() -> None:
+def test_response_of_v_is_per_photon() -> None:
     """Pickles spectra come normalised to V = 0: per photon they agree in every class, per energy they do not."""
     v, vega = bands.band("V"), Source.from_library("Vega")
 

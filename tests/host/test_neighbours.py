@@ -174,5 +174,5 @@ def test_unusable_tables_are_refused(
         read_neighbours(tmp_path / "near.csv", target)
 
 
-def test_a_star_at_the_same_place_is_pointed_out() -> None:
+def test_star_at_the_same_place_is_pointed_out() -> None:
     assert any("star.neighbours_of" in text for text in seen(STAR, Neighbour("A", 0.3, 7.2, "V", "G2V")).messages)

@@ -259,7 +259,7 @@ def test_ambiguous_tables_raise(tmp_path: Path, case: str) -> None:
     assert len(str(caught.value)) < 400
 
 
-def test_a_column_is_chosen_by_its_name(tmp_path: Path) -> None:
+def test_column_is_chosen_by_its_name(tmp_path: Path) -> None:
     content = text({"wave_rest": NM + 5, "wave_obs": NM, "model_flux": TWO, "observed_flux": ONE})
     assert is_right(read(tmp_path, content, "[wave_obs,observed_flux]"))
     assert is_right(read(tmp_path, text({"nm": NM, "model": ONE, "flux": TWO}), "[model]"))

@@ -276,7 +276,7 @@ def test_angstrom_without_a_unit_gets_a_single_hint(
 
 
 @pytest.mark.parametrize(("low", "high"), [(100, 250), (540, 2000), (800, 2500), (90, 190), (115, 360)])
-def test_an_extension_needs_a_third_of_the_range(tmp_path: Path, low: float, high: float) -> None:
+def test_extension_needs_a_third_of_the_range(tmp_path: Path, low: float, high: float) -> None:
     nm = np.linspace(low, high, 800)
     (tmp_path / "short.txt").write_text(lines(nm, 1e-13 + 1e-15 * nm, head="# nm FLAM\n"))
     for extend in ("G2V", None):
@@ -285,14 +285,14 @@ def test_an_extension_needs_a_third_of_the_range(tmp_path: Path, low: float, hig
 
 
 @pytest.mark.parametrize(("low", "high", "part"), [(290, 2500, 82), (100, 444, 49), (195, 370, 34), (360, 980, 68)])
-def test_the_measured_range_is_always_reported(tmp_path: Path, low: float, high: float, part: int) -> None:
+def test_measured_range_is_always_reported(tmp_path: Path, low: float, high: float, part: int) -> None:
     nm = np.linspace(low, high, 2000)
     (tmp_path / "short.txt").write_text(lines(nm, 1e-13 + 1e-15 * nm, head="# nm FLAM\n"))
     star = Source.read(tmp_path / "short.txt", extend="G2V")
     assert star.messages[0] == f"its own points cover {low:g}-{high:g} nm, {part}% of 200-700 nm"
 
 
-def test_a_gap_is_not_measured(tmp_path: Path) -> None:
+def test_gap_is_not_measured(tmp_path: Path) -> None:
     nm = np.append(np.arange(170.0, 260.0), np.arange(650.0, 900.0))
     (tmp_path / "gap.txt").write_text(lines(nm, 1e-13 + 1e-15 * nm, head="# nm FLAM\n"))
     with refused("extend", "170-899", "22%", "200-700"):

@@ -79,7 +79,7 @@ def test_every_word_is_finite(probes_fast: Probes) -> None:
 
 
 @pytest.mark.long
-def test_a_thousand_million_draws(probes_fast: Probes) -> None:
+def test_thousand_million_draws(probes_fast: Probes) -> None:
     """Pearson, Kolmogorov-Smirnov and tails to six sigma at 1e9; each fails by chance once in 1e6 new seeds."""
     items, groups = 4096, 3815
     counts = np.zeros((items, 4096), np.uint32)

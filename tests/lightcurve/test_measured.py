@@ -209,7 +209,7 @@ def test_intervals_of_a_joint_fit_agree_with_its_errors() -> None:
     np.testing.assert_allclose(high, 1.0, atol=0.15)
 
 
-def test_a_joint_fit_of_a_steady_flare_leaves_the_cooling_open() -> None:
+def test_joint_fit_of_a_steady_flare_leaves_the_cooling_open() -> None:
     lit, _ = lit_frames(STEADY, Stare.of(150.0))
     found = fit_cooling(np.array([one.recorded_dn for one in lit]), quiet(), model(), levels=(0.95,), **START)
     assert found.estimates[0, :4] == pytest.approx([52.0, 40.0, 1.5, 9000.0], rel=0.01)

@@ -135,7 +135,7 @@ def test_tovar_mendoza_rise_keeps_its_digits():
         assert float(shape.before(tau)) == pytest.approx(exact, rel=1e-8)
 
 
-def test_a_late_frame_keeps_its_digits():
+def test_late_frame_keeps_its_digits():
     # The difference of two integrals from the beginning would have none left here.
     shape = SHAPES["davenport2014"]
     (a, b), (c, d) = shape.DECAY

@@ -62,13 +62,13 @@ def test_pictures_of_a_part_say_so(case: str, monkeypatch: pytest.MonkeyPatch) -
                 assert "6 of 8 half-widths shown" in written
 
 
-def test_the_largest_shares_say_how_many_there_are() -> None:
+def test_largest_shares_say_how_many_there_are() -> None:
     shares = dict.fromkeys("abcde", 0.2)
     assert describe_shares(shares) == "a 20 %, b 20 %, c 20 % (3 of 5 unknowns shown)"
     assert describe_shares({"a": 1.0}) == "a 100 %"
 
 
-def test_a_part_has_a_note() -> None:
+def test_part_has_a_note() -> None:
     assert (list(First("abc", 2, "letters")), First("abc", 2, "letters").note) == (["a", "b"], "2 of 3 letters shown")
     assert (First("abc", 3, "letters").note, note_of(First("abc", 1, "letters"))) == ("", "1 of 3 letters shown")
     assert (note_of("abc"), part_note(0, 0, "letters")) == ("", "")

@@ -67,7 +67,7 @@ def test_every_answer_has_a_picture_and_every_picture_a_class() -> None:
         assert len(set(names)) == len(names)
 
 
-def test_a_picture_is_added_in_one_place(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_picture_is_added_in_one_place(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A function with the decorator is drawn, saved and put into axes like all others."""
     from matplotlib.figure import Figure
 

@@ -76,6 +76,6 @@ def test_false_alarms_are_as_requested(engine: Engine) -> None:
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_the_scenes_differ(number: int) -> None:
+def test_scenes_differ(number: int) -> None:
     a, b = scene(number)[0], scene(number + 1)[0]
     assert a.exposure_s != b.exposure_s or a.wavelength_nm[0] != b.wavelength_nm[0]

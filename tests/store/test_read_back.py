@@ -47,7 +47,7 @@ def test_stores_are_read_back_with_their_metadata(tmp_path: Path, engine: Engine
     assert not frames.quality.any()
 
 
-def test_a_store_of_several_arrays_asks_for_one(tmp_path: Path, engine: Engine) -> None:
+def test_store_of_several_arrays_asks_for_one(tmp_path: Path, engine: Engine) -> None:
     path = _written(tmp_path, study(40), engine, "zarr")
     with refused("hdu", "star-1/quiescent", expected="FILE[star-1/flare-1]"):
         read_frames(path)

@@ -112,7 +112,7 @@ def test_python_arguments_have_the_range(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", PAGE)
-def test_the_page_has_the_range(name: str) -> None:
+def test_page_has_the_range(name: str) -> None:
     read, reach = FIELDS[PAGE[name]].read, NUMERIC[name].range
     assert isinstance(read, Number)
     scale = 100 if name == "amplitude" else 1
