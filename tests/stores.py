@@ -19,7 +19,7 @@ CHUNK, LAST = "star-1/quiescent/c/1/0", "star-1/flare-1/c/4/0"
 
 
 def study(realisations: int = 300, **sections: Any) -> Study:
-    """One star with one flare on 197 pixels, one frame each unless told otherwise."""
+    """One star with one flare on 197 pixels, one frame each by default."""
     data = {
         "star": [{"library": "G2V", "magnitude": 7.4}],
         "flare": {"amplitudes": [0.24]},

@@ -37,7 +37,7 @@ def test_all_data_have_a_licence() -> None:
 
 
 def test_wheels_and_sdists_contain_the_licences() -> None:
-    """By the same patterns as setuptools: beside the data, and among the package's own licences."""
+    """Licences are packed by the patterns of setuptools, next to the data and among those of the package."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     texts = set((LIBRARY / "licenses").iterdir())
     assert len(texts) == len(NOTICES)

@@ -1,4 +1,4 @@
-"""Completeness answers: what they hold, sweeps and resumes, intervals, what is refused and told."""
+"""Completeness answers: tables, sweeps, resumed runs, intervals, errors and messages."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def test_temperature_drift_hides_no_flare(stares):
 
 
 def test_cosmic_rays_and_saturation_are_reported(stares):
-    """Cosmic rays are drawn where the study has them, and hide flares; flares that saturate are told."""
+    """Cosmic rays are drawn if the study has them, and hide flares; saturating flares are reported."""
     quick = {"count": 10, "positions": 2, "fitted": 0, "widths": 1, "sizes": 2, "low": 1e33, "high": 1e39}
     plain, struck = (
         inject(study(injections=quick, search={"nulls": 5}, stare={"duration_s": 2500.0, "gaps": []}, **more), stares)

@@ -1,4 +1,4 @@
-"""Limits: the power asked for is found there again, by theory and by simulation; harder is never easier."""
+"""Limits have the requested power by theory and by simulation, and are monotone."""
 
 from __future__ import annotations
 

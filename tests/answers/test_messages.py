@@ -1,4 +1,4 @@
-"""What answers tell beside their numbers."""
+"""Messages of answers."""
 
 from __future__ import annotations
 

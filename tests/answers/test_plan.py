@@ -109,7 +109,7 @@ def held(table: Table, column: str, target: str) -> list[float]:
 
 
 def test_report_numbers_are_in_the_named_tables(answer: PlanAnswer, tmp_path: Path) -> None:
-    """As written beside it, in the column that is named, for the target: pages, summary and messages."""
+    """Each number of the report (pages, summary, messages) equals the value in the column that it names."""
     tables = {name: QTable.read(write_table(table, tmp_path / f"{name}.ecsv")) for name, table in answer.tables.items()}
     count = 0
     for k, one in enumerate(answer.planned):
@@ -157,7 +157,7 @@ def test_missing_values_are_reported(answer: PlanAnswer) -> None:
 
 @pytest.mark.long
 def test_report_is_written(answer: PlanAnswer, study: Study) -> None:
-    """A page for each target beside the summary and the assumptions; every assumption."""
+    """The report has a page per target, a summary, and every assumption."""
     content = answer.documents["plan.pdf"]()
     assert len(re.findall(rb"/Type /Page\b", content)) >= len(answer.planned) + 2
     html = plan(study.with_settings(["plan.report=html"])).documents["plan.html"]().decode()
@@ -205,7 +205,7 @@ def test_plan_takes_completeness_as_argument(study: Study) -> None:
 
 
 def test_conditions_equal_those_of_stares_along_the_orbit() -> None:
-    """Temperature and hits while a target is seen, beside the frames of the same orbit; both change the noise."""
+    """Compare temperature and hits while a target is seen with frames of the same orbit; both change the noise."""
     base = [
         "plan.targets=[{name='GJ 205'}]",
         "orbit.days=3",

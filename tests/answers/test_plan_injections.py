@@ -1,4 +1,4 @@
-"""Completeness by injections: shares over half-widths, beside the closed form; campaigns close through a search."""
+"""Completeness by injections: shares over half-widths, and simulated campaigns that are searched."""
 
 import numpy as np
 import pytest

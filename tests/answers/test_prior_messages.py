@@ -1,4 +1,4 @@
-"""A prior that does not contain what the expectation has: the reader is told, by every verb that draws it."""
+"""Every verb that draws a prior reports one that excludes the value of the expectation."""
 
 from __future__ import annotations
 

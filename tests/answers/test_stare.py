@@ -151,7 +151,7 @@ def test_search_finds_only_the_injected_flares(stares):
     assert (found["value"] >= one.search.threshold).all()
     assert set(found["event"]) <= {1, 2, 3, 4}
     put_in = answer.events[found["event"] - 1]
-    # Within five standard errors: beyond that once in 2e6 for a normal error, of 15 looked at.
+    # Within five standard errors: a normal error exceeds that once in 2e6; 15 are tested.
     for name in ("peak_time", "amplitude", "half_width", "equivalent_duration"):
         away = (found[name] - put_in[name]) / found[name + "_error"]
         assert (np.abs(np.asarray(away)) < 5).all(), name

@@ -1,4 +1,4 @@
-"""Unknowns from the question to the answer: study, flags, files, what they cost, and false alarms as asked for."""
+"""Unknowns: study keys, flags, files, their cost in S/N, and false alarms with unknowns drawn."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ def test_priors_are_drawn_jointly_on_both_instruments() -> None:
             assert prepare(seen, processes=Case(asked).processes).joint
 
 
-#: Draws of each scene, the false-alarm probability asked for, and scenes.
+#: Draws of each scene, requested false-alarm probability, and number of scenes.
 DRAWS, FAP, SCENES = 20_000, 0.01, 40
 SEEDS = itertools.count(2026)
 
@@ -253,7 +253,7 @@ def test_false_alarms_with_drawn_unknowns_are_as_requested(engine: Engine) -> No
 
 
 def test_table_has_a_picture(tmp_path: Path) -> None:
-    """METHODS section 7's row again, and the smallest amplitude has the power asked for."""
+    """The table repeats a row of METHODS section 7, and the smallest amplitude has the requested power."""
     found = unknown_table(study())
     rows = {row["unknown"]: row for row in found.table}
     assert rows["the dark level (+-0.1 deg C)"]["marginalised"] == pytest.approx(3.06, rel=0.01)

@@ -226,7 +226,7 @@ def test_long_chains_of_instruments_are_refused(tmp_path: Path) -> None:
     "content", ["[" * 100_000, "null", "[]", '{"attributes": []}', '{"attributes": {"study": "a = 1e999"}}']
 )
 def test_invalid_manifests_are_refused(content: str, tmp_path: Path) -> None:
-    """RecursionError of nested JSON. Alone it is someone else's file; beside shards it was ours and is damaged."""
+    """Nested JSON raised RecursionError. A manifest alone is foreign; next to shards it is a damaged one of mauvecl."""
     for folder, name in (("store", "zarr.json"), ("run/checkpoint", "manifest.json")):
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / name).write_text(content)
@@ -324,7 +324,7 @@ def test_invalid_collection_addresses_are_refused(address: str, tmp_path: Path) 
 
 
 def test_two_flags_for_one_key_are_refused(tmp_path: Path) -> None:
-    """--flares beside -a was dropped in silence."""
+    """--flares was silently ignored if -a was given."""
     (tmp_path / "flares.csv").write_text("amplitude\n0.1\n")
     assert "--flares and --amplitude" in refused(*DETECT, "--flares", "flares.csv", folder=tmp_path)
 

@@ -1,4 +1,4 @@
-"""What a verb leaves on the disk is whole or not there, whatever the disk does; the answer is told all the same."""
+"""Files of a verb are whole or missing, whatever the disk does, and the answer is printed."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ def test_foreign_manifest_is_kept(tmp_path: Path, how: dict[str, bool]) -> None:
 
 
 def test_restart_of_a_locked_folder_raises(tmp_path: Path) -> None:
-    """What another process holds is not looked at, let alone removed."""
+    """A folder that another process has locked is neither read nor removed."""
     with Checkpoint(tmp_path, "detect", small(), patience_s=0.0) as checkpoint:
         checkpoint.put(SHARD.removesuffix(".npz"), {})
         for how in ({"restart": True}, {"resume": True}):

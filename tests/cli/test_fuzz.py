@@ -45,7 +45,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True, scope="module")
 def bounded_memory() -> Iterator[None]:
-    """Whoever asks for more memory is told that there is none, and the sentence of that is a failure here."""
+    """Limit the memory; a message about memory then fails the test."""
     here = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     before = resource.getrlimit(resource.RLIMIT_AS)
     # PoCL maps some gigabytes of its own, in tests that draw.

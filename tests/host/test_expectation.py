@@ -87,7 +87,7 @@ def test_closed_form_signal_to_noise(quiet: Expectation, signal: Any) -> None:
 
 
 def test_sky_alone_has_no_net_signal(sunlike: Source, mauve: Instrument) -> None:
-    """A star of nothing has an S/N of nothing however bright the sky, unless the paper's convention is asked for."""
+    """A star without light has an S/N of 0 for any sky, except in the convention of the paper."""
     star = [expect(sunlike, mauve, exposure=50, sky=Sky.of_brightness(v)) for v in (22.1, 15.0)]
     for x in star:
         nothing = replace(x, source_electrons=np.zeros_like(x.source_electrons))
@@ -186,7 +186,7 @@ def test_saturation_is_the_first_message(mauve: Instrument) -> None:
     assert f"{hit[0]:.1f}-" in x.messages[0]
     assert f"-{hit[-1]:.1f} nm" in x.messages[0]
     assert f"{x.saturated.sum()} of 1643 pixels" in x.messages[0]
-    # A frame of the length told is safe, and one a little longer is not.
+    # A frame of the reported length is safe, and one a little longer is not.
     safe = float(x.messages[0].split("longest safe frame is ")[1].split(" s")[0])
     assert safe == pytest.approx(x.longest_safe_frame_s, abs=1e-3)
     assert not expect(star, mauve.with_(frame_s=safe), exposure=1).saturated.any()

@@ -1,4 +1,4 @@
-"""What the library's headers must admit, beside where the numbers come from."""
+"""Headers of library spectra state assumptions and sources."""
 
 from __future__ import annotations
 

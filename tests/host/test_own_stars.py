@@ -193,7 +193,7 @@ def test_short_spectrum_is_kept_with_its_extension(archive: str, tmp_path: Path)
     star = Source.from_library("VB 8")
     direct = Source.read(WHOLE.parent / "vb8_stiswfcnic_004.fits", extend="M3V")
     np.testing.assert_array_equal(star.flux_flam, direct.flux_flam)
-    # What must be told of it is told wherever it is used.
+    # Its messages are reported wherever it is used.
     messages = expect(star.at_magnitude(9.0), Instrument.load("mauve"), exposure=50.0).messages
     assert any("113 of its 1349 points" in message for message in messages)
     assert any("continued by M3V" in message for message in messages)

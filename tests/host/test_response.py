@@ -105,7 +105,7 @@ def test_random_spectra_agree_with_quadrature(mauve: Instrument, top_hat: float,
     flux = rng.random(wavelength.size) * np.where(rng.random(wavelength.size) < 0.03, 50, 1) * 1e-13
     rate = electrons_per_second(instrument, wavelength, flux, order)
     for pixel in (0, 811, 1642):
-        # Far below the 1e-6 that is asked for.
+        # Far below the requested 1e-6.
         assert rate[pixel] == pytest.approx(brute(instrument, wavelength, flux, pixel, order), rel=1e-9)
 
 

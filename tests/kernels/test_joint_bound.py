@@ -24,7 +24,8 @@ from mauvecl.noise.cumulants import (
 from mauvecl.noise.processes import Processes, Uniform
 from mauvecl.noise.scene import prepare
 
-#: By exact convolution no allowed draw is told apart sooner; the condition's own estimate is right to 4 % there.
+#: By exact convolution no allowed draw can be distinguished with fewer draws. The estimate of the condition is right to
+#: 4 % there.
 SOONEST = 4e13
 #: Nor is a tail between 5 and 6 sigma further from the exact one than this share of it (a longer search finds .0046).
 TAIL = 5e-3

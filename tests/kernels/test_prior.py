@@ -1,4 +1,4 @@
-"""Priors: the device's map from words to factors, integrated exactly, against the distribution asked for."""
+"""Compare the device's map from words to factors, integrated exactly, with the distribution of the prior."""
 
 from __future__ import annotations
 

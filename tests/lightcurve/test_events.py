@@ -43,7 +43,7 @@ def test_cooling_flare_keeps_its_light_curve_and_spectrum():
     alone = coefficients([Event(500.0, 60.0, 0.5)], START, 5.0, np.array([10_000.0]))[:, 0]
     # In the band in which amplitudes are measured every spectrum has an amplitude of one.
     np.testing.assert_allclose(found.sum(axis=1), alone, rtol=1e-9, atol=1e-15)
-    # Spectra of one amplitude at 600 nm, mixed from the nodes, beside the blackbody of the frame's middle.
+    # Spectra of one amplitude at 600 nm, mixed from the nodes, compared with the blackbody at the middle of the frame.
     nm = np.linspace(200.0, 700.0, 101)
     unit = np.array([blackbody(nm, k) / blackbody(np.array([600.0]), k) for k in kelvin])
     for k in (95, 110, 130, 200):

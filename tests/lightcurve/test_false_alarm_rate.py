@@ -1,4 +1,4 @@
-"""Alarms of noise in closed form, beside counts and importance sampling of the same banks."""
+"""Compare the closed-form false-alarm rate with counts and with importance sampling of the same banks."""
 
 from __future__ import annotations
 

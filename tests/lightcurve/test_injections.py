@@ -170,7 +170,7 @@ def test_completeness_of_five_cells_agrees_with_numpy(injections, stares, rays):
 
 
 def test_draws_are_common_and_addressed_by_counter(injections, stares):
-    """The same whatever the half-widths asked for, and whatever part of the stares is drawn, to the last bit."""
+    """Draws depend neither on the requested half-widths nor on the part of the stares, to the last bit."""
     asked = injections.request(4)
     every = stares.reduced(asked)["critical"]
     alone = stares.reduced(replace(injections, half_widths_s=(40.0,)).request(4))["critical"]

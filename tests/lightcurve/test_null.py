@@ -158,7 +158,7 @@ def stares():
 
 @pytest.mark.long
 def test_false_alarms_in_random_stares_are_as_requested(stares):
-    """As asked for within 4 standard errors in 50 random stares: once in 10^4 runs it fails by chance.
+    """Alarms are as requested within 4 standard errors in 50 random stares: once in 10^4 runs it fails by chance.
 
     The cycle is marginalised in time, or the dark in each frame. The plain statistic, which takes all for known,
     alarms nearly always.

@@ -125,7 +125,7 @@ def test_splitting_changes_no_bit(engine: Engine, method: Any) -> None:
 
 @dataclass(frozen=True)
 class Beside:
-    """Statistics, and what flares need beside them, as they are."""
+    """Keep the statistics and the sums for flares unchanged."""
 
     adds: ClassVar[bool] = False
 

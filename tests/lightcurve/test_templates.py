@@ -39,7 +39,7 @@ def test_sums_have_covariance_one(star, case):
 
 @pytest.mark.parametrize("case", CASES)
 def test_few_temperatures_lose_little_snr(star, case):
-    """Flares of 6000-20 000 K at any temperature between those of the templates; in time 1.3 % may go beside."""
+    """Flares of 6000-20 000 K between the temperatures of the templates; 1.3 % of the S/N may be lost in time."""
     quiet, flares = star
     nuisances = frame_nuisances(quiet, Stare.of(100.0), CASES[case])
     t = Templates.of(quiet, flares, TEMPERATURES_K, nuisances=nuisances)

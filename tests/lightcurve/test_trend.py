@@ -62,7 +62,7 @@ def random_stare(rng):
 
 @pytest.mark.long
 def test_false_alarms_with_random_drifts_and_cycles():
-    """As asked for within 4 standard errors in 12 random stares: once in 10^4 runs it fails by chance.
+    """Alarms are as requested within 4 standard errors in 12 random stares: once in 10^4 runs it fails by chance.
 
     With unknowns three times as far out, at the threshold for one false alarm per star-month, fewer than 7 alarms,
     where a chance of one in 10^5 has as many for the 0.6 that are expected.

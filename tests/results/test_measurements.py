@@ -79,7 +79,7 @@ def test_forecasts_of_blackbodies(row: tuple[Any, ...]) -> None:
     known, unknown = (forecast(x, m, kelvin, [amplitude], u) for u in (None, free(x, sky=0.1)))
     assert known.snr == pytest.approx(snr, rel=0.01)
     got = [one.errors[k] / one.values[k] for one in (known, unknown) for k in (1, 0)]
-    # Four decimals are printed: half of the last one beside 1 %.
+    # Four decimals are printed: half of the last one, and 1 %.
     np.testing.assert_allclose(got, errors, rtol=0.01, atol=5e-5)
 
 

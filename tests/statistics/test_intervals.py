@@ -52,7 +52,7 @@ def counted(kind: str, fap: float, probability: float, n: int, seeds: int) -> tu
     [(0.1, 1000, 2000, (0.3, 0.7, 0.97)), (0.01, 10_000, 1000, (0.05, 0.3, 0.97)), (1e-3, 100_000, 100, (0.3,))],
 )
 def test_interval_has_nominal_coverage(kind: str, fap: float, n: int, seeds: int, probabilities: tuple) -> None:
-    """94-97 %, beside 5 standard errors of the seeds: one of the 21 fails by chance in 8e4 runs.
+    """94-97 %, within 5 standard errors of the seeds: one of the 21 fails by chance in 8e4 runs.
 
     The interval that it takes the place of is wider in all of them, and up to twice as wide.
     """

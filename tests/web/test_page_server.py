@@ -321,7 +321,7 @@ def test_curve_and_map_show_the_closed_form(statistic: str, tmp_path: Path) -> N
     assert y[steep] == pytest.approx(exact, abs=0.01)
     columns, rows, p = limit._map(limit._Kept(closed))
     row = p[int(np.argmin(np.abs(rows - np.log10(5.0))))]
-    shift = (rows[1] - rows[0]) / 0.4  # rows lie beside the question's own amplitude
+    shift = (rows[1] - rows[0]) / 0.4  # rows lie on both sides of the amplitude of the question
     for level in (0.1, 0.5, 0.9):
         assert np.interp(-level, -row, columns) == pytest.approx(np.interp(-level, -y, x), abs=0.05 + shift)
 
@@ -578,7 +578,7 @@ def test_cancel_ends_every_computation(served: Any, kind: str) -> None:
     assert idle < 0.25, "nothing goes on behind it"
 
 
-#: For each table of a tab: verb, what it needs beside the study, its file.
+#: For each table of a tab: verb, flags in addition to the study, file.
 COMMANDS = {
     "detection": ("detect", [], "detection.ecsv"),
     "roc": ("detect", [], "roc.ecsv"),
@@ -893,7 +893,7 @@ def test_messages_without_fields_are_answered_or_refused(served: Any, caplog: py
             while told.get("n") != 7:
                 message = await asyncio.wait_for(connection.read_message(), 60)
                 assert message is not None, ask
-                # A file that was asked for comes as bytes.
+                # A requested file arrives as bytes.
                 told = json.loads(message) if isinstance(message, str) else {}
             connection.close()
 
