@@ -426,12 +426,12 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         measured = float(nm[0]), float(nm[-1])
         gaps = [f"{nm[i]:.1f}-{nm[i + 1]:.1f}" for i in np.flatnonzero(np.diff(nm) > GAP_NM)]
         if gaps:
-            messages += (f"The flare spectrum {name} is interpolated in its gaps at {', '.join(gaps)} nm.",)
+            messages += (f"The flare spectrum {name} is interpolated in its gaps at {', '.join(gaps)} nm",)
         if continue_at_k is not None:
             nm, flux = _continued(name, nm, flux, continue_at_k)
             messages += (
                 f"The flare spectrum {name} covers {measured[0]:g}-{measured[1]:g} nm; a blackbody of "
-                f"{continue_at_k:g} K continues it.",
+                f"{continue_at_k:g} K continues it",
             )
         return cls(nm, flux, name, measured, messages)
 
@@ -480,7 +480,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
             flux = flux[inside] - np.interp(nm, star.wavelength_nm, star.flux_flam)
         return cls.from_arrays(
             nm, flux, name=read.name, continue_at_k=continue_at_k,
-            messages=tuple(f"{read.name}: {text}." for text in messages),
+            messages=tuple(f"{read.name}: {text}" for text in messages),
         )  # fmt: skip
 
     @property

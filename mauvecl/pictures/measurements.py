@@ -70,7 +70,8 @@ def contours(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
     for axis, one in zip(axes[0], flares, strict=True):
         for rise, line in zip(RISES, ("-", "--"), strict=True):
             kelvin, low, high = one.region(rise)
-            axis.plot(np.append(kelvin, kelvin[::-1]), np.append(low, high[::-1]), line, color=COLOURS[0])
+            around = np.concatenate([kelvin, kelvin[::-1], kelvin[:1]]), np.concatenate([low, high[::-1], low[:1]])
+            axis.plot(*around, line, color=COLOURS[0])
         axis.plot(one.perfect.estimates[0, 0], one.perfect.estimates[0, 1], "+", color=COLOURS[4])
         if np.isfinite(one.truth[:2]).all():
             axis.plot(*one.truth[:2], "x", color="black")
@@ -86,10 +87,8 @@ def pulls(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
     figure, axes = plt.subplots(1, len(flares), figsize=(3.4 * len(flares), 3.0), squeeze=False)
     x = np.linspace(-5.0, 5.0, 201)
     for axis, one in zip(axes[0], flares, strict=True):
-        # The parameters are temperature, amplitude and, if fitted, the Balmer jump.
-        for colour, q in zip(COLOURS, range(min(3, len(one.truth))), strict=False):
-            if one.found.names[q].startswith("flux") or not np.isfinite(one.truth[q]):
-                continue
+        # Temperature, amplitude and the next one; an observed flare has only fluxes.
+        for colour, q in zip(COLOURS, np.flatnonzero(np.isfinite(one.truth))[:3], strict=False):
             with np.errstate(invalid="ignore", divide="ignore"):
                 pull = (one.found.estimates[:, q] - one.truth[q]) / one.found.errors[:, q]
             pull = pull[np.isfinite(pull)]

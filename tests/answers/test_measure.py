@@ -222,3 +222,12 @@ def test_measure_command_writes_its_files(tmp_path: Path) -> None:
     code, _, told = ended("measure", *words, "--model", "spots", folder=tmp_path)
     assert code == 2
     assert "spots" in told
+
+
+def test_expected_regions_close(jump: MeasureAnswer) -> None:
+    """Amplitudes meet at the lowest and highest temperature, where chi-squared has risen at any amplitude."""
+    for one in jump.flares:
+        kelvin, low, high = one.region(5.99)
+        width = high - low
+        assert (width[[0, -1]] < 1e-4 * width.max()).all()
+        assert kelvin[0] < one.perfect.estimates[0, 0] < kelvin[-1]

@@ -17,7 +17,7 @@ from mauvecl.lightcurve.stares.stare_requests import Arrays, StaresRequest
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.tables import Column
+from mauvecl.schema.tables import Column, number
 
 if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
@@ -34,7 +34,7 @@ Float = NDArray[np.float64]
 JOINT_COLUMNS = (
     Column("quantity", "found.names", "", "what is measured", "quantity"),
     Column("unit", "found.units", "", "of truth, estimate and intervals", "unit"),
-    Column("truth", "truth", "", "true value; undefined where the flare has none", "truth", ".4g"),
+    Column("truth", "truth", "", "true value; undefined where the flare has none", "truth", number(".4g")),
     Column("estimate", lambda one: one.found.estimates[0], "", "of maximum likelihood", "estimate", ".4g"),
     Column("error", lambda one: one.found.errors[0], "", "its standard error", "error", ".2g"),
     Column("low_68", lambda one: one.found.low[0, 0], "", "lower end of its 68 % interval; infinite if there is none"),

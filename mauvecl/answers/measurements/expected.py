@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import InCell
@@ -79,8 +80,15 @@ class ExpectedMeasurement(InCell):
             return amplitude, power, rise - (rest @ rest - amplitude**2 * power)
 
         nodes = np.linspace(reduction.log_k[0], reduction.log_k[-1], 8 * reduction.log_k.size)
-        inside = nodes[at(nodes)[2] >= 0.0]
-        ends = (inside[0], inside[-1]) if inside.size else (best, best)
+        inside = np.flatnonzero(at(nodes)[2] >= 0.0)
+        # From the outermost node inside to the next one, where the region ends, or from the fit.
+        known = nodes[inside[[0, -1]]] if inside.size else np.array([best, best])
+        beyond = np.searchsorted(nodes, known[0]) - 1, np.searchsorted(nodes, known[1], side="right")
+        ends = [
+            scipy.optimize.brentq(lambda x: float(at(np.array([x]))[2][0]), inner, nodes[k])
+            if 0 <= k < nodes.size else inner
+            for inner, k in zip(known, beyond, strict=True)
+        ]  # fmt: skip
         # Dense at the ends, where the amplitudes meet like a root.
         log_k = (ends[0] + ends[1]) / 2 + (ends[1] - ends[0]) / 2 * np.sin(np.linspace(-np.pi / 2, np.pi / 2, n))
         amplitude, power, left = at(log_k)

@@ -24,7 +24,7 @@ from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.tables import Column, View, percent, records, stacked, table_of
+from mauvecl.schema.tables import Column, View, number, percent, records, stacked, table_of
 from mauvecl.statistics.intervals import Interval, clopper_pearson
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import amplitude_column, place_columns
@@ -119,12 +119,12 @@ def _coverage_columns(level: float, suffix: str, whose: str, heading: str = "") 
 COLUMNS = (
     Column("quantity", "", "", "what is measured", "quantity"),
     Column("unit", "", "", "of truth, estimates and errors", "unit"),
-    Column("truth", "", "", "true value; undefined where the flare has none", "truth", ".4g"),
+    Column("truth", "", "", "true value; undefined where the flare has none", "truth", number(".4g")),
     Column("error_known", "", "", "standard error in advance, everything known", "error, all known", ".4g"),
     Column("error", "", "", "standard error in advance, unknowns marginalised over", "error", ".4g"),
     Column("perfect", "", "", "estimate from an exposure without noise", "fit without noise", ".4g"),
     Column("median", "", "", "median of the estimates"),
-    Column("bias", "", "", "median of the estimates less the truth", "bias", ".4g"),
+    Column("bias", "", "", "median of the estimates less the truth", "bias", number(".4g")),
     Column("scatter", "", "", "half of the central 68.27 % of the estimates", "scatter", ".4g"),
     *_coverage_columns(LEVELS[0], "", "of all"),
     *_coverage_columns(LEVELS[1], "", "of all", "95 % covers"),
