@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -166,6 +167,10 @@ def neighbours() -> None:
     observed_frames()
 
 
+def spectra_of_au_mic() -> None:
+    shutil.copytree(ROOT / "tests" / "data" / "flares" / "aumic_iue", "aumic_iue")
+
+
 BROUGHT: dict[str, tuple[Callable[[], None], ...]] = {
     "README.md": (targets, observed_frames),
     "cluster.md": (study_of_ones_own,),
@@ -173,7 +178,7 @@ BROUGHT: dict[str, tuple[Callable[[], None], ...]] = {
     "my-instrument.md": (efficiency,),
     "neighbours.md": (neighbours,),
     "my-star.md": (spectra,),
-    "observations.md": (observed_frames,),
+    "observations.md": (observed_frames, spectra_of_au_mic),
     "page.md": (study_of_ones_own,),
     "plan.md": (targets,),
     "tutorial.md": (own_star,),
