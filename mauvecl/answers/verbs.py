@@ -84,6 +84,8 @@ class Verb:
         Key of the observation that the command does not take.
     defaults : mapping, optional
         Values of keys where neither a study file nor a flag is given, if they differ from the study's.
+    tab : bool
+        Whether the page has a tab with this answer; one without a class in `web.tabs` shows its first view.
     default : callable, optional
         Makes the study from the flags where no file is given; the paper's question by default.
     """
@@ -98,6 +100,7 @@ class Verb:
     without: str = ""
     defaults: Mapping[str, Any] | None = None
     default: Callable[[dict[str, Any]], Study] | None = None
+    tab: bool = False
 
     @property
     def ask(self) -> Callable[..., Any]:
@@ -188,6 +191,7 @@ VERBS: dict[str, Verb] = {
             ("limit", "flare", *DRAWS, *DETECTION, *NUISANCES, *UNKNOWN, "sweep"),
             counts="limits",
             older=("limiting_magnitude",),
+            tab=True,
         ),
         Verb(
             "map",
@@ -236,6 +240,7 @@ VERBS: dict[str, Verb] = {
     """,
             ("flare", "measure", *STARE, *NUISANCES, *SIZE, "run.fap", "run.seed", "sweep"),
             counts="flares",
+            tab=True,
         ),
         Verb(
             "stare",
@@ -372,6 +377,7 @@ VERBS: dict[str, Verb] = {
             ),
             counts="targets",
             observation=ORBIT,
+            tab=True,
         ),
     )
 }

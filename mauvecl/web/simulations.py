@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,11 +12,11 @@ from mauvecl.answers.campaigns.plan import PlanAnswer, plan
 from mauvecl.answers.campaigns.visible import visible
 from mauvecl.answers.detection import maps
 from mauvecl.answers.detection.detect import DetectAnswer, detect
-from mauvecl.answers.limits.limits import limit
 from mauvecl.answers.measurements.measure import MeasureAnswer, measure
 from mauvecl.answers.observations.change import change
 from mauvecl.answers.signal.snr import SnrAnswer, snr
 from mauvecl.answers.stares.inject import InjectAnswer, inject
+from mauvecl.answers.verbs import VERBS
 from mauvecl.host.orbit.targets import Target
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
@@ -96,10 +97,13 @@ def _visible(study: Study) -> dict[str, Any]:
     return {"visible": answer, "seen": {name: getattr(answer, name) for name in ("table", "months", "by_day")}}
 
 
-#: Functions of the simulations by name; they return answers by name.
-SIMULATIONS: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
+def _answer(verb: str, study: Study, pool: Pool) -> dict[str, Any]:
+    return {verb: VERBS[verb].ask(study, pool)}
+
+
+#: Functions of simulations that change the study or make several answers; they return answers by name.
+_ADAPTED: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
     "detection": _detection,
-    "limit": lambda study, pool: {"limit": limit(study, pool)},
     "map": lambda study, pool: {"map": map_around(study, pool)},
     "measure": lambda study, pool: {"measure": fits(study, pool)},
     "change": lambda study, pool: {"change": change(study)},
@@ -107,5 +111,7 @@ SIMULATIONS: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
     "visible": lambda study, pool: _visible(study),
     "plan": lambda study, pool: {"plan": campaign_plan(study)},
 }
+#: Functions of all simulations by name: the adapted ones, and the verbs that have a tab.
+SIMULATIONS = {name: partial(_answer, name) for name, verb in VERBS.items() if verb.tab} | _ADAPTED
 #: Simulations that use the pool's devices.
-DRAWING = {"detection", "limit", "map"}
+DRAWING = {"detection", "map"} | {name for name in SIMULATIONS.keys() - _ADAPTED.keys() if VERBS[name].counts}

@@ -1,8 +1,8 @@
-"""Tabs of the page, one module each; a new tab is added to the list below."""
+"""Tabs of the page: one module each for those with pictures, which are listed below; others follow from their verb."""
 
 from __future__ import annotations
 
-from mauvecl.web.tabs.change import Change
+from mauvecl.answers.verbs import VERBS
 from mauvecl.web.tabs.compare import Compare
 from mauvecl.web.tabs.completeness import Completeness
 from mauvecl.web.tabs.detection import Detection
@@ -16,8 +16,8 @@ from mauvecl.web.tabs.tab import Tab
 from mauvecl.web.tabs.unknowns import Unknown
 from mauvecl.web.tabs.visibility import Visibility
 
-#: By name, in the order of the page.
-TABS: dict[str, Tab] = {
+#: Tabs with pictures, in the order of the page.
+DRAWN: dict[str, Tab] = {
     one.name: one
     for one in (
         Detection(),
@@ -31,6 +31,19 @@ TABS: dict[str, Tab] = {
         Completeness(),
         Visibility(),
         Plan(),
-        Compare(),
     )
+}
+
+
+def _tab_of(verb: str) -> Tab:
+    """Return the tab with the first view of a verb's answer."""
+    made: Tab = type(verb.capitalize(), (Tab,), {"verb": verb})()
+    return made
+
+
+#: All tabs by name, in the order of the page.
+TABS: dict[str, Tab] = {
+    **DRAWN,
+    **{name: _tab_of(name) for name, verb in VERBS.items() if verb.tab and name not in DRAWN},
+    Compare.name: Compare(),
 }
