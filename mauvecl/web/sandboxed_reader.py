@@ -26,7 +26,7 @@ CONTENT_MIB = 64
 TOGETHER = 2
 #: Exit codes of the reading process.
 _REFUSED, _NO_ROOM = 2, 3
-#: What a source tells of itself beside its numbers.
+#: Attributes of a source other than its numbers.
 WORDS = ("name", "origin", "notes", "messages", "measured_nm", "unscaled")
 _turns = threading.BoundedSemaphore(TOGETHER)
 

@@ -34,13 +34,14 @@ from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 from typer.testing import CliRunner
 
+from mauvecl.answers.verbs import VERBS
 from mauvecl.cli.app import app
 from mauvecl.noise.scene import prepare
 from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.study.study import Study
-from mauvecl.web import access, closed_forms, server, visitor
+from mauvecl.web import access, closed_forms, server, tabs, visitor
 from mauvecl.web.closed_forms import ClosedForms, percent
 from mauvecl.web.downloads import as_command, as_python
 from mauvecl.web.fields import FIELDS, PRESETS, UPLOADED_UNKNOWN, Number, star_names, star_words
@@ -49,6 +50,7 @@ from mauvecl.web.plain_log import Plain
 from mauvecl.web.simulations import SIMULATIONS, campaign_plan
 from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS, limit
+from mauvecl.web.tabs.tab import FIXED
 from mauvecl.web.upload import MOST_UPLOADED, read_pairs, read_upload
 
 NUMBERS = [name for name, field in FIELDS.items() if isinstance(field.read, Number)]
@@ -969,3 +971,16 @@ def test_first_load_is_small_and_compressed(served: Any) -> None:
 
 def test_upload_limit_fits_into_a_message() -> None:
     assert MOST_UPLOADED + 4096 < server.MESSAGE
+
+
+def test_tab_of_a_verb_follows_from_its_row() -> None:
+    """Any verb with an answer may ask for a tab; its table is that of the terminal."""
+    made = tabs._tab_of("exposure")
+    assert (made.name, made.title, made.simulations) == ("exposure", "Exposure", {"exposure": "Exposure"})
+    study = Study().with_settings(["signal.snr=10", "signal.wavelength_nm=300"])
+    answer = VERBS["exposure"].ask(study)
+    headings, *cells = made.rows(None, {"exposure": answer})  # type: ignore[arg-type]
+    shown, all_cells = answer.views[0].texts(FIXED)
+    assert set(headings) <= set(shown)
+    assert len(cells) == len(all_cells) == 2
+    assert made.rows(None, {}) == []  # type: ignore[arg-type]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from mauvecl.answers.verbs import VERBS
+from mauvecl.web.tabs.change import Change
 from mauvecl.web.tabs.compare import Compare
 from mauvecl.web.tabs.completeness import Completeness
 from mauvecl.web.tabs.detection import Detection
