@@ -330,6 +330,7 @@ VERBS: dict[str, Verb] = {
     mauvecl change --star K5V -m 8 --exposure 300 --visits 40 --periods --look-at "eps Eri" --days 60
     """,
             ("change", "limit.power", "run.fap", "run.seed", *NUISANCES, *ORBIT, "orbit.targets", "sweep"),
+            tab=True,
         ),
         Verb(
             "calibrate",

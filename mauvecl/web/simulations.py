@@ -13,7 +13,6 @@ from mauvecl.answers.campaigns.visible import visible
 from mauvecl.answers.detection import maps
 from mauvecl.answers.detection.detect import DetectAnswer, detect
 from mauvecl.answers.measurements.measure import MeasureAnswer, measure
-from mauvecl.answers.observations.change import change
 from mauvecl.answers.signal.snr import SnrAnswer, snr
 from mauvecl.answers.stares.inject import InjectAnswer, inject
 from mauvecl.answers.verbs import VERBS
@@ -106,7 +105,6 @@ _ADAPTED: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
     "detection": _detection,
     "map": lambda study, pool: {"map": map_around(study, pool)},
     "measure": lambda study, pool: {"measure": fits(study, pool)},
-    "change": lambda study, pool: {"change": change(study)},
     "completeness": lambda study, pool: {"completeness": completeness(study, pool)},
     "visible": lambda study, pool: _visible(study),
     "plan": lambda study, pool: {"plan": campaign_plan(study)},
