@@ -84,6 +84,7 @@ def test_detected_flares_near_the_threshold_are_too_bright(engine: Engine) -> No
     assert any("intervals of 95 % cover 94 to 99 %" in text for text in answer.messages)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("amplitude", [1e-4, 0.01, 30.0])
 def test_faint_and_bright_flares_have_tables_and_pictures(amplitude: float, engine: Engine, tmp_path: Path) -> None:
     """Without limits on one side or both, or with pixels that saturate."""

@@ -271,6 +271,7 @@ def test_study_file_with_curves_shapes_and_events_is_read(tmp_path, stares):
     assert Case(study).stare.unknowns[0].name == "light drift"
 
 
+@pytest.mark.long
 def test_two_flares_of_the_documentation_have_their_values(stares):
     page = Path(__file__).parents[2] / "docs" / "flares-in-time.md"
     (text,) = (

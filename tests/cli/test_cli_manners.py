@@ -104,6 +104,7 @@ def test_bash_completes_verbs_and_flags(tmp_path: Path) -> None:
         assert wanted in done.stdout.split(), done
 
 
+@pytest.mark.long
 def test_pipes_have_no_colour_and_errors_go_to_stderr(tmp_path: Path) -> None:
     plain = started("library", folder=tmp_path, TERM="xterm-256color")
     assert "\x1b" not in plain.stdout + plain.stderr

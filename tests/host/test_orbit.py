@@ -69,6 +69,7 @@ def test_track_matches_the_verification_vectors() -> None:
     assert np.abs(track.of_date_km - np.array(rows)[:, 1:]).max() < 0.02
 
 
+@pytest.mark.long
 def test_frames_agree_with_astropy(day: Track) -> None:
     with offline():
         import astropy.units as u
@@ -89,6 +90,7 @@ def test_frames_agree_with_astropy(day: Track) -> None:
     assert np.abs(sun / np.linalg.norm(sun, axis=1)[:, None] - day.bodies.sun).max() < 5e-7
 
 
+@pytest.mark.long
 def test_check_values(orbit: Orbit, day: Track) -> None:
     """TIME.md, section 5."""
     from mauvecl.host.orbit.radiation import proton_map

@@ -369,6 +369,7 @@ FLUXES = {
 }
 
 
+@pytest.mark.long
 @given(
     wave=st.sampled_from(sorted(WAVES)),
     flux=st.sampled_from(sorted(FLUXES)),
@@ -423,6 +424,7 @@ no errors given; flux density; AB; redshift 0.0; x y; 2 columns; distance 10 pc;
 Teff 5777; wave, flux; Wavelength (nm) Flux (erg/s/cm2/A)"""
 
 
+@pytest.mark.long
 @given(
     lines=st.lists(st.sampled_from(re.split(r"; |\n", PROSE)), min_size=1, max_size=3, unique=True),
     remark=st.sampled_from(["# ", "% ", "! ", ";", ""]),

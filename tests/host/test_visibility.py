@@ -209,6 +209,7 @@ def test_flux_map_interpolates_between_cells() -> None:
         flux.at(edge, edge * 0, above_mev=5)  # type: ignore[arg-type]
 
 
+@pytest.mark.long
 def test_zodiacal_light_over_the_year() -> None:
     """As `Sky.at` has it, target by target and day by day."""
     times = TimeGrid("2027-01-01", 360.0, 86_400 * 30)

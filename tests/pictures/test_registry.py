@@ -92,6 +92,7 @@ def test_picture_is_added_in_one_place(monkeypatch: pytest.MonkeyPatch, tmp_path
         star.pictures["line-1"](ax="axes")
 
 
+@pytest.mark.long
 def test_matplotlib_is_loaded_when_a_picture_is_drawn() -> None:
     code = (
         "import sys; from mauvecl import Source; star = Source.from_library('G2V'); names = list(star.pictures); "

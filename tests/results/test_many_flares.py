@@ -28,6 +28,7 @@ def seen(engine: Engine, amplitudes: np.ndarray) -> Detection:
     return engine.detect(quiet, flares, **KIND)
 
 
+@pytest.mark.long
 def test_batches_of_flares_equal_all_at_once(engine: Engine) -> None:
     amplitudes = np.geomspace(0.001, 3.0, 40)
     table = seen(engine, amplitudes).table(0.01)
@@ -39,6 +40,7 @@ def test_batches_of_flares_equal_all_at_once(engine: Engine) -> None:
             np.testing.assert_array_equal(part[name], whole[name])
 
 
+@pytest.mark.long
 def test_memory_per_flare_is_bounded(engine: Engine) -> None:
     """From bright flares, whose bins are many, to faint ones; a histogram of all bins would keep 2 MB."""
     sizes = {}

@@ -70,6 +70,7 @@ def test_intervals_of_two_temperatures_have_nominal_coverage(engine: Engine) -> 
     assert stats.binom.sf(rejected - 1, 400, 0.01) > 1e-6
 
 
+@pytest.mark.long
 def test_second_temperature_of_a_single_blackbody_is_unconstrained(engine: Engine) -> None:
     """A blackbody of 9000 K: no limit on the second temperature, and the first is that of the plain fit."""
     quiet, _, one = expectations()

@@ -59,6 +59,7 @@ def of_two(form: QuadraticForm, x: float, *, upper: bool) -> float:
     return float(inside + upper * (stats.norm.sf(edges[-1]) + stats.norm.cdf(edges[0])))
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::scipy.integrate.IntegrationWarning")
 def test_two_terms_of_any_kind_against_quadrature() -> None:
     """Weights up to 1e4 apart, shifts up to 8: every tail to 1e-10, its quantile in half a second."""

@@ -388,6 +388,7 @@ def test_impossible_exports_raise(tmp_path: Path, engine: Engine, monkeypatch: p
         Selection.of(made)
 
 
+@pytest.mark.long
 def test_commands_of_stores_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("study.toml").write_text(study(100).toml())
