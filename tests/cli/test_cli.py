@@ -117,23 +117,21 @@ def test_study_is_read_from_a_table(answered: tuple[Path, str], tmp_path: Path) 
     assert "table 'no.ecsv' cannot be read" in run("detect", "no.ecsv", folder=tmp_path, code=2).stderr
 
 
-def test_study_defines_weights(tmp_path: Path) -> None:
-    """A band around 280 nm: its closed form and its simulation agree, and bad files are a sentence."""
+def test_study_defines_weights(tmp_path: Path, engine: Engine) -> None:
+    """The closed form and the simulation of a band around 280 nm agree, and bad files raise."""
     (tmp_path / "band.txt").write_text("# nm, per DN\n270 1\n290 1\n")
-    words = ("detect", "study.toml", "-n", "20000", "--fap", "0.01", "--no-pictures")
-    study = (
-        "[[star]]\nlibrary = 'G2V'\nmagnitude = 7.4\n[flare]\namplitudes = [0.03]\n[run.weights]\nband = 'band.txt'\n"
+    (tmp_path / "study.toml").write_text(
+        "[[star]]\nlibrary = 'G2V'\nmagnitude = 7.4\n[flare]\namplitudes = [0.03]\n"
+        "[run]\nrealisations = 20000\nfap = 0.01\n[run.weights]\nband = 'band.txt'\n"
     )
-    (tmp_path / "study.toml").write_text(study)
-    run(*words, folder=tmp_path)
-    table = QTable.read(tmp_path / "mauvecl-detect" / "detection.ecsv")
+    table = detect(Study.read(tmp_path / "study.toml"), engine).table
     (row,) = table[table["statistic"] == "band"]
     assert row["mean"] == pytest.approx(row["expected"], rel=0.02)
     assert abs(row["probability"] - row["closed_form_probability"]) < 0.03
     for text in ("270\n290\n", "a b\n", "290 1\n270 1\n"):
         (tmp_path / "band.txt").write_text(text)
         with pytest.raises(InputError) as error:
-            detect(Study.read(tmp_path / "study.toml"))
+            detect(Study.read(tmp_path / "study.toml"), engine)
         assert error.value.expected
 
 
@@ -285,14 +283,20 @@ def test_gaussian_writes_its_tables(tmp_path: Path) -> None:
     assert {p.name for p in (tmp_path / "mauvecl-gaussian").iterdir()} == names
 
 
-def test_wrong_template_loses_snr(tmp_path: Path) -> None:
-    """Looked for as 5000 K a flare of 10000 K is seen less often, and the text says how much S/N is kept."""
-    words = ("--star", "G2V", "-m", "7.4", "-a", "0.01", "-n", "50000", "--fap", "0.01", "--statistic", "matched")
-    shown = run("detect", *words, "--no-pictures", "--template", "5000", "--template", "10000", folder=tmp_path).stdout
-    kept = [float(line.split(" keeps ")[1].split()[0]) for line in shown.splitlines() if " keeps " in line]
+def test_wrong_template_loses_snr(engine: Engine) -> None:
+    """A search for a flare of 5000 K detects one of 10000 K less often; a message states the S/N that remains."""
+    run = [
+        "run.realisations=50000",
+        "run.fap=0.01",
+        "run.statistics=['matched']",
+        "run.template_temperatures_k=[5000, 10000]",
+    ]
+    study = Study().with_settings(["star=[{library='G2V', magnitude=7.4}]", "flare.amplitudes=[0.01]", *run])
+    answer = detect(study, engine)
+    kept = [float(line.split(" keeps ")[1].split()[0]) for line in answer.messages if " keeps " in line]
     assert 50 < kept[0] < 95
     assert kept[1] == 100.0
-    table = QTable.read(tmp_path / "mauvecl-detect" / "detection.ecsv")
+    table = answer.table
     p = dict(zip(table["statistic"], table["probability"], strict=True))
     assert p["matched 5000 K"] < p["matched"] == p["matched 10000 K"]
 
