@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from commands import run
+from layouts import documented_files
 
 from mauvecl.study.study import Study
 
@@ -171,9 +172,19 @@ def spectra_of_au_mic() -> None:
     shutil.copytree(ROOT / "tests" / "data" / "flares" / "aumic_iue", "aumic_iue")
 
 
+def observed_noise() -> None:
+    """Write a light curve of Mauve with dates."""
+    time, flux = np.arange(300) * 60.0, np.random.default_rng(1).normal(100.0, 1.0, 300)
+    columns = [fits.Column("TIME", "D", unit="s", array=time), fits.Column("FLUX", "D", array=flux)]
+    hdu = fits.BinTableHDU.from_columns(columns)
+    hdu.header.update({"MJDREF": 61_300, "TREFPOS": "TOPOCENTER", "INSTRUME": "mauve"})
+    hdu.writeto("light-curve.fits")
+
+
 BROUGHT: dict[str, tuple[Callable[[], None], ...]] = {
     "README.md": (targets, observed_frames),
     "cluster.md": (study_of_ones_own,),
+    "mapping.md": (observed_noise, lambda: documented_files(Path())),
     "long-runs.md": (study_of_ones_own,),
     "my-instrument.md": (efficiency,),
     "neighbours.md": (neighbours,),
