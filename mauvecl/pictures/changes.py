@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import COLOURS, NULL, headline, plain_numbers, styled_picture
+from mauvecl.study.parts import First
 
 if TYPE_CHECKING:
     from mauvecl.answers.observations.change import ChangeAnswer
 
-#: Stars and cells of the sweep that are drawn.
+#: Changes whose periods are drawn, at most.
 MOST = 3
 #: Nanometres on both sides of an index that are drawn.
 AROUND_NM = 15.0
@@ -24,25 +26,25 @@ def change_against_magnitude(plt: Any, answer: ChangeAnswer) -> Any:
     """Plot the smallest detectable changes against the magnitude of the star, one panel for each unit."""
     units = list(dict.fromkeys(row.change.unit for _, row in answer.along))
     figure, axes = plt.subplots(1, len(units), figsize=(1.0 + 3.3 * len(units), 3.6), squeeze=False)
-    titles = list(dict.fromkeys(row.title for row in answer.changes))[:1]
+    titles = First(list(dict.fromkeys(row.title for row in answer.changes)), 1, "stars")
+    (title,) = titles
     for axis, unit in zip(axes[0], units, strict=True):
         names = list(dict.fromkeys(row.change.name for _, row in answer.along if row.change.unit == unit))
-        for colour, name in zip(COLOURS, names, strict=False):
-            own = [(magnitude, row) for magnitude, row in answer.along if row.change.name == name]
-            first = own[: len(own) // len({row.title for row in answer.changes})]
-            x = np.array([magnitude for magnitude, _ in first])
-            y = np.array([row.smallest.one for _, row in first]) * (1 if unit else 100)
+        for colour, name in zip(cycle(COLOURS), names, strict=False):
+            own = [one for one in answer.along if one[1].change.name == name]
+            own = own[: len(own) // answer.many]
+            x = np.array([magnitude for magnitude, _ in own])
+            y = np.array([row.smallest.one for _, row in own]) * (1 if unit else 100)
             axis.plot(x[np.isfinite(y)], y[np.isfinite(y)], color=colour, label=name)
-        now = next((row for row in answer.changes if row.title == titles[0]), None)
         magnitude = answer.study.star[0].magnitude
-        if now is not None and magnitude is not None:
+        if magnitude is not None:
             axis.axvline(magnitude, color=NULL, linewidth=0.8, linestyle=":")
         axis.set(yscale="log", xlabel=f"magnitude ({answer.study.star[0].band})",
                  ylabel=f"smallest change ({unit or '%'})")  # fmt: skip
         plain_numbers(axis)
         axis.legend()
     visits, exposure = answer.study.change.visits, answer.study.observation.exposure_s
-    headline(figure, f"{titles[0]}: smallest change between {visits} visits of {exposure:g} s")
+    headline(figure, f"{title}: smallest change between {visits} visits of {exposure:g} s", titles.note)
     return figure
 
 
@@ -50,7 +52,8 @@ def change_against_magnitude(plt: Any, answer: ChangeAnswer) -> Any:
 @styled_picture
 def recovered_periods(plt: Any, answer: ChangeAnswer) -> Any:
     """Plot the share of recovered periods over period and semi-amplitude, for the first changes."""
-    some = answer.periods[:MOST]
+    first = First(answer.periods, MOST, "changes")
+    some = list(first)
     figure, axes = plt.subplots(1, len(some), figsize=(1.0 + 2.9 * len(some), 3.2), squeeze=False)
     for axis, row in zip(axes[0], some, strict=True):
         r = row.recovery
@@ -62,9 +65,9 @@ def recovered_periods(plt: Any, answer: ChangeAnswer) -> Any:
                  title=row.change.name)  # fmt: skip
         plain_numbers(axis)
     figure.colorbar(mesh, ax=list(axes[0]), label="recovered (%)")
-    first = some[0].recovery
-    days = float(np.ptp(first.time_d))
-    headline(figure, f"{some[0].title}: periods that {first.time_d.size} visits within {days:.0f} days recover")
+    time = some[0].recovery.time_d
+    text = f"{some[0].title}: periods that {time.size} visits within {np.ptp(time):.0f} days recover"
+    headline(figure, text, first.note)
     return figure
 
 

@@ -123,13 +123,16 @@ def throughput(plt: Any, instrument: Instrument) -> Any:
     w = np.linspace(*RANGE_NM, 501)
     figure, (above, below) = plt.subplots(2, 1, figsize=(3.6, 4.0), sharex=True)
     above.plot(w, 100 * instrument.quantum_efficiency(w), color=COLOURS[0])
-    above.set(ylabel="quantum efficiency (%)", title=f"{instrument.name}: nominal, not a flight calibration")
+    errors = instrument.throughput_errors
+    known = "nominal, not a flight calibration" if errors is None else "calibrated"
+    above.set(ylabel="quantum efficiency (%)", title=f"{instrument.name}: {known}")
     below.plot(w, 100 * instrument.throughput(w), color=COLOURS[4])
     spread = 100 * instrument.throughput(w)
-    below.fill_between(
-        w, np.where(w < 250, 0.5, 0.7) * spread, np.where(w < 250, 1.5, 1.3) * spread, color=NULL, alpha=0.25,
-        linewidth=0, label="sensible uncertainty",
-    )  # fmt: skip
+    ends = [np.where(w < 250, 1 - sign * 0.5, 1 - sign * 0.3) for sign in (1, -1)]
+    if errors is not None:
+        ends = [np.exp(sign * 1.96 * errors.sd(w)) for sign in (-1, 1)]
+    label = "sensible uncertainty" if errors is None else "95 %"
+    below.fill_between(w, ends[0] * spread, ends[1] * spread, color=NULL, alpha=0.25, linewidth=0, label=label)
     below.set(xlabel=WAVELENGTH, ylabel="throughput with it (%)", xlim=RANGE_NM)
     below.legend()
     return figure

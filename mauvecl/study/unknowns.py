@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,6 +27,7 @@ from mauvecl.study.parts import First
 if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.noise.priors import Prior
+    from mauvecl.study.cases import Case
     from mauvecl.study.study import Study
 
 Float = NDArray[np.float64]
@@ -84,6 +85,12 @@ def drawn(study: Study) -> DrawnStudies:
             raise error.within("the priors of unknown values include impossible ones") from error
         studies.append(changed)
     return DrawnStudies(tuple(priors), tuple(rows[name].label for name in priors), values, tuple(studies))
+
+
+def throughput_cases(case: Case) -> list[Case]:
+    """Return the case with each mode of its calibrated throughput at one standard deviation; empty if it has none."""
+    modes = (row for row in values_of(case.instrument).values() if isinstance(row, ThroughputMode))
+    return [replace(case, study=case.study.with_instrument(mode.changes(case.instrument, 1.0))) for mode in modes]
 
 
 def _unknown_priors(study: Study, nominal: Instrument) -> dict[str, Prior]:

@@ -18,6 +18,7 @@ from mauvecl.answers.campaigns.planned import (
     Planned,
     TargetObservation,
     closed_form,
+    errors_of_throughput,
     observe,
     rates_of,
     star_of,
@@ -31,7 +32,7 @@ from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.messages import Message, of_kind
 from mauvecl.schema.physical import DAY_S
-from mauvecl.schema.tables import Column, View, number, table_of
+from mauvecl.schema.tables import Column, View, number, percent, table_of
 from mauvecl.study.cases import Case
 from mauvecl.study.messages import SATURATED, collect_messages
 from mauvecl.study.study import Study
@@ -70,6 +71,14 @@ COLUMNS = (
     Column("at_least_one", lambda one: one.recovered.at_least_one if one.recovered else np.nan, "",
            "probability of recovering any", "P(>= 1)", number(".2f")),
     Column("best_months", lambda one: " ".join(one.best_months), "", "those with most hours", "best months", months),
+)  # fmt: skip
+#: Columns of errors by a calibrated throughput.
+THROUGHPUT_COLUMNS = (
+    Column("E50_error", lambda one: one.of_throughput[0] if one.of_throughput else np.nan, "",
+           "relative standard error of E50 by the calibration of the throughput", "E50 by throughput", percent(".2g")),
+    Column("expected_error", lambda one: one.of_throughput[1] if one.of_throughput else np.nan, "",
+           "relative standard error of the recovered flares by the calibration of the throughput",
+           "flares by throughput", percent(".2g")),
 )  # fmt: skip
 #: Columns of the table of what is put in.
 STAR_COLUMNS = (
@@ -134,7 +143,8 @@ class PlanAnswer(Answer):
         alarms = Column("false_alarms", lambda one: self.study.search.rate * one.hours / 24, "", "expected of noise",
                         "false alarms", two_digits)  # fmt: skip
         share = share_columns(self.study.has_neighbours, "observation.quiet.target_share")
-        return (*COLUMNS[:-1], alarms, *share, COLUMNS[-1])
+        calibrated = any(one.of_throughput is not None for one in self.planned)
+        return (*COLUMNS[:-1], alarms, *share, *(THROUGHPUT_COLUMNS if calibrated else ()), COLUMNS[-1])
 
     @property
     def table(self) -> QTable:
@@ -361,7 +371,8 @@ def plan(
         if rates is not None:
             days = observed * 3600 / DAY_S
             recovered = Yield.of_expected(0.0, 0.0) if its is None else Yield.of(rates, its, days)
-        return Planned(one, exposed, observed, its, rates, recovered, best, why)
+        of_throughput = errors_of_throughput(one, rates)
+        return Planned(one, exposed, observed, its, rates, recovered, best, why, of_throughput)
 
     planned: list[Planned] = []
     if progress is not None:

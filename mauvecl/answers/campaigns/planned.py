@@ -15,12 +15,13 @@ from mauvecl.host.stars.spectral_types import nearest_spectrum
 from mauvecl.lightcurve.flares.energies import EnergyScale, quiescent_luminosity
 from mauvecl.lightcurve.flares.rates import BOLOMETRIC, Rates
 from mauvecl.lightcurve.search.completeness import Completeness, frame_signal
-from mauvecl.lightcurve.search.yields import Yield
+from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
 from mauvecl.schema.errors import InputError
 from mauvecl.study.cases import Case
 from mauvecl.study.orbits import PlanTarget
 from mauvecl.study.sections import SkyLight, Star
 from mauvecl.study.stare_expectation import energy_scale
+from mauvecl.study.unknowns import throughput_cases
 
 if TYPE_CHECKING:
     from mauvecl.answers.campaigns.visible import VisibleAnswer
@@ -89,6 +90,7 @@ class Planned:
     recovered: Yield | None  # recovered flares; None if rates are unknown
     best_months: tuple[str, ...]
     no_rates: str = ""  # reason for unknown rates
+    of_throughput: tuple[float, float] | None = None  # relative errors of E50 and yield by a calibrated throughput
 
     @property
     def name(self) -> str:
@@ -119,6 +121,25 @@ def closed_form(observation: TargetObservation) -> Completeness:
         bank=study.search.white_bank(observation.quiet.frame_s),
         law=study.plan.law(),
     )
+
+
+def errors_of_throughput(observation: TargetObservation, rates: Rates | None) -> tuple[float, float] | None:
+    """Return the relative errors of E50 and of the recovered flares by a calibrated throughput, to first order.
+
+    They are those of the closed form; None if the throughput is not calibrated, or nothing is recovered.
+    """
+    calibrated = throughput_cases(observation.case)
+    if not calibrated or not observation.signal_per_frame > 0 or not observation.window_s > 0:
+        return None
+
+    def logarithms(case: Case) -> tuple[float, float]:
+        its = closed_form(replace(observation, case=case))
+        number = np.nan if rates is None else recovered_per_day(rates, its)
+        return float(np.log(its.energy_at(0.5))), float(np.log(number))
+
+    moved = np.array([logarithms(case) for case in calibrated]) - logarithms(observation.case)
+    energy, number = np.sqrt((moved**2).sum(axis=0))
+    return float(energy), float(number)
 
 
 def rates_of(text: PlanTarget, observation: TargetObservation) -> tuple[Rates | None, str]:

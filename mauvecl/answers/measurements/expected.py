@@ -20,6 +20,7 @@ from mauvecl.results.measurements.two_temperatures import (
     forecast_two_temperatures,
 )
 from mauvecl.study.measurements import fitted_models
+from mauvecl.study.unknowns import throughput_cases
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -43,6 +44,7 @@ class ExpectedMeasurement(InCell):
     fitted: FlareModel | TwoTemperatures
     quiet: Expectation
     unknown: Nuisances | None
+    of_throughput: Float | None  # standard errors by the calibration of the throughput, which exposures share
 
     @property
     def name(self) -> str:
@@ -157,6 +159,7 @@ def expected_measurements(
     truth = Truth(case.star, case.source, case.flaring(amplitude), light, band, quiet.exposure_s)
     lit = flare.recorded_dn - quiet.recorded_dn
     snr = matched_filter(quiet, flare, None, lit)[1], matched_filter(quiet, flare, unknown, lit)[1]
+    calibrated = throughput_cases(case)
     expected = []
     for name, model in (models or models_of(case)).items():
         perfect = fit_model(flare.recorded_dn, quiet, model, unknown)
@@ -164,12 +167,47 @@ def expected_measurements(
             forecast_model(quiet, model, perfect.log_k[0], perfect.amplitudes[0], u) for u in (None, unknown)
         )
         true = np.array([truth.value(quantity) for quantity in model.names])
+        of_throughput = None
+        if calibrated:
+            of_throughput = _errors_of_throughput(calibrated, amplitude, model, quiet, unknown, perfect)
         expected.append(
             ExpectedMeasurement(
-                case.label, case.at, amplitude, name, snr, true, known, ahead, perfect, model, quiet, unknown
+                case.label,
+                case.at,
+                amplitude,
+                name,
+                snr,
+                true,
+                known,
+                ahead,
+                perfect,
+                model,
+                quiet,
+                unknown,
+                of_throughput,
             )
         )
     return expected
+
+
+def _errors_of_throughput(
+    calibrated: list[Case],
+    amplitude: float,
+    model: FlareModel | TwoTemperatures,
+    quiet: Expectation,
+    unknown: Nuisances | None,
+    perfect: Measurement,
+) -> Float:
+    """Return the standard errors that the throughput's own errors cause, to first order, shape (n_derived,).
+
+    The observer knows the quiescent exposure from other frames, and fits the flare with the calibrated throughput.
+    """
+    moved = []
+    for case in calibrated:
+        (flare,) = case.expect(case.flaring(amplitude))
+        exposure = quiet.recorded_dn + flare.recorded_dn - case.quiet.recorded_dn
+        moved.append(fit_model(exposure, quiet, model, unknown).estimates[0] - perfect.estimates[0])
+    return np.asarray(np.sqrt(np.sum(np.square(moved), axis=0)))
 
 
 def matched_filter(

@@ -92,7 +92,9 @@ class MeasuredFlare(ExpectedMeasurement):
                 values |= dict(
                     zip((name, f"{name}_low", f"{name}_high"), _coverage(found, truth, k, which), strict=True)
                 )
-        return table_of(COLUMNS, [values])
+        if self.of_throughput is not None:
+            values["error_throughput"] = self.of_throughput
+        return table_of(columns_of([self]), [values])
 
     @cached_property
     def rejected(self) -> Interval:
@@ -133,6 +135,18 @@ COLUMNS = (
     Column("bias_selected", "", "", "median of the estimates of detected flares less the truth"),
     Column("one_sided", "", "", "share of 95 % intervals with one end", "one-sided", percent(".0f")),
 )
+#: Column of errors that all exposures share, after the standard errors of one exposure.
+THROUGHPUT_COLUMN = Column("error_throughput", "", "", "standard error by the calibration of the throughput, which all "
+                           "exposures share", "by throughput", ".4g")  # fmt: skip
+
+
+def columns_of(flares: Sequence[MeasuredFlare]) -> tuple[Column, ...]:
+    """Return the columns of measured quantities, with that of the throughput if it is calibrated."""
+    place = [column.name for column in COLUMNS].index("error") + 1
+    calibrated = any(one.of_throughput is not None for one in flares)
+    return (*COLUMNS[:place], *((THROUGHPUT_COLUMN,) if calibrated else ()), *COLUMNS[place:])
+
+
 #: Columns of the table of fits.
 FIT_COLUMNS = (
     Column("snr", lambda one: one.snr[0], "", "S/N of the flare in one exposure, everything known", "S/N, all known",
@@ -229,7 +243,7 @@ class MeasureAnswer(Answer):
     def views(self) -> list[View]:
         measured = self.table[self.table["unit"] != "erg / s"]
         title = f"Measured in one exposure; {self.study.measure.fits} simulated fits of each flare"
-        views = [View(title, (*self._first, *COLUMNS), measured)]
+        views = [View(title, (*self._first, *columns_of(self.flares)), measured)]
         drawn = [one.drawn for one in self.stares if isinstance(one.drawn, MeasuredBins)]
         if drawn:
             columns = (*place_columns(self.study), *_bin_columns(drawn[0]))

@@ -181,6 +181,11 @@ class ChangeAnswer(Answer):
         return (*self.USES, "orbit", "seed") if self.periods else self.USES
 
     @property
+    def many(self) -> int:
+        """Number of stars at other magnitudes: all with a magnitude, in every cell of the sweep."""
+        return len(self.along) // (MAGNITUDES.size * len(self.study.change.of))
+
+    @property
     def _place(self) -> tuple[Column, ...]:
         return place_columns(self.study)
 
