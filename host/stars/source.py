@@ -382,7 +382,8 @@ class Source(Drawable, ContentEquality):
             See `magnitude`.
         """
         factor = 10.0 ** (-0.4 * (magnitude - self.magnitude(band, system)))
-        scaled = self._with_flux(self.flux_flam * factor, f"scaled to {bands.band(band).name} = {magnitude:g}")
+        history = (*self.history, f"scaled to {bands.band(band).name} = {magnitude:g}")
+        scaled = replace(self, flux_flam=self.flux_flam * factor, history=history)
         return replace(scaled, scale=bands.scale(band, system), unscaled="")
 
     def flaring(
@@ -470,6 +471,3 @@ class Source(Drawable, ContentEquality):
         flux = self.flux_flam[inside] * model.extinguish(self.wavelength_nm[inside] * u.nm, Ebv=ebv)
         history = (*self.history, f"reddened by E(B-V) = {ebv:g}, {law}, R_V = {rv:g}")
         return replace(self, wavelength_nm=self.wavelength_nm[inside], flux_flam=flux, history=history)
-
-    def _with_flux(self, flux: NDArray[np.float64], what: str) -> Self:
-        return replace(self, flux_flam=flux, history=(*self.history, what))

@@ -207,14 +207,10 @@ def kernel_cache() -> KernelCache:
             break
     else:
         raise OSError(f"no folder for compiled kernels can be written to with {MIN_FREE_BYTES >> 20} MiB to spare")
-    store = KernelCache(base if _writable(base) else None, work)
+    store = KernelCache(base if base.is_dir() and os.access(base, os.W_OK) else None, work)
     # PoCL's threads may still write when Python exits; a later process removes these files.
     atexit.register(store.close)
     return store
-
-
-def _writable(folder: Path) -> bool:
-    return folder.is_dir() and os.access(folder, os.W_OK)
 
 
 def _working_folder(parent: Path) -> Path | None:

@@ -105,7 +105,7 @@ class StareLaunches(Launches):
             Index in `out` of the tile's first stare.
         """
         if self._by_sums:
-            self._by_cumulants(tile, out, row)
+            self._in_frames("stare_sums", self.variant, self._own, tile, out, row)
         else:
             self._by_pixels(tile, out[:, row : row + tile.wanted])
 
@@ -136,10 +136,6 @@ class StareLaunches(Launches):
             host = np.empty((size, self._scenarios, self.variant.sums, tile.size), np.float32)
             self._cl.enqueue_copy(self._queue, host, values)
             out[..., begin : begin + size] = host[..., tile.start : tile.stop].transpose(1, 3, 2, 0)
-
-    def _by_cumulants(self, tile: Tile, out: Floats, row: int) -> None:
-        """Draw sums from their cumulants, all frames of each stare at once."""
-        self._in_frames("stare_sums", self.variant, self._own, tile, out, row)
 
     def glow(self, tile: Tile, out: Floats, row: int) -> None:
         """Compute what `Injections` need to add flares to a tile's frames.

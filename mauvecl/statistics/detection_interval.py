@@ -15,12 +15,10 @@ FEW = 10
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
-def detection_interval(
-    above: Sequence[float], trials: int, fap: float, correlation: float = 0.0, confidence: float = CONFIDENCE
-) -> Interval:
+def detection_interval(above: Sequence[float], trials: int, fap: float, correlation: float = 0.0) -> Interval:
     """Return the fraction of flares above an estimated threshold, with an interval of the detection probability.
 
-    The interval is for the probability above the true threshold.
+    The interval is for the probability above the true threshold, at the level `CONFIDENCE` of the threshold's interval.
 
     Parameters
     ----------
@@ -34,8 +32,6 @@ def detection_interval(
         Correlation of null and flare statistic, 0 to 1, if the threshold was estimated from the flares' own draws. Use
         0 if it was not, or if the correlation is unknown; the interval is then too wide, by a few per cent if the
         probability is much larger than `fap`.
-    confidence : float
-        Level of the threshold's interval and of the result.
 
     Notes
     -----
@@ -48,7 +44,7 @@ def detection_interval(
     Jeffreys's.
     """
     above_cut, few, many = above
-    tail = (1.0 - confidence) / 2.0
+    tail = (1.0 - CONFIDENCE) / 2.0
     middle, lower, upper = (_probit((k + 0.5) / (trials + 1.0)) for k in (above_cut, few, many))
     # For small counts Jeffreys's interval undercovers; Clopper and Pearson's never does.
     more = 0.5 if min(above_cut, trials - above_cut) >= FEW else 0.0

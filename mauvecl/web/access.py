@@ -30,10 +30,12 @@ def local(address: str) -> bool:
     Raises
     ------
     InputError
-        If it is empty, or no address or name that this machine knows.
+        If it is empty, or this machine cannot resolve it.
     """
     if not address.strip():
-        raise InputError("address = '' is empty", "one such as 127.0.0.1, ::1 or 0.0.0.0", key="address", value=address)
+        raise InputError(
+            "address = '' is empty", "an address such as 127.0.0.1, ::1 or 0.0.0.0", key="address", value=address
+        )
     try:
         known = {str(info[4][0]).split("%")[0] for info in socket.getaddrinfo(address, None, type=socket.SOCK_STREAM)}
     except (OSError, UnicodeError) as error:
@@ -57,7 +59,7 @@ def origin(text: str) -> str:
     Raises
     ------
     InputError
-        If it names no single host.
+        If it does not name a single host.
     """
     host = re.sub(r"^https?://", "", text.strip().lower()).removesuffix("/")
     if re.fullmatch(HOST, host) is None:
@@ -71,20 +73,20 @@ def hosts(address: str, port: int, allowed: Iterable[str]) -> frozenset[str]:
     Parameters
     ----------
     address : str
-        Where the server listens.
+        Address on which the server listens.
     port : int
     allowed : iterable of str
-        What `--allow-origin` names.
+        Values of `--allow-origin`.
 
     Raises
     ------
     InputError
-        If others than this machine may come and no origin is named, or an origin or the address is none.
+        If other machines may connect and no origin is given, or an origin or the address is invalid.
     """
     named = {origin(text) for text in allowed}
     if not local(address) and not named:
         raise InputError(
-            f"address = {shortened(address)} lets in other machines",
+            f"address = {shortened(address)} accepts other machines",
             "`allow_origin` with the address that visitors' browsers will show, such as https://mauve.example.org",
             key="address",
             value=address,
@@ -110,12 +112,12 @@ class RefusalHandler(RequestHandler):
 
 
 class AccessMatcher(Matcher):
-    """Matcher of requests that are refused.
+    """Matcher of requests that are rejected.
 
     Parameters
     ----------
     allowed : frozenset of str
-        As `hosts` gives them.
+        Hosts from `hosts`.
     """
 
     def __init__(self, allowed: frozenset[str]) -> None:
@@ -127,23 +129,23 @@ class AccessMatcher(Matcher):
         return Rule(cls(allowed), RefusalHandler)
 
     def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
-        """Return the reason for which a request is refused, or None."""
+        """Return the reason for which a request is rejected, or None."""
         refused = self._foreign(request) or self._too_many(request)
         return None if refused is None else {"target_kwargs": dict(zip(("status", "why"), refused, strict=True))}
 
     def _foreign(self, request: HTTPServerRequest) -> tuple[int, str] | None:
-        """Return the refusal of an unknown host name (DNS rebinding) or of another server's page, or None."""
+        """Return the error for an unknown host name (DNS rebinding) or another server's page, or None."""
         if [plain(host) for host in request.headers.get_list("Host")] not in [[host] for host in self._allowed]:
             return 403, "The page is not served under this host name; see `mauvecl serve --allow-origin`."
         for given in request.headers.get_list("Origin"):
             if plain(re.sub(r"^https?://", "", given.lower())) not in self._allowed:
-                return 403, "The page is not there for pages of other servers; see `mauvecl serve --allow-origin`."
+                return 403, "Pages of other servers cannot use this page; see `mauvecl serve --allow-origin`."
         if request.path == "/live" and not request.headers.get_list("Origin"):
-            return 403, "Expected a connection as the page makes it."
+            return 403, "Expected a connection from the page."
         return None
 
     def _too_many(self, request: HTTPServerRequest) -> tuple[int, str] | None:
-        """Return the refusal if there are too many visitors, or None."""
+        """Return the error if there are too many visitors, or None."""
         if request.path in ("/", "/live") and len(Visitor.here) >= MAX_VISITORS:
             return 503, "Too many visitors are here at the moment; please come again in some minutes."
         return None

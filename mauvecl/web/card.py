@@ -11,7 +11,7 @@ from mauvecl.web.tabs.tab import Answers
 
 #: Part of the message about the throughput, which the page shows once.
 NOMINAL = "The throughput is nominal"
-#: Answers whose messages are shown; those of others stand among them.
+#: Answers whose messages are shown, since they include those of the others.
 TOLD = ("detection", "measure", "completeness", "visible", "plan")
 #: Sensible relative uncertainty of the nominal throughput (assumed; see the documentation's page on what is nominal).
 THROUGHPUT = 0.3

@@ -1,4 +1,4 @@
-"""ClosedForms-form answers to a visitor's question."""
+"""Closed-form answers to a visitor's question."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class ClosedForms:
 
     question: Question
     case: Case
-    odds: DetectionForms  # of the statistic that is asked for, for Gaussian noise
-    chance: float  # of detection; NaN if the flare saturates every pixel that counts
+    odds: DetectionForms  # of the requested statistic, for Gaussian noise
+    chance: float  # of detection; NaN if the flare saturates every used pixel
 
     @classmethod
     def of(cls, question: Question, folder: Path) -> ClosedForms:
@@ -46,12 +46,12 @@ class ClosedForms:
         ----------
         question : Question
         folder : Path
-            Where an uploaded spectrum is written for the study to find.
+            Folder to which an uploaded spectrum is written for the study.
 
         Raises
         ------
         InputError
-            For values that cannot be together.
+            For incompatible values.
         """
         q, study = question, question.study(folder)
         uploaded = q.uploaded

@@ -39,7 +39,7 @@ def study_file(study: Study, name: str) -> tuple[str, bytes]:
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         archive.write(file, STAR_FILE)
-        # The file as seen from the study: not where the server has it.
+        # Path relative to the study, instead of that on the server.
         archive.writestr("study.toml", study.toml().replace(str(file.resolve()), STAR_FILE))
     return f"{name}.zip", out.getvalue()
 
@@ -51,7 +51,7 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
     ----------
     tab : Tab
     name : str
-        Of the tab's `files`.
+        One of the tab's `files`.
     ending : {"ecsv", "fits", "study"}
     closed : ClosedForms
     answers : mapping

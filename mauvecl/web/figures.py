@@ -16,7 +16,7 @@ SHOWN_NM = (195.0, 705.0)
 #: Spectral lines, nm in vacuum (NIST Atomic Spectra Database, version 5): Mg II h and k, Ca II H and K, H alpha. The
 #: Balmer jump is 4 / R_H, with Rydberg's constant for hydrogen.
 MARKS = {"Mg II": (279.63, 280.35), "Ca II": (393.48, 396.96), "Balmer jump": (364.7,), "H alpha": (656.46,)}
-#: Marks that show only if asked for.
+#: Marks that are hidden by default.
 MORE_MARKS = ("H alpha",)
 
 
@@ -58,7 +58,7 @@ INKS = {
 }  # fmt: skip
 
 
-#: How lines of pinned scenarios are broken: lengths drawn and left out.
+#: Dash patterns of the lines of pinned scenarios: lengths of dashes and gaps.
 DASHES = ("6 3", "9 3 2 3", "2 2")
 
 
@@ -69,9 +69,9 @@ class Canvas:
     ----------
     ink : Ink
     x, y : str
-        What the axes are called, with units.
+        Labels of the axes, with units.
     logs : frozenset of str
-        Which axes are logarithmic.
+        Logarithmic axes.
     wavelength : bool
         Whether x is a wavelength: its range is then shared with all such figures, and lines are marked.
     """
@@ -83,7 +83,7 @@ class Canvas:
         )
         named = isinstance(how.get("y_range"), list)
         if "y_range" not in how:
-            # What is not asked for takes no room; before there is anything there is a range all the same.
+            # Hidden marks do not affect the range; without data, the range is a default one.
             ranges["y_range"] = DataRange1d(only_visible=True, default_span=2.0)
         plot = figure(
             x_axis_label=x,
@@ -112,7 +112,7 @@ class Canvas:
         plot.grid.grid_line_color = ink.grid
         plot.x_range.name, plot.y_range.name = "wavelength" if wavelength else "x range", "y range"
         self.plot = plot
-        #: What the page says of the picture: names, colours, forms, and by what each is asked for.
+        #: Entries of the legend: name, colour, form, and the tag that shows or hides each.
         self.legend: list[tuple[str, str, str, str]] = []
         if wavelength:
             self._mark()

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class InterpolatedForm:
-    """ClosedForms form that is exact at some points and interpolated in the probit between them.
+    """Closed form that is exact at some points and interpolated in the probit between them.
 
     Parameters
     ----------

@@ -14,10 +14,10 @@ from mauvecl.web.fields import FIELDS, UPLOADED, Draws, Field
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
 
-#: Fields whose values only count with those of others.
+#: Fields whose values only apply together with those of others.
 CONDITIONAL = ("sky_brightness", "target", "time", "second_area", "hours")
 Points = tuple[tuple[float, float], ...]
-#: Name of an uploaded star's file beside its study.
+#: Name of an uploaded star's file in the folder of its study.
 STAR_FILE = "star.ecsv"
 
 

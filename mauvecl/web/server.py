@@ -7,15 +7,15 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-#: Bytes of one message: an upload, and room; and of a request's body, for the page takes none.
+#: Largest size in bytes of a message, an upload with a margin, and of a request's body, of which the page has none.
 MESSAGE, BODY = 8 * 2**20, 2**16
-#: Seconds that a connection may take for the headers of a request and for its body, also where it is kept for another.
+#: Seconds that a connection may take for the headers and the body of each request.
 REQUEST_S = 20.0
-#: Open connections; of more, the oldest that is not a visitor's page is closed. Browsers open up to six each.
+#: Largest number of open connections, beyond which the oldest without a page is closed; browsers open up to six.
 MAX_CONNECTIONS = 512
-#: Seconds after which a page that nobody uses is let go, and between two looks.
+#: Seconds after which unused pages are disconnected, and interval of this check.
 IDLE_S, SWEEP_S = 3600, 5
-#: Seconds between two signs of life on a connection; one that gives none is ended.
+#: Seconds between pings of a connection, which is closed if it does not reply.
 PING_S = 20
 
 
@@ -25,10 +25,10 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
     Parameters
     ----------
     address : str
-        127.0.0.1 lets only this machine in.
+        Address; 127.0.0.1 accepts only this machine.
     port : int
     allowed : sequence of str
-        Origins by which the page may be asked for beside this machine's own.
+        Origins of the page in addition to this machine's own.
 
     Returns
     -------
@@ -37,7 +37,7 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
     Raises
     ------
     InputError
-        If the address cannot be, or lets in other machines without an origin.
+        If the address is invalid, or accepts other machines without an origin.
     OSError
         If the port is taken.
     """
@@ -64,7 +64,7 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
         default_handler_args={"status": 404, "why": "There is no such page."},
         log_function=lambda handler: None,
     )
-    # The door is asked before anything else.
+    # Access control comes first.
     application.default_router.rules.insert(0, AccessMatcher.rule(let_in))
     server = BoundedServer(
         application,
@@ -107,7 +107,7 @@ def warm() -> None:
         shown(tab, closed, {})
     Job(lambda pool: pool.realise(closed.quiet, count=1, seed=0)).future.result()
     prepare()
-    # What is there now stays; looking through it again would cost each visitor.
+    # Objects that exist now are permanent, so garbage collection need not scan them again.
     gc.collect()
     gc.freeze()
 
@@ -118,17 +118,17 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
     Parameters
     ----------
     address : str
-        127.0.0.1 lets only this machine in.
+        Address; 127.0.0.1 accepts only this machine.
     port : int
     show : bool
-        Open a browser.
+        Whether to open a browser.
     allow_origin : sequence of str
-        Origins by which the page may be asked for; needed where the address lets in other machines.
+        Origins of the page; required if the address accepts other machines.
 
     Raises
     ------
     InputError, OSError
-        As `make` does.
+        As for `make`.
     """
     import asyncio
 

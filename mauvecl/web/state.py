@@ -1,6 +1,6 @@
-"""What a visitor has entered, as text: a question where every field is right, and what is wrong where one is not.
+"""State of the page: the text of all fields, their errors, and the question if all are valid.
 
-Nothing here knows how the page looks; whatever shows it enters text here, and shows `entered` and `faults`.
+The state is independent of the page's appearance: the page enters text, and shows `entered` and `faults`.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from mauvecl.web.tabs import TABS
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
 
-#: Bytes of a link's values that are looked at.
+#: Largest number of characters of a link that are parsed.
 MOST_LINKED = 4096
-#: What a link holds beside the question.
+#: Entries of a link in addition to the question.
 SEEN = {"tab": Field("Tab", next(iter(TABS)), Choice(tuple(TABS))), "simulated": Field("Simulated", "", several)}
 
 
@@ -31,15 +31,15 @@ class State:
     Attributes
     ----------
     entered : dict
-        Text of each field, right or wrong, by name: those of `FIELDS` and `SEEN`.
+        Text of each field of `FIELDS` and `SEEN` by name, valid or not.
     faults : dict
-        The sentence of what is wrong, by name of the field; empty where there is a question.
+        Error message by name of the field; empty if there is a question.
     stray : str
-        What the last link held that is no field, in a sentence, or nothing.
+        Message on entries of the last link that are not fields, or empty.
     uploaded : Source or None
-        The spectrum that stands for the star where "uploaded star" is entered.
+        Spectrum of the star if "uploaded star" is entered.
     unknown : tuple of pairs or None
-        Likewise where "uploaded spectrum" is entered for what is unknown.
+        Spectrum of the unknown if "uploaded spectrum" is entered.
     """
 
     def __init__(self, uploaded: Source | None = None, unknown: Points | None = None) -> None:
@@ -115,7 +115,7 @@ class State:
         Raises
         ------
         InputError
-            If some field is not right, with what each accepts.
+            If a field is invalid, with the accepted values of each.
         """
         if self.faults:
             fault, _, expected = self.fault.partition(", expected ")
@@ -150,6 +150,6 @@ class State:
         first = {name: field.first for name, field in self._fields.items()}
         self.enter(first | {name: text for name, text in pairs if name in self._fields})
         for name in SEEN.keys() & self.faults.keys():
-            # No field of the page could set them right.
+            # The page has no field to correct them.
             self.stray += f" The link's {name}: {self.faults[name]}; it was left out."
             self.enter({name: SEEN[name].first})

@@ -13,7 +13,7 @@ from tornado.web import RequestHandler
 
 from mauvecl.host.version import VERSION
 
-#: The page asks its own server alone, and runs no code but its own.
+#: The page connects to its own server only, and runs only its own code.
 HEADERS = {
     "Content-Security-Policy": (
         "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; object-src 'none'; "
@@ -97,7 +97,7 @@ def front() -> bytes:
 
 
 def _digest() -> str:
-    """Return the digest of all assets, so that browsers use no old ones."""
+    """Return the digest of all assets, so that browsers do not use old ones."""
     each = [packed(content)[1] for path in sorted(_FOLDER.iterdir()) if (content := asset(path.name)) is not None]
     return hashlib.sha256("".join(each).encode()).hexdigest()[:12]
 

@@ -193,7 +193,7 @@ class Visitor(WebSocketHandler):
             self._begin(self._or_why(work, **told))
             return
         work.close()
-        self.tell(**told, refused="too much is asked for at once, expected one thing after the other")
+        self.tell(**told, refused="too many requests at the same time, expected one after the other")
 
     async def _or_why(self, work: Coroutine[Any, Any, None], **told: Any) -> None:
         """Run a function, and report an invalid request or an internal error."""

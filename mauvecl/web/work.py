@@ -17,7 +17,7 @@ from mauvecl.runs.pool import LocalWorkers, Pool, PoolProgress
 TOGETHER = 2
 _threads = ThreadPoolExecutor(TOGETHER, thread_name_prefix="mauvecl-page")
 _own = threading.local()
-#: Uploads are read one after the other, beside the event loop.
+#: Uploads are read one after the other, outside the event loop.
 _reader = ThreadPoolExecutor(1, thread_name_prefix="mauvecl-upload")
 
 

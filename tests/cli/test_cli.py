@@ -278,7 +278,7 @@ def test_snr_answers_the_budgets_of_the_paper_and_sweeps(tmp_path: Path) -> None
 def test_gaussian_writes_its_tables(tmp_path: Path) -> None:
     words = ("--star", "G2V", "-n", "10000", "--fap", "0.01", "--sweep", "magnitude=6,9", "--statistic", "matched")
     shown = run("gaussian", *words, folder=tmp_path).stdout
-    assert "The root-of-N formula beside 10,000 realisations" in shown
+    assert "The root-of-N formula and 10,000 realisations" in shown
     names = {"gaussian.ecsv", "elements.ecsv", "thresholds.ecsv", "gaussian.png", "study.toml", "run.json"}
     assert {p.name for p in (tmp_path / "mauvecl-gaussian").iterdir()} == names
 

@@ -11,17 +11,9 @@ from astropy.modeling.models import BlackBody
 from mauvecl.host.stars.bands import band
 from mauvecl.host.stars.source import Source
 from mauvecl.lightcurve.flares import energies
-from mauvecl.lightcurve.flares.energies import EnergyScale, share_within
+from mauvecl.lightcurve.flares.energies import EnergyScale
 from mauvecl.lightcurve.flares.events import Event
 from mauvecl.lightcurve.flares.shapes import SHAPES
-
-
-@pytest.mark.parametrize(
-    ("kelvin", "share"), [(9000, 0.72246), (10_000, 0.74135), (14_000, 0.68203), (20_000, 0.48199)]
-)
-def test_share_of_a_blackbody_equals_its_integral(kelvin, share):
-    assert share_within(200, 700, kelvin) == pytest.approx(share, abs=6e-6)
-
 
 #: erg/s of Shibayama et al. 2013's formula by other tables of the bands, for flares of 9000 and 10 000 K.
 ELSEWHERE = [
@@ -103,7 +95,6 @@ def test_duration_peak_and_energy_are_consistent(name):
     assert same.amplitude == pytest.approx(0.4, rel=1e-14)
     duration = flare.equivalent_duration_s
     assert energies.amplitude_of(duration, 33.0, name) == pytest.approx(0.4, rel=1e-14)
-    assert energies.half_width_of(duration, 0.4, name) == pytest.approx(33.0, rel=1e-14)
     assert Event.of_peak(flare.peak, peak_s=100.0, half_width_s=33.0, shape=name).amplitude == pytest.approx(0.4)
     assert flare.peak == pytest.approx(0.4 * SHAPES[name].peak)
     # And the duration is the integral of what frames are given.

@@ -10,7 +10,7 @@ import pytest
 
 from mauvecl.host.stars.bands import band
 from mauvecl.host.stars.source import Source
-from mauvecl.lightcurve.flares.energies import EnergyScale, share_within
+from mauvecl.lightcurve.flares.energies import EnergyScale
 from mauvecl.lightcurve.flares.events import Cooling, Event, coefficients, temperatures_of
 from mauvecl.study.cases import Case
 from mauvecl.study.sections import Flare, SkyLight, Star
@@ -21,6 +21,16 @@ from mauvecl.study.study import Study
 STARS = ("A0V", "A7V", "F5V", "G2V", "K1V", "K5V", "M0V", "M3V", "M5V", "Sun")
 BANDS = ("Kepler", "TESS", "V", "B", "Gaia G", "Gaia BP", "GALEX NUV")
 SHAPES = ("davenport2014", "tovarmendoza2022")
+
+
+def share_within(low_nm: float, high_nm: float, temperature_k: float) -> float:
+    """Return the fraction of a blackbody's light between two wavelengths."""
+    # 15 / pi^4 times the integral of x^3 / (e^x - 1) over x = h c / (wavelength k T), CODATA 2018.
+    from scipy.integrate import quad
+
+    ends = [1.438776877e7 / (nm * temperature_k) for nm in (high_nm, low_nm)]
+    value = quad(lambda x: x**3 / np.expm1(x), ends[0], ends[1], epsabs=0.0, epsrel=1e-12, limit=200)[0]
+    return float(15 / np.pi**4 * value)
 
 
 def spread(n: int, low: float, high: float, rng: np.random.Generator) -> Any:

@@ -9,12 +9,12 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from scipy import special
-from searches import DAVENPORT, KNOWN, ONE, spectra, survey
+from searches import DAVENPORT, KNOWN, ONE, consecutive_alarms, spectra, survey
 
 from mauvecl.device.stare_engine import Stares
 from mauvecl.lightcurve.search import injection_sites
 from mauvecl.lightcurve.search.bank import Bank, Baseline
-from mauvecl.lightcurve.search.counted_rate import consecutive_alarm_rate, consecutive_alarms
+from mauvecl.lightcurve.search.counted_rate import consecutive_alarm_rate
 from mauvecl.lightcurve.search.flare_fit import SingleFlareFit
 from mauvecl.lightcurve.search.importance_sampling import sample_rate
 from mauvecl.lightcurve.search.injection_sites import OVERLAP, sites_of

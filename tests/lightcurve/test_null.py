@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from refusals import refused
 from scipy import special
-from searches import DAVENPORT, KNOWN, ONE, survey
+from searches import DAVENPORT, KNOWN, ONE, consecutive_alarms, survey
 
 from mauvecl.device.stare_engine import Stares
 from mauvecl.lightcurve.defaults import DAYS, per_day
 from mauvecl.lightcurve.search.bank import Bank, Baseline
-from mauvecl.lightcurve.search.counted_rate import CountedRate, consecutive_alarm_rate, consecutive_alarms
+from mauvecl.lightcurve.search.counted_rate import CountedRate, consecutive_alarm_rate
 from mauvecl.lightcurve.search.importance_sampling import LADDER, sample_rate
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.search.unknown_shifts import UnknownShifts

@@ -64,10 +64,10 @@ COLUMNS = (
            "flares recovered, by the rates as they are", "flares",
            lambda expected: two_digits(expected) if expected == expected else "not known"),
     Column("low", lambda one: one.recovered.low if one.recovered else None, "",
-           "95 % of campaigns recover at least so many: scatter of the rates and Poisson's", "95 %", _interval,
+           "lower end of the 95 % interval: scatter of the rates and Poisson noise", "95 %", _interval,
            ("high",), int),
     Column("high", lambda one: one.recovered.high if one.recovered else None, "",
-           "95 % of campaigns recover at most so many", kind=int),
+           "upper end of the 95 % interval", kind=int),
     Column("at_least_one", lambda one: one.recovered.at_least_one if one.recovered else np.nan, "",
            "probability of recovering any", "P(>= 1)", number(".2f")),
     Column("best_months", lambda one: " ".join(one.best_months), "", "those with most hours", "best months", months),
@@ -202,7 +202,7 @@ class PlanAnswer(Answer):
                 ("blackbody of " if self.study.flare.is_blackbody else "") + self.study.flare.light().describe(),
                 "assumption; energies are those of all its light, spread alike in all directions",
             ),
-            ("noise of a stare", "white", "beside what the study says is unknown of a stare; see completeness"),
+            ("noise of a stare", "white", "in addition to the study's unknowns of a stare; see completeness"),
             *self._along_orbit,
             (
                 "false alarms",
@@ -386,7 +386,7 @@ def plan(
 
 
 def _completeness(question: PlanQuestion, engine: Stares | Pool | None) -> CompletenessOf:
-    """Return the function for the completeness that a plan asks for."""
+    """Return the function for the completeness that a plan requests."""
     if question.completeness == "closed form":
         return closed_form
     from mauvecl.answers.campaigns.planned_injections import inject_target

@@ -276,7 +276,7 @@ def detect(
 
 
 def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
-    """Return a sentence on the number of independent squares of the paper's sum, if it is asked for."""
+    """Return a sentence on the number of independent squares of the paper's sum, if it is requested."""
     forms = [
         star.detection.closed_form("paper", template=flare)
         for star in stars

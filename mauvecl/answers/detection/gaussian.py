@@ -219,7 +219,7 @@ class GaussianAnswer(Answer):
     def views(self) -> list[View]:
         run = self.study.run
         title = (
-            f"The root-of-N formula beside {run.realisations:,} realisations; promised: no difference in S/N, 68.3 % "
+            f"The root-of-N formula and {run.realisations:,} realisations; promised: no difference in S/N, 68.3 % "
             f"of 1-sigma intervals, as many 5-sigma pixels and false alarms ({run.fap:g}) as normal noise has"
         )
         return [View(title, self._columns, self.cells)]
@@ -275,7 +275,7 @@ def gaussian(
         Without a sweep: magnitudes from 4 to 12, exposures of 5, 50 and 600 s.
     engine : Engine or Pool, optional
     progress : callable, optional
-        Called as ``progress(done, total)`` in stars, each of which is asked for its S/N and then for its flares.
+        Called as ``progress(done, total)`` in stars, each of which is drawn for its S/N and then for its flares.
     """
     from mauvecl.device.engine import Engine as Default
 

@@ -43,7 +43,7 @@ class Limit:
     ----------
     star : str
     amplitude : float
-        Of the flare; NaN where the amplitude is asked for.
+        Amplitude of the flare; NaN if the amplitude is the limit.
     of, statistic : str
     fap, power : float
     value : Interval
@@ -210,7 +210,7 @@ class LimitAnswer(Answer):
 
     @property
     def tables(self) -> dict[str, Table]:
-        """The limits, the draws of what is unknown, and what is assumed, where asked for."""
+        """Tables of the limits and, if requested, of draws of unknowns and of assumptions."""
         more = {"unknowns": self.draws} if self.study.unknowns.draws else {}
         return {"limit": self.table} | more | ({} if self.assumptions is None else {"assumptions": self.assumptions})
 
@@ -240,7 +240,7 @@ class LimitAnswer(Answer):
 def solve(case: Case, statistic: str, engine: Engine | Pool) -> Limit:
     """Return the limit of a case's first flare, or of its amplitude, and simulate it again with another seed.
 
-    Averages over draws of unknown instrument values if the study asks for them.
+    Averages over draws of unknown instrument values if the study has some.
 
     Raises
     ------
@@ -300,7 +300,7 @@ def limit(
     Raises
     ------
     InputError
-        As `solve`, if it holds of every limit; else `LimitAnswer.failed` tells.
+        As `solve`, if it holds of every limit; else see `LimitAnswer.failed`.
     """
     from mauvecl.device.engine import Engine as Default
     from mauvecl.runs.pool import map_in_order
@@ -309,7 +309,7 @@ def limit(
     result = LimitAnswer(study)
     if any(axis.quantity == study.limit.of for axis in study.sweep.axes):
         raise InputError(
-            f"the sweep runs over the {study.limit.of} that is asked for",
+            f"the sweep runs over the {study.limit.of}, of which the limit is requested",
             "other quantities",
             key="sweep",
             value=study.limit.of,

@@ -111,7 +111,7 @@ class LimitSearch:
         for message in detection.messages:
             raise InputError(
                 f"at a {self.of} of {value:g}: {message.rstrip('.')}",
-                "a limit where some pixel tells",
+                "a limit at which some pixel is not saturated",
                 key="limit.of",
                 value=self.of,
             )

@@ -69,7 +69,7 @@ class MeasuredStare(InCell):
 
 
 def measured_stare(case: Case, engine: Engine | Pool) -> MeasuredStare:
-    """Draw the stare of a case, and measure its flares as its study asks for."""
+    """Draw the stare of a case, and measure its flares."""
     study, asked = case.study, case.study.measure
     staring, events = case.stare_expectation, case.events
     if asked.joint_fit and len(events) != 1:

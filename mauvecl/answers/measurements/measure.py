@@ -180,7 +180,7 @@ class MeasureAnswer(Answer):
         Every model of every flare of every star in every cell of the sweep.
     messages : list of str
     stares : list of MeasuredStare
-        One stare of every star in every cell, if the study asks for bins of a stare or a joint fit.
+        One stare of every star in every cell, if the study requests bins of a stare or a joint fit.
     """
 
     USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "processes", "nuisances", "seed")
@@ -217,7 +217,7 @@ class MeasureAnswer(Answer):
 
     @cached_property
     def _along(self) -> dict[str, QTable]:
-        """Tables of measurements along stares, those that the study asks for."""
+        """Tables of measurements along stares, those that the study requests."""
         asked = self.study.measure
         binned = {"temperatures": self.temperatures} if asked.snr_per_bin is not None else {}
         return binned | ({"joint": self.joint} if asked.joint_fit else {})

@@ -147,7 +147,7 @@ def exposure(
     ------
     InputError
         For an S/N that no exposure up to 1e7 s reaches, or a wavelength outside the spectrum, if it holds of every
-        star; of some it is told by a message.
+        star; of some it is reported by a message.
     """
     snr, wavelength_nm, per = study.signal.snr, study.signal.wavelength_nm, study.signal.per
     if snr is None or wavelength_nm is None:

@@ -41,7 +41,7 @@ class StarSnr(InCell):
 
     @property
     def shown_nm(self) -> list[float]:
-        """The wavelength asked for, or those of `SHOWN_NM` that the spectrum holds."""
+        """The requested wavelength, or those of `SHOWN_NM` within the spectrum."""
         if self.asked_nm is not None:
             return [self.asked_nm]
         first, last = self.result.expectation.wavelength_nm[[0, -1]]
@@ -165,11 +165,11 @@ def _cut_off(star: StarSnr) -> str:
     """Return a message on pixels that saturated in the simulation, or an empty text."""
     result = star.result
     cut = result.counts.clipped[:, 1]
-    met = cut[cut > 0]
-    if not met.size:
+    clipped = cut[cut > 0]
+    if not clipped.size:
         return ""
-    share = 100 * met.mean() / (result.counts.n * result.expectation.n_frames)
+    share = 100 * clipped.mean() / (result.counts.n * result.expectation.n_frames)
     return (
-        f"{star.title}: saturation cut off {met.size} of {cut.size} pixels in the simulation, each of them in "
+        f"{star.title}: saturation cut off {clipped.size} of {cut.size} pixels in the simulation, each of them in "
         f"{share:.3g} % of its frames on average."
     )

@@ -177,7 +177,7 @@ class StarCompleteness(InCell):
         # The probability of at least this many alarms if the expected number is right.
         if scipy.special.gammainc(max(self.alarmed, 1e-300), self.expected) < LEAST_CHANCE:
             text = (
-                f"FALSE ALARMS of {self.title} are more than were asked for: {self.alarmed} of the drawn stares have "
+                f"FALSE ALARMS of {self.title} exceed the requested rate: {self.alarmed} of the drawn stares have "
                 f"one at the threshold, {self.expected:.2g} should: set search.null = 'counted' with more search.nulls."
             )
             messages.append(Message(text, "false alarms"))

@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
 
 Float = NDArray[np.float64]
-#: Weighting of the response in an integral over a band.
-Weighted = Literal["energy", "photons"]
 #: Light of a flare that counts for its energy: in the band of its amplitude, or at all wavelengths.
 Kind = Literal["band", "bolometric"]
 #: Number of points of the integral over a band; the step is at most a tenth of the sampling of the band.
@@ -237,22 +235,16 @@ def amplitude_of(equivalent_duration_s: float, half_width_s: float, shape: Shape
     return equivalent_duration_s / half_width_s / shape_of(shape).equivalent_duration
 
 
-def half_width_of(equivalent_duration_s: float, amplitude: float, shape: Shape | str) -> float:
-    """Return the half-width for an equivalent duration, s."""
-    return equivalent_duration_s / amplitude / shape_of(shape).equivalent_duration
-
-
 def amplitude_of_peak(peak: float, shape: Shape | str) -> float:
     """Return the amplitude of a shape for its maximum, which differs from it for `tovarmendoza2022`."""
     return peak / shape_of(shape).peak
 
 
 @lru_cache(1024)
-def in_band(band: str, temperature_k: float, weighted: Weighted = "energy") -> float:
-    """Return a blackbody's surface flux in a band, erg s-1 cm-2, or times nm for photons; the maximum response is 1."""
+def in_band(band: str, temperature_k: float) -> float:
+    """Return a blackbody's surface flux in a band, erg s-1 cm-2; the maximum response is 1."""
     wavelength, response = _response(band)
-    weight = response if weighted == "energy" else response * wavelength
-    return _integral(wavelength, weight * blackbody(wavelength, temperature_k))
+    return _integral(wavelength, response * blackbody(wavelength, temperature_k))
 
 
 def flux_in_band(band: str, flare: FlareSpectrum) -> float:
@@ -262,16 +254,6 @@ def flux_in_band(band: str, flare: FlareSpectrum) -> float:
     wavelength, response = _response(band)
     grid = flare.grid(wavelength)
     return _integral(grid, np.interp(grid, wavelength, response) * flare.flux(grid))
-
-
-def share_within(low_nm: float, high_nm: float, temperature_k: float) -> float:
-    """Return the fraction of a blackbody's light between two wavelengths."""
-    # 15 / pi^4 times the integral of x^3 / (e^x - 1) over x = h c / (wavelength k T), CODATA 2018.
-    from scipy.integrate import quad
-
-    ends = [1.438776877e7 / (nm * temperature_k) for nm in (high_nm, low_nm)]
-    value = quad(lambda x: x**3 / np.expm1(x), ends[0], ends[1], epsabs=0.0, epsrel=1e-12, limit=200)[0]
-    return float(15 / np.pi**4 * value)
 
 
 def _response(band: str) -> tuple[Float, Float]:

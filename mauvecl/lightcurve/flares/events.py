@@ -19,7 +19,7 @@ from mauvecl.schema.physical import Amplitude, Duration, Energy, Moment, Tempera
 
 Float = NDArray[np.float64]
 
-#: Largest number of flare spectra of a stare (`components.MOST_FLARES`), and the smallest for flares that cool.
+#: Largest number of flare spectra of a stare (`frame_components.MOST_FLARES`), and the smallest for flares that cool.
 MOST_TEMPERATURES, LEAST_STEPS = 8, 3
 #: For a flare that cools: smallest number of steps per frame, half-width and cooling time, and largest per frame.
 PARTS, MOST_PARTS = 16, 512
@@ -187,11 +187,11 @@ def check_contributions(events: Sequence[Event], start_s: Float, frame_s: float)
     return sentences
 
 
-def temperatures_of(events: Sequence[Event], most: int = MOST_TEMPERATURES) -> Float:
+def temperatures_of(events: Sequence[Event]) -> Float:
     """Return the temperatures whose spectra represent the events, K, ascending, shape (n_temperature,).
 
     They are all constant temperatures and, for flares that cool, a grid that is even in 1 / T. Raises InputError if
-    there are more than `most`.
+    there are more than `MOST_TEMPERATURES`.
     """
     constant: list[float] = []
     cooling = []
@@ -200,11 +200,11 @@ def temperatures_of(events: Sequence[Event], most: int = MOST_TEMPERATURES) -> F
             cooling.append(event.temperature)
         elif all(abs(event.hottest_k - other) >= SAME_K for other in constant):
             constant.append(event.hottest_k)
-    left = most - len(constant)
+    left = MOST_TEMPERATURES - len(constant)
     if left < (LEAST_STEPS if cooling else 0):
         raise InputError(
             f"flares of {len(constant)} constant temperatures{' and some that cool' if cooling else ''}",
-            f"at most {most - (LEAST_STEPS if cooling else 0)}",
+            f"at most {MOST_TEMPERATURES - (LEAST_STEPS if cooling else 0)}",
             key="events",
             value=len(constant),
         )

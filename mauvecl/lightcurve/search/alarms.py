@@ -209,7 +209,8 @@ class _StareSearch:
         blocks = [block for block in self.blocks() if self._key(block) not in self.complete]
         if not blocks:
             return []
-        spans = [(min(a for a, _ in each), max(b for _, b in each)) for each in self._overlaps(blocks)]
+        overlaps = [[self.sums.overlap(one.theta) for one in block] for block in blocks]
+        spans = [(min(a for a, _ in each), max(b for _, b in each)) for each in overlaps]
         best: list[list[tuple[float, Candidate]]] = [[] for _ in blocks]
         for rho, excess, peaks, which, row in self._values():
             for several, (first, last) in zip(best, spans, strict=True):
@@ -247,9 +248,6 @@ class _StareSearch:
             each.theta = theta
         one.rho = float(np.sqrt(fall))
         return True
-
-    def _overlaps(self, blocks: list[list[Candidate]]) -> list[list[tuple[float, float]]]:
-        return [[self.sums.overlap(one.theta) for one in block] for block in blocks]
 
     @staticmethod
     def _key(block: list[Candidate]) -> tuple[float, ...]:

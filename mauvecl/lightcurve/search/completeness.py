@@ -178,9 +178,9 @@ class Completeness:
         return cls(10**log_energy, np.clip(probability, 0, 1), "bolometric", how)
 
 
-def default_bank(shape: Shape | str = "davenport2014", frame_s: float = 5.0) -> Bank:
+def default_bank() -> Bank:
     """Return the bank of a default search with one sum per frame."""
-    return Bank(BANK_S, np.ones((1, 1)), shape_of(shape), frame_s)
+    return Bank(BANK_S, np.ones((1, 1)), shape_of("davenport2014"), 5.0)
 
 
 def search_threshold(false_alarms_per_day: float, bank: Bank | None = None) -> float:

@@ -8,7 +8,6 @@ covers rates that are too small to count.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy
@@ -57,26 +56,6 @@ class CountedRate:
         low, high = central_counts(n, 1 - alarmed)
         places = np.clip([round(n * (1 - alarmed)), low, high], 0, n - 1)
         return Interval(*(float(self.maxima[k]) for k in places))
-
-
-def consecutive_alarms(values: NDArray[Any], points: int, sigma: float) -> NDArray[np.bool_]:
-    """Return the frames that complete a run of `points` consecutive frames above `sigma`.
-
-    Parameters
-    ----------
-    values : ndarray, shape (..., n_frame)
-        Values in standard deviations. A longer run has one alarm, at its frame number `points`.
-    points : int
-    sigma : float
-    """
-    above = np.asarray(values > sigma)
-    alarm = np.zeros(above.shape, np.bool_)
-    if above.shape[-1] < points:
-        return alarm
-    windows = np.asarray(np.lib.stride_tricks.sliding_window_view(above, points, axis=-1).all(axis=-1))
-    before = np.concatenate([np.zeros((*above.shape[:-1], 1), np.bool_), windows[..., :-1]], axis=-1)
-    alarm[..., points - 1 :] = windows & ~before
-    return alarm
 
 
 def consecutive_alarm_rate(points: int, sigma: float, frame_s: float) -> float:

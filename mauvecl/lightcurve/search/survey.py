@@ -56,11 +56,11 @@ class Survey:
         directions: dict[Any, Float] = self.components.directions(self.coefficients)
         return directions
 
-    def covariance(self, *, jittered: tuple[Changing, ...] = ("light", "sky", "temperature")) -> Float:
-        """Return the covariance of each frame's sums without a flare, with some jitters, (n_frame, n_sum, n_sum)."""
+    def covariance(self) -> Float:
+        """Return the covariance of each frame's sums without a flare, shape (n_frame, n_sum, n_sum)."""
         covariance = self.components.covariance(self.coefficients)
-        for of in jittered:
-            moved = self.stare.jitters[of] * self.directions[of]
+        for of, sd in self.stare.jitters.items():
+            moved = sd * self.directions[of]
             covariance = covariance + moved[:, :, None] * moved[:, None, :]
         return covariance
 

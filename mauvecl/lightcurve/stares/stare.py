@@ -43,7 +43,7 @@ class StareUnknown:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "curve", _read_only(self.curve))
-        _check_quantity(self.name, self.of)
+        _check_quantity(self.of)
         _check_spread(self.name, self.of, self.sd)
 
 
@@ -223,7 +223,7 @@ class Stare:
 
     @classmethod
     def along(cls, orbit: Orbit, target: Target | str, start: str, duration_s: Duration, **how: Any) -> Stare:
-        """Return the stare along an orbit; see `along.stare_along`, which also returns the particle rate."""
+        """Return the stare along an orbit; see `orbit_stare.stare_along`, which also returns the particle rate."""
         from mauvecl.lightcurve.stares.orbit_stare import stare_along
 
         return stare_along(orbit, target, start, duration_s, **how).stare
@@ -320,7 +320,7 @@ def _read_only(values: Float) -> Float:
     return kept
 
 
-def _check_quantity(name: str, of: str) -> None:
+def _check_quantity(of: str) -> None:
     if of not in CHANGING:
         raise InputError.of("of", of, f"one of {', '.join(CHANGING)}")
 

@@ -48,7 +48,7 @@ class SumTable:
     ----------
     rows : ndarray of float32, shape (4 + n_flare, n)
         Total at coefficients of one, then star, sky, dark, neighbours and each flare: means (0 for the total), then the
-        unique second, third and, if needed, fourth cumulants, in the order of `scene.unique`; fourth cumulants are
+        unique second, third and, if needed, fourth cumulants, in the order of `stare_scene.unique`; fourth ones are
         multiplied by their multiplicity.
     whole : ndarray of float32, shape (n_statistic * (n_statistic + 1) / 2,)
         Lower triangular matrix that converts whitened sums to the statistics.

@@ -215,7 +215,7 @@ def intervals(
         elif one.ratio is None:
             columns.append(_linear_interval(profile, spline, x, linear, variance, hot, left))
         else:
-            columns.append(_ratio_interval(profile, spline(x), x, hot, best.gain - allowed))
+            columns.append(_ratio_interval(profile, spline(x), hot, best.gain - allowed))
     return np.column_stack([c[0] for c in columns]), np.column_stack([c[1] for c in columns])
 
 
@@ -264,7 +264,7 @@ def extreme(values: Float, which: Callable[..., Float]) -> Float:
     return np.asarray(sign * (middle + rise))
 
 
-def _ratio_interval(profile: Profile, per: Float, x: Float, hot: Float, least_gain: Float) -> tuple[Float, Float]:
+def _ratio_interval(profile: Profile, per: Float, hot: Float, least_gain: Float) -> tuple[Float, Float]:
     """Return the interval of 1 + per x (amplitude 1) / (amplitude 0): Fieller's at each temperature, then the hull."""
     fixed = profile.reduction.fixed
     others = np.linalg.qr(fixed[1:].T)[0].T if len(fixed) > 1 else np.zeros((0, fixed.shape[1]))

@@ -1,8 +1,8 @@
-// The fields: text that is entered, right or wrong, sliders beside it, the list of stars, files.
+// Fields of the page: entered text, valid or not, sliders, the list of stars, and files.
 
 const byId = id => document.getElementById(id)
 
-// What a slider's place means, and back; values have as many digits as they need.
+// Conversion between a slider's position and the value, with as many digits as needed.
 class Scale {
   constructor({low, high, step, log}) {
     Object.assign(this, {low, high, step, log})
@@ -35,7 +35,7 @@ export class Fields {
       button.addEventListener("click", () => file.click())
       file.addEventListener("change", () => {
         const [one] = file.files
-        // The same file may be chosen again; its name does not stand beside another star.
+        // The same file may be chosen again; its name is not shown for another star.
         file.value = ""
         if (one) chosen(button.dataset.choose, one)
       })
@@ -102,7 +102,7 @@ export class Fields {
     }
   }
 
-  // What stands beside a field: its slider, and fields that are asked for under one sky only.
+  // Elements that accompany a field: its slider, and fields that apply to one choice of sky only.
   aside(name) {
     const slider = document.querySelector(`[data-slider="${name}"]`)
     if (slider) {
@@ -132,7 +132,7 @@ export class Fields {
     }
   }
 
-  // The sentences of what is wrong, at their fields; a wrong field is never hidden.
+  // Error messages at their fields; an invalid field is never hidden.
   tell(faults) {
     for (const name of Object.keys(this.words.fields)) {
       const field = byId(`f-${name}`)
@@ -149,7 +149,7 @@ export class Fields {
   }
 }
 
-// A list under the field of stars that holds those whose names have what is typed.
+// List below the field of stars with the names that contain the typed text.
 class Stars {
   constructor(field, list, names, chosen) {
     Object.assign(this, {field, list, names, chosen, at: -1})
@@ -177,7 +177,7 @@ class Stars {
       return item
     }))
     this.at = -1
-    // A name that is whole needs no list over the fields below it.
+    // A complete name needs no list, which would cover the fields below.
     this.show(found.length > 0 && !(found.length === 1 && found[0].toLowerCase() === wanted))
   }
 

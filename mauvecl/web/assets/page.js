@@ -1,4 +1,4 @@
-// The page: what is entered goes to the server, and nothing is shown that is not the answer to it.
+// The page sends the entered text to the server, and only shows the answer to it.
 
 import {Card} from "./card.js"
 import {Compare} from "./compare.js"
@@ -25,7 +25,7 @@ class Page {
     this.wanted = []
     this.card = new Card()
     this.fields = new Fields(words, (name, last, other) => {
-      // Whoever enters something else does not wait for a file.
+      // A changed question cancels the wait for a file.
       if (other) delete this.lacks[name]
       this.changed(last, other)
     }, (field, file) => this.upload(field, file))
@@ -37,7 +37,7 @@ class Page {
     this.live = new Live(version => this.back(version), code => this.lost(code))
   }
 
-  // What is entered, as the query of an address.
+  // The entered text as the query of a URL.
 
   get link() {
     const first = {...words.fields, ...words.seen}
@@ -45,7 +45,7 @@ class Page {
     return `?${new URLSearchParams(pairs.filter(([name, text]) => text !== "" || first[name] !== ""))}`
   }
 
-  // The question alone: what is asked, whatever is seen of it.
+  // The question alone, independent of the view.
   get question() {
     return JSON.stringify(this.fields.entered)
   }
@@ -75,7 +75,7 @@ class Page {
     window.history[push ? "pushState" : "replaceState"]({}, "", window.location.pathname + this.link)
   }
 
-  // Something was entered: `last` is whether the visitor is done with it, `other` whether it is another question.
+  // A field was changed: `last` is true at the end of a change, `other` if the question changes.
   changed(last, other) {
     if (other) {
       this.seen.simulated = ""
@@ -99,7 +99,7 @@ class Page {
 
   // The answer
 
-  // Until there is an answer to these fields there is none.
+  // The previous answer is invalid until there is one to these fields.
   withdraw() {
     this.answer = null
     clearTimeout(this.soon)
@@ -107,7 +107,7 @@ class Page {
     this.offer()
   }
 
-  // There is no answer to what is entered.
+  // The entered text has no answer.
   none(faults, refused) {
     this.withdraw()
     document.title = "No answer: mauvecl"
@@ -174,7 +174,7 @@ class Page {
     if (DRAWN.has(told.tab) && !told.draws) this.soon = setTimeout(() => this.drawOne(), DRAW_MS)
   }
 
-  // Pinned scenarios in the pictures of this tab; what they show is asked for once.
+  // Pinned scenarios in the pictures of this tab; their data are requested once.
   pinned() {
     const name = this.seen.tab, tab = words.tabs[name]
     // A pinned upload is drawn as long as it is the one that is here.
@@ -206,7 +206,7 @@ class Page {
     })
   }
 
-  // What can be asked for now.
+  // Actions that are available now.
   offer() {
     const ready = this.answer !== null
     const busy = this.running !== null

@@ -106,14 +106,14 @@ class Picture {
     this.models.get(name).data = data
   }
 
-  // Scenarios beside the question, by their slots: columns of each, or nothing.
+  // Pinned scenarios by slot: columns of each, or nothing.
   pin(pinned) {
     const same = pinned.every((columns, slot) => columns === (this.pinned[slot] ?? null))
     this.pinned = pinned
     if (!same && this.models && this.drawn) this.fill()
   }
 
-  // What is asked for shows; so do the marks that all pictures share.
+  // Show the requested parts, and the marks that all pictures share.
   reveal() {
     if (!this.plot) return
     for (const model of this.plot.references()) {
@@ -197,7 +197,7 @@ export class Pictures {
     return Promise.all(Object.entries(pictures).map(([name, drawn]) => this.all[name].put(drawn)))
   }
 
-  // Scenarios beside the question, by their slots: what is entered in each, and columns for each picture.
+  // Pinned scenarios by slot: the entered text of each, and columns for each picture.
   pin(tab, pinned, entered) {
     for (const {name, pins, alike} of tab.pictures) {
       if (!pins) continue

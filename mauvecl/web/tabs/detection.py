@@ -164,7 +164,7 @@ class Detection(Tab):
     """Tab of the detection, the first one."""
 
     name, title = "detection", "Detection"
-    about = "What the flare adds beside the noise, and how the statistic tells it from none."
+    about = "The flare relative to the noise, and the statistic with and without the flare."
     pictures = (Excess(), Distributions(), Trade())
     simulations = {"detection": "Simulate"}  # noqa: RUF012
     answer = "detection"

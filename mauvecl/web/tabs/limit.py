@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Ends of the pictures: magnitudes, and amplitudes in per cent; they stay, whatever is asked.
+#: Ranges of the pictures: magnitudes, and amplitudes in per cent, fixed for all questions.
 MAGNITUDES, PERCENTS = (2.0, 14.0), (0.1, 100.0)
-#: Columns and rows of a map in closed form; between them what varies evenly is interpolated.
+#: Columns and rows of a map in closed form; smooth quantities are interpolated between them.
 STEPS = 9, 5
-#: A curve begins with so many points; distances are halved so many times where it changes by more than this.
+#: Initial number of points of a curve, number of times that steps are halved, and change above which they are halved.
 FIRST, HALVINGS, CHANGE = 9, 5, 0.25
 
 
-#: What a map does not depend on; an upload goes by its content.
+#: Fields on which a map does not depend; an upload is identified by its content.
 FREE = {"magnitude", "amplitude_percent", "realisations", "seed", "see", "hours", "uploaded"}
 
 
@@ -85,13 +85,13 @@ def _curve(kept: _Kept) -> tuple[Float, Float]:
 def _map(kept: _Kept) -> tuple[Float, Float, Float]:
     """Return magnitudes, logarithms of amplitudes in per cent, and probabilities.
 
-    Interpolated is what makes them, in standard deviations without a flare: the flare's part of the statistic and its
-    spread, both as logarithms, the threshold, the skewness. A gamma distribution of these moments (Pearson's type III)
-    is within 0.05 of the closed forms where they are steepest.
+    The interpolated quantities are, in standard deviations without a flare: logarithms of the flare's part of the
+    statistic and of its spread, the threshold and the skewness. A gamma distribution of these moments (Pearson's type
+    III) is within 0.05 of the closed forms where they are steepest.
     """
     (columns, rows), (low, high) = STEPS, np.log10(PERCENTS)
     x, y = np.linspace(*MAGNITUDES, columns), np.linspace(low, high, rows)
-    # A saturated star shows nothing.
+    # A saturated star has no detectable flare.
     known = np.zeros((4, rows, columns))
     known[0], known[2] = -30.0, 3.0
     for i, magnitude in enumerate(x):

@@ -53,13 +53,13 @@ class Picture(ABC):
     logs : tuple of str
         Axes, of x and y, that the visitor may have logarithmic, and those that are at first in capitals.
     shows : dict of str
-        Parts that are hidden until asked for, by tag of their models, with what they are called.
+        Parts that are hidden by default, by tag of their models, with their names.
     sets : str
         Fields that a click on the picture sets, with the axis that gives each, as in "magnitude=x".
     pins : str
         The source whose columns are shown of pinned scenarios, too; none where they are not.
     alike : tuple of str
-        Fields that a scenario must have in common with the question to be shown beside it.
+        Fields in which a pinned scenario must agree with the question to be shown with it.
     """
 
     name: ClassVar[str]
