@@ -31,13 +31,13 @@ from mauvecl.host.version import VERSION
 
 
 def _help(text: str | None) -> str:
-    """Return a help text with each example on lines of its own, which fit 80 columns and can be pasted."""
+    """Return a help text with examples on separate lines of at most 80 columns, which can be pasted."""
     text = re.sub(r"(?m)^(Examples?:) (?=mauvecl )", r"\1\n\n", inspect.cleandoc(text or ""))
     return re.sub(r"(?m)^mauvecl .*$", lambda found: "\b\n" + _broken(found[0]), text)
 
 
 def _broken(command: str, most: int = 72) -> str:
-    """Return a command on lines that end in a backslash before a flag, where it is long."""
+    """Divide a long command into lines that end in a backslash before a flag."""
     lines = [""]
     for part in re.split(r" (?=-)", command):
         if lines[-1] and len(lines[-1]) + len(part) > most:
@@ -54,7 +54,7 @@ add_plain_commands()
 OTHERS: dict[str, Callable[..., None]] = {
     function.__name__: function for function in (verify, export, serve, devices, selftest, schema)
 }
-#: Help text of every command, in the order of `--help`: the questions, bulk, mauvecl itself.
+#: Help text of every command, in the order of `--help`: verbs, raw spectra, mauvecl itself.
 HELP = {
     **{name: _help(COMMANDS[name].help) for name in (*VERBS, "realise")},
     **{name: _help(function.__doc__) for name, function in OTHERS.items()},
@@ -132,11 +132,11 @@ def _options(
 
 def main() -> None:
     """Run the command line; a failure is one sentence and an exit code, never a traceback."""
-    # Threads of linear algebra wait for each other in a loop where kernels, or visitors of the page, have the cores.
+    # Threads of linear algebra would wait in busy loops while kernels or visitors of the page use the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Pictures are files: whatever a notebook's kernel wants figures to be shown by is not for this process, and
-    # matplotlib fails at its import where it lacks that.
+    # Pictures are files. A notebook kernel's choice of backend does not apply to this process, and importing matplotlib
+    # fails if that backend is not installed.
     os.environ.pop("MPLBACKEND", None)
-    # Everything goes with the process: no look for cycles at its end.
+    # No garbage collection at exit, since the process ends.
     atexit.register(gc.freeze)
     sys.exit(guarded(app))

@@ -31,14 +31,14 @@ EXIT_CODES = (
     f"(a fault of mauvecl; a file with its traceback is named), {OUTPUT_FULL} standard output cannot be written, "
     f"{INTERRUPTED} interrupted, {READER_GONE} the reader of standard output went away, 143 terminated."
 )
-#: Characters of a sentence, at most.
+#: Largest number of characters of a message.
 LONGEST = 1000
-#: What a disk or its limits answer where no file is named.
+#: Error numbers of full disks and quotas, which name no file.
 DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EMFILE, errno.ENFILE)
 
-#: Who writes to standard output for us.
+#: Libraries that write to standard output for mauvecl.
 PRINTERS = ("click", "typer", "rich", "mauvecl.cli")
-#: Where the verb writes, once it does: the place for a traceback too.
+#: Output folder of the verb, once known, to which tracebacks are written.
 _folder: Path | None = None
 
 
@@ -67,7 +67,7 @@ def guarded(app: typer.Typer) -> int:
         except SystemExit as end:
             code = end.code if isinstance(end.code, int) else BAD_INPUT if end.code else 0
             if isinstance(end.__context__, BrokenPipeError):
-                # Click and rich end so where nobody reads, each in its own way.
+                # Click and rich end in different ways if the reader of standard output is gone.
                 sys.stdout, code = out, READER_GONE
     return _flushed(code)
 
@@ -96,12 +96,12 @@ def _run(app: typer.Typer) -> int:
 def _failed(error: Exception) -> int:
     """Report a wrong use of flags, a device that fails, or an unforeseen failure."""
     if hasattr(error, "format_message") and isinstance(getattr(error, "exit_code", None), int):
-        # A usage error of Click's, or help because nothing was asked, which says so itself.
+        # A usage error of Click, or the help text of an empty command line, which Click prints itself.
         text = str(error.format_message())
         return _say(text.splitlines()[0] if text else "", BAD_INPUT) if text.strip() else BAD_INPUT
     if type(error).__name__ == "Abort":
         return _say("interrupted", INTERRUPTED)
-    # Imported late: program is not needed by verbs that draw nothing.
+    # Imported here, because verbs that draw nothing do not need it.
     program = sys.modules.get("mauvecl.device.program")
     if program is not None and isinstance(error, program.DeviceError):
         return _say(str(error), BAD_INPUT, whole=isinstance(error, program.BuildError))
@@ -120,7 +120,7 @@ def _failed_call(error: OSError) -> int:
     if code:
         return code
     if error.filename is None and _raised_by(error).startswith(PRINTERS):
-        # Click writes through a stream of its own.
+        # Click writes through its own stream.
         _discard()
         return _not_written(error)
     if error.filename is None and error.errno not in DISK:
@@ -154,7 +154,7 @@ def _warn(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -
 
 
 def _print_anything() -> None:
-    """Write characters that the terminal's encoding lacks as escapes; names may contain any."""
+    """Write characters that the terminal's encoding lacks as escapes, since names may contain any character."""
     for stream in (sys.stdout, sys.stderr):
         change: Callable[..., None] | None = getattr(stream, "reconfigure", None)
         if change is not None:
@@ -172,7 +172,7 @@ def _flushed(code: int) -> int:
             return READER_GONE
         return _not_written(error)
     except ValueError:
-        # Closed already.
+        # Already closed.
         pass
     return code
 
@@ -192,7 +192,7 @@ def _raised_by(error: BaseException) -> str:
 
 
 def _discard() -> None:
-    """Discard what standard output still holds; Python would fail on it again at its end."""
+    """Discard the buffer of standard output, on which Python would fail again at exit."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
@@ -215,7 +215,7 @@ def _write_traceback(error: Exception) -> Path | str:
         if folder is None:
             continue
         with contextlib.suppress(OSError):
-            # A name that nobody can have put there before.
+            # A random name, which nobody can have created before.
             handle, name = tempfile.mkstemp(prefix=f"mauvecl-fault-{now}-", suffix=".txt", dir=folder)
             with os.fdopen(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
                 file.write(text)

@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
     from mauvecl.runs.pool import PoolProgress
 
-#: Work shorter than this shows no progress.
+#: Work shorter than this shows no progress, s.
 PATIENCE_S = 2.0
-#: Columns of a table that goes into a pipe or a file, at most.
+#: Largest width of a table in a pipe or file, characters.
 WIDEST = 100_000
-#: Share of the work from which on the time left is estimated; the rate of the first tile says little.
+#: Fraction of the work after which the remaining time is estimated, since the first tile's rate is unreliable.
 TOLD_FROM = 0.01
 
 
@@ -53,10 +53,10 @@ class Meter:
         """Record how much work is done, in the meter's unit."""
         now = time.monotonic()
         if done < self._last and total == self._total:
-            # Threads may tell in another order than they worked.
+            # Threads may report in another order than they worked.
             return
         if done <= self._last:
-            # The next star's work begins.
+            # Start of the next star's work.
             self._stop()
             self._started = self._shown = now
         self._last, self._total = done, total
@@ -71,7 +71,7 @@ class Meter:
             print(f"{done} of {total} {self._unit}, {rate:.3g} a second, {left}{self._retries()}", file=sys.stderr)
 
     def _left(self, done: int, total: int, rate: float) -> str:
-        """Return the time left, once enough is done to estimate it."""
+        """Return the remaining time, once enough work is done to estimate it."""
         if rate * (time.monotonic() - self._started) < TOLD_FROM * total:
             return "time left unknown"
         seconds = (total - done) / rate
@@ -81,7 +81,7 @@ class Meter:
         return f"{seconds:.0f} s left"
 
     def _rate(self, done: int) -> float:
-        """Work done a second, without what was taken from a checkpoint."""
+        """Work per second, without parts from a checkpoint."""
         resumed = self.standing().resumed if self.standing is not None and self._unit == "realisations" else 0
         return (done - resumed) / max(time.monotonic() - self._started, 1e-9)
 
@@ -141,16 +141,16 @@ def show_table(title: str, columns: Sequence[str], cells: Sequence[Sequence[Any]
 
     columns, cells = without_empty(columns, cells)
     filled = list(range(len(columns)))
-    # Names may hold brackets and colons, which are no markup here.
+    # Names may contain brackets and colons, which are not markup here.
     how: dict[str, Any] = {"highlight": False, "markup": False, "emoji": False}
     console = Console(**how)
     if not console.is_terminal:
-        # Piped: as wide as it needs to be.
+        # A pipe has no width, so the table is as wide as needed.
         console = Console(**how, width=WIDEST)
-    # A table's own title would be broken at the table's width.
+    # rich would wrap a table's title at the table's width.
     console.print(title, soft_wrap=True)
     for part in _parts(columns, cells, filled, console.width):
-        # What fits in no terminal is told whole all the same.
+        # A column that exceeds the terminal is printed completely.
         Console(**how, width=max(console.width, _width(columns, cells, part))).print(_table(columns, cells, part))
 
 
@@ -168,17 +168,17 @@ def _table(columns: Sequence[str], cells: Sequence[Sequence[Any]], part: Sequenc
 
 
 def _width(columns: Sequence[str], cells: Sequence[Sequence[Any]], part: Sequence[int]) -> int:
-    """Of a table of some columns: two blanks beside each, a line's room between them and at both ends."""
+    """Return the width of a table: two blanks per column, and lines between columns and at both ends."""
     from rich.cells import cell_len
 
     return 1 + sum(3 + max(cell_len(text) for text in (columns[i], *(str(row[i]) for row in cells))) for i in part)
 
 
 def _parts(columns: Sequence[str], cells: Sequence[Sequence[Any]], filled: list[int], room: int) -> list[list[int]]:
-    """Return the columns of each part: those that fit next to each other, after the first ones that tell rows apart."""
+    """Return the columns of each part: the first columns, which identify rows, and as many others as fit."""
     if _width(columns, cells, filled) <= room:
         return [filled]
-    # No more than needed: of months, the first are not repeated in each part.
+    # As few as needed, so that the first months are not repeated in each part.
     apart = next((n for n in (1, 2, 3) if len({tuple(row[i] for i in filled[:n]) for row in cells}) == len(cells)), 3)
     fitting = (filled[:n] for n in range(apart, 1, -1) if _width(columns, cells, filled[:n]) <= room / 2)
     first = next(fitting, filled[:1])

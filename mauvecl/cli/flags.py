@@ -1,4 +1,4 @@
-"""Flags of the command line: those of a study follow from the metadata of its fields; the others set no key."""
+"""Flags of the command line: flags of a study, from the metadata of its fields, and those of no key."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ SetFlag = Annotated[
 class StudyFlag(NamedTuple):
     """Flag of the command line, and the key of the study that it sets."""
 
-    name: str  # of its parameter
+    name: str  # name of the parameter
     kind: Any
     section: str
     key: str
@@ -56,7 +56,7 @@ def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, StudyFlag]
     Parameters
     ----------
     *keys : str
-        As in ``"observation.exposure_s"``, or ``"flare"``.
+        Keys and sections such as ``"observation.exposure_s"`` or ``"flare"``.
     defaults : mapping
         Defaults of a verb that differ from the study's, by key.
     """
@@ -80,7 +80,7 @@ def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, StudyFlag]
 @cache
 def _all_flags() -> tuple[tuple[str, FieldInfo, Flag], ...]:
     """Return the path, field and metadata of every flag of a study."""
-    # `mauvecl --help` shows no flags, and begins twice as fast without the study.
+    # `mauvecl --help` shows no flags, and starts twice as fast without importing the study.
     from mauvecl.schema.section import fields_of
     from mauvecl.study.study import Study
 
@@ -138,7 +138,7 @@ def _help(path: str, field: FieldInfo, flag: Flag, kind: Any, defaults: Mapping[
 
 
 def _words(annotation: Any) -> str:
-    """Return the accepted words of a field as a list in words, or nothing."""
+    """Return the accepted words of a field as text; empty if there are none."""
     if get_origin(annotation) is Literal:
         *others, last = get_args(annotation)
         return f"{', '.join(others)} or {last}"
@@ -147,7 +147,7 @@ def _words(annotation: Any) -> str:
 
 
 def _text(default: Any) -> str:
-    """Return a default in the form in which it is typed; nothing for none."""
+    """Return a default as it is typed; empty without a default."""
     if isinstance(default, tuple):
         return ",".join(map(_text, default))
     if isinstance(default, bool) or not isinstance(default, str | int | float):

@@ -1,4 +1,4 @@
-"""Checks before anything large is loaded or begins: invalid values, endless runs, and full disks."""
+"""Checks before a run starts: invalid values, endless runs, and full disks."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 YEAR_S = 365.25 * 86_400.0
 #: Pixel-realisations a second of one core, counted per scenario: the best of `bench/results/rates.ecsv`, 1.2e10 on two
-#: cores with 16 scenarios, so that nothing is questioned that could end.
+#: cores with 16 scenarios, so that no feasible run raises an error.
 CORE_RATE = 6e9
-#: Assumed of a device that is named: an accelerator as fast as a hundred cores.
+#: Assumed speed of a selected device, in cores: that of an accelerator.
 DEVICE_RATE = 100 * CORE_RATE
-#: Assumed of a cluster somewhere: a thousand cores, as in the plan of the documentation.
+#: Assumed number of cores of a cluster, as in the documentation's plan.
 CLUSTER_CORES = 1000
 #: The engine's index of realisations has 63 bits: `Engine._check`.
 MOST_REALISATIONS = 2**63 - 1
@@ -64,7 +64,7 @@ def _check_file(file: Path) -> None:
         place, _ = without_columns(file)
         there = place.is_file()
     except (OSError, ValueError):
-        # The reader reports what cannot be a name.
+        # The reader reports impossible names.
         return
     if not there:
         read_bytes(place, "spectrum file")
@@ -79,19 +79,19 @@ def question_time(study: Study, *, device: str | None, cluster: str | None, insi
     device, cluster : str, optional
         Values of these flags.
     insist : bool
-        Skip the check of the time.
+        Whether to skip the check of the time.
 
     Raises
     ------
     InputError
-        If the least that it draws would take longer, with the estimate and how to insist; or if there are more
-        realisations than the index counts, which no insisting changes.
+        If the smallest number of draws would take longer; the message contains the estimate and names `--insist`. Also
+        if there are more realisations than the index can count, regardless of `insist`.
     """
     count = study.run.realisations
     if count > MOST_REALISATIONS:
         raise InputError.of("realisations", count, f"at most {MOST_REALISATIONS}: the index has 63 bits")
     if insist or count < 10**9:
-        # A billion ends within hours anywhere: no need to look at the instrument.
+        # A billion ends within hours on any device, so the instrument need not be loaded.
         return
     scenarios = 1 + len(study.flare.amplitudes)
     combinations = study.sweep.size
@@ -114,7 +114,7 @@ def question_room(store: Store, *, insist: bool) -> None:
     Raises
     ------
     InputError
-        With what it takes and what there is.
+        With the required and the available space.
     """
     if insist:
         return

@@ -1,4 +1,4 @@
-"""Write flags in messages where they name parameters of functions and keys of studies."""
+"""Replacement of parameters of functions and keys of studies by flags in messages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 #: A remedy in a message: `extend`, `resume=True`, `wavelength_unit='Angstrom'`, `fap=0.001`.
 _REMEDY = re.compile(r"`(?P<name>[a-z][a-z0-9_.]*)(?:=(?P<value>[^`]+))?`")
-#: Parameters whose flags are called otherwise, and which no key of the study gives.
+#: Parameters with flags of other names that are not keys of the study.
 _OTHERWISE = {"setting": "--set"}
 
 
@@ -30,7 +30,7 @@ def _keys() -> Mapping[str, str]:
 
 
 def _commands() -> Iterator[Any]:
-    """Yield the command that was called, then all others."""
+    """Yield the called command, then all others."""
     from typer.main import get_command
 
     from mauvecl.cli.app import app
@@ -56,7 +56,7 @@ def _flags(name: str, command: Any) -> list[str]:
 
 
 def with_flags(text: str) -> str:
-    """Return a message with flags in place of the remedies that it names in backticks."""
+    """Return a message with flags instead of the remedies in backticks."""
     return _REMEDY.sub(_as_flag, text) if "`" in text else text
 
 
@@ -75,7 +75,7 @@ def _as_flag(found: re.Match[str]) -> str:
 
 
 def name_flag(error: InputError) -> str:
-    """Return the error's message with a flag in place of its key, where that flag gave the value."""
+    """Return the error's message with a flag instead of its key, if that flag gave the value."""
     text, key = with_flags(str(error)), error.key
     if key is None:
         return text
@@ -86,7 +86,7 @@ def name_flag(error: InputError) -> str:
         flags = _flags(name.removeprefix("flare_"), command)
     if not any(_gives(word, flags) for word in sys.argv[1:]):
         return text
-    # The key as it is written, which may have blanks, after the place that holds it.
+    # The key as written, which may contain blanks, after its location.
     section, _, own = re.escape(key).replace("_", "[_ ]").rpartition(r"\.")
     shown = rf"(?:{section}\.)?{own}" if section else own
     return re.sub(rf"^(?:[^:=]*: )?{shown} = ", lambda _: f"{flags[0]} ", text)

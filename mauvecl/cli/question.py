@@ -1,4 +1,4 @@
-"""The study of a verb, from a file or the default, and flags."""
+"""Study of a verb from a file or the default, and flags."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ def study_of(
 
 
 def is_star(given: Path) -> bool:
-    """Return whether what stands in place of the study is a star: a name of the library or a spectrum file."""
+    """Return whether the argument of the study is a star: a name of the library or a spectrum file."""
     from mauvecl.study.star_names import has_spectrum, well_known
 
     text = str(given)
     if given.suffix.lower() == ".toml" or given.is_dir():
         return False
     if not _is_there(text):
-        # The first name decides: a wrong one among others has a sentence of its own.
+        # The first name decides; a wrong name among others has its own message.
         first = text.split(",")[0].strip()
         return bool(first) and (has_spectrum(first) or well_known(first) is not None)
     if given.suffix.lower() == ".ecsv":
@@ -59,7 +59,7 @@ def is_star(given: Path) -> bool:
 
 
 def _is_toml(file: Path) -> bool:
-    """Return whether a file holds TOML: a study, whatever it is called."""
+    """Return whether a file contains TOML, that is a study, regardless of its name."""
     import tomllib
 
     try:
@@ -137,7 +137,7 @@ def stars_of(study: Study, given: dict[str, Any], flags: Mapping[str, StudyFlag]
     if not (names or magnitudes or same or of_files):
         return None
     if names:
-        # A name that is a file's is a file; anything else is looked up in the library.
+        # A name of an existing file is a file; other names are searched for in the library.
         each = [one for name in names for one in ([name] if _is_there(name) else map(str.strip, name.split(",")))]
         stars: list[dict[str, Any]] = [{"file": name} if _is_file(name) else {"library": name} for name in each]
     else:
@@ -163,13 +163,13 @@ def _is_there(name: str) -> bool:
     try:
         return bool(name) and without_columns(name)[0].exists()
     except (OSError, ValueError):
-        # What no file name can be is refused as one.
+        # Impossible file names raise an error.
         return True
 
 
 def _is_file(name: str) -> bool:
     if _is_there(name):
         return True
-    # "K2.5V" looks like a file's name and is not one.
+    # "K2.5V" looks like a file name but is a star.
     suffix = Path(name).suffix
     return bool(suffix) and not suffix[1:].isupper()

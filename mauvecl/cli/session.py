@@ -1,4 +1,4 @@
-"""What every verb of the command line does around its answer: who draws, where it is written, how much is said."""
+"""Session of a verb of the command line: workers, output folder and terminal output."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, as the end of a batch job's time or a shutdown sends it."""
+    """SIGTERM, sent at the time limit of a batch job or at shutdown."""
 
 
 @dataclass(eq=False)
 class Session:
-    """One call of a verb; use it in a `with` block, in which this process alone writes into the output folder.
+    """Session of one call of a verb; in its `with` block, only this process writes to the output folder.
 
     Attributes
     ----------
@@ -44,17 +44,17 @@ class Session:
         Folder for everything written.
     as_json, quiet, pictures : bool
     device : str, optional
-        As `Engine` takes it; several with commas between them.
+        Device as for `Engine`; several are separated by commas.
     cluster : str, optional
-        As `cluster.DaskWorkers` takes it.
+        As for `cluster.DaskWorkers`.
     resume, restart : bool
-        What is to become of an unfinished run that is there.
+        Whether to continue or discard an unfinished run in the folder.
     keep_after : float, optional
-        Seconds after which finished parts of the work are kept on the disk; as `Checkpoint` has it by default.
+        Seconds after which finished parts are written to the disk; the default is that of `Checkpoint`.
     insist : bool
-        Begin what would never end, or not fit.
+        Whether to start runs that would take too long or too much space.
     opened : Device, optional
-        On which something was drawn without a pool, for the record.
+        Device on which something was drawn without a pool, for the run record.
     """
 
     verb: str
@@ -81,12 +81,12 @@ class Session:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Let go of the output folder.
+        """Release the output folder.
 
         Raises
         ------
         InputError
-            If a file of the answer, which is printed by now, could not be written.
+            If a file of the answer could not be written; the answer is printed before.
         """
         from mauvecl.schema.errors import InputError
 
@@ -100,7 +100,7 @@ class Session:
 
     @cached_property
     def folder(self) -> Path:
-        """Where everything is written; held from now on."""
+        """Output folder, which is locked from the first use."""
         from mauvecl.answers.files import make_folder
         from mauvecl.runs.locks import locked
 
@@ -111,12 +111,12 @@ class Session:
 
     @contextmanager
     def pool(self, *, unit: str = "realisations") -> Iterator[Pool]:
-        """Everyone who draws, with progress and a checkpoint; interruptions are told.
+        """Yield the pool of workers, with progress and a checkpoint; interruptions are reported.
 
         Parameters
         ----------
         unit : str
-            What progress counts: realisations, which the pool tells, or something that the caller tells `meter`.
+            Unit of progress: realisations, which the pool reports, or items that the caller reports to `meter`.
         """
         from mauvecl.runs.pool import Pool
 
@@ -138,7 +138,7 @@ class Session:
         if self.keep_after is not None:
             how["patience_s"] = self.keep_after
         checkpoint = Checkpoint(self.folder, self.verb, self.study, held=True, **how)
-        with told_of_interrupts(lambda: self._kept(checkpoint)), checkpoint:
+        with report_interrupts(lambda: self._kept(checkpoint)), checkpoint:
             self.say(checkpoint.messages)
             yield checkpoint
             if checkpoint.damaged:
@@ -148,7 +148,7 @@ class Session:
         self._checkpoint = checkpoint
 
     def _load(self) -> None:
-        """Import what tables and pictures need, which takes three quarters of a second at the end otherwise."""
+        """Import modules for tables and pictures in advance, which saves 0.75 s at the end."""
         from importlib import import_module
 
         from mauvecl.pictures.registry import load
@@ -161,7 +161,7 @@ class Session:
             canvas()
 
     def metered(self, unit: str) -> Meter:
-        """Progress in a unit, to be used in a `with` block."""
+        """Return the progress in a unit, for a `with` block."""
         from mauvecl.cli.console import Meter
 
         return Meter(quiet=self.quiet or self.as_json, unit=unit)
@@ -174,7 +174,7 @@ class Session:
         return f"{parts} kept in {str(checkpoint.folder)!r}, and the same command with --resume goes on from there"
 
     def say(self, lines: Sequence[str]) -> None:
-        """Tell the reader, unless standard output is for JSON alone."""
+        """Print messages, unless standard output is reserved for JSON."""
         from mauvecl.cli.console import show
         from mauvecl.cli.naming import with_flags
 
@@ -183,7 +183,7 @@ class Session:
 
     @cached_property
     def draws_pictures(self) -> bool:
-        """Whether pictures are to be drawn; tells where matplotlib is missing."""
+        """Return whether to draw pictures; print a message if matplotlib is missing."""
         from mauvecl.pictures.style import available
 
         if self.pictures and not available():
@@ -193,7 +193,7 @@ class Session:
         return self.pictures
 
     def write(self, table: Table, name: str) -> None:
-        """Write a table into the folder, in the format of its name's ending."""
+        """Write a table to the folder, in the format of its file extension."""
         from mauvecl.answers.files import write_table
 
         self.leave(lambda: write_table(table, self.folder / name))
@@ -204,7 +204,7 @@ class Session:
         return write_document(content(), self.folder / name)
 
     def leave(self, write: Callable[[], Path | Sequence[Path]]) -> None:
-        """Have files written; one that cannot be is told at the end, when the answer is out."""
+        """Write files; failures are reported at the end, after the answer is printed."""
         from mauvecl.schema.errors import InputError
 
         try:
@@ -215,7 +215,7 @@ class Session:
         self.files += [made] if isinstance(made, Path) else made
 
     def record(self, study: Study, inputs: Sequence[Expectation], messages: Sequence[str]) -> None:
-        """Write the study and the run record into the folder, and remove what was kept for a resume."""
+        """Write the study and the run record to the folder, and remove the checkpoint."""
         from mauvecl.answers.files import write_record, write_study
 
         if self.folder / "study.toml" not in self.files:
@@ -223,14 +223,14 @@ class Session:
         seconds = time.perf_counter() - self.started
         pool = self._pool
         how: dict[str, Any] = {"pool": pool, "opened": self.opened, "seconds": seconds, "messages": messages}
-        # Only a whole answer takes the place of another's.
+        # Only a complete answer replaces another's files.
         how |= {"files": self.files, "whole": not self._lost}
         self.leave(lambda: write_record(self.verb, study, inputs, self.folder, **how))
         if self._checkpoint is not None and not self._lost:
             self._checkpoint.forget()
 
     def ask(self, study: Study) -> Any:
-        """Return the answer of the session's verb; a pool draws where the verb has something to count."""
+        """Return the answer of the session's verb; a pool draws if the verb counts something."""
         from mauvecl.answers.verbs import VERBS
 
         verb = VERBS[self.verb]
@@ -242,14 +242,14 @@ class Session:
     def answer(self, answer: Answer) -> None:
         """Print an answer and write its files."""
         self.say([*answer.messages, answer.assumed])
-        with told_of_interrupts(self._written):
+        with report_interrupts(self._written):
             self._leave_all(answer)
         if self.as_json:
             from mauvecl.cli.naming import with_flags
 
             content = answer.as_json()
-            told = {"assumed": answer.assumed, "messages": [with_flags(line) for line in content["messages"]]}
-            self.print_json(told | {key: value for key, value in content.items() if key != "messages"})
+            remarks = {"assumed": answer.assumed, "messages": [with_flags(line) for line in content["messages"]]}
+            self.print_json(remarks | {key: value for key, value in content.items() if key != "messages"})
             return
         from mauvecl.cli.console import show_view
 
@@ -259,7 +259,7 @@ class Session:
         self.finish()
 
     def _leave_all(self, answer: Answer) -> None:
-        """Tables, documents and pictures of an answer, then the run's record."""
+        """Write tables, documents and pictures of an answer, then the run record."""
         for name, table in answer.files.items():
             self.write(table, name)
         for name, content in answer.documents.items():
@@ -283,7 +283,7 @@ class Session:
         print(json_text(content))
 
     def finish(self) -> None:
-        """Name the files written."""
+        """Print the names of the written files."""
         if self.files and not self.quiet:
             names = ", ".join(path.name for path in self.files)
             self.say([f"Wrote {names} to {self.folder}/ in {time.perf_counter() - self.started:.1f} s."])
@@ -291,7 +291,7 @@ class Session:
 
 @contextmanager
 def working(device: str | None, cluster: str | None) -> Iterator[Workers]:
-    """Open the workers that were asked for; release them at the end, at once if the work ended early."""
+    """Open the requested workers; release them at the end, at once if the work ended early."""
     from mauvecl.runs.pool import LocalWorkers
 
     if cluster is not None:
@@ -310,8 +310,8 @@ def working(device: str | None, cluster: str | None) -> Iterator[Workers]:
 
 
 @contextmanager
-def told_of_interrupts(kept: Callable[[], str]) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the work in order, with a sentence of what is kept; exit codes 130 and 143."""
+def report_interrupts(kept: Callable[[], str]) -> Iterator[None]:
+    """Stop the work in order at Ctrl-C and SIGTERM, with a message on kept results; exit codes 130 and 143."""
 
     def terminate(*_: object) -> None:
         raise Terminated

@@ -1,4 +1,4 @@
-"""Decorator that turns a function of a study and a session into a verb with a study file and flags."""
+"""Decorator that makes a function of a study and a session a command with a study file and flags."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 
 
 class StudyCommand(NamedTuple):
-    """Command with the flags of a study, which are made when it is called."""
+    """Command with the flags of a study, which are built when it is called."""
 
     help: str
     build: Callable[[], Callable[..., None]]
 
 
-#: The command of each verb that takes a study, by its name; `takes_study` fills it.
+#: Commands of verbs with a study by name, filled by `takes_study`.
 COMMANDS: dict[str, StudyCommand] = {}
 
 
@@ -51,24 +51,24 @@ def takes_study(
     pictures: bool = True,
     observation: Sequence[str] = OBSERVATION,
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Let a verb take a study file and flags, and call it with the resulting study and session.
+    """Make a function a command with a study file and flags, called with the resulting study and session.
 
     Parameters
     ----------
     *keys : str
-        Keys and sections of the study whose flags the verb takes, in addition to those of the observation.
+        Keys and sections of the study whose flags the verb accepts, in addition to those of the observation.
     name, help : str
-        The command's name and help text, where they are not the function's name and docstring.
+        Name and help text of the command; by default the function's name and docstring.
     without : str
-        A key of the observation that the verb does not take.
+        Key of the observation that the verb does not accept.
     defaults : mapping
-        Values of keys where neither a study file nor a flag is given, if they differ from the study's.
+        Defaults of keys that differ from the study's.
     writes : str
-        Default output, if that is not a folder of tables.
+        Default output, if it is not a folder of tables.
     default : callable, optional
         Function of the flags that returns the study if no file is given; the paper's question by default.
     draws, pictures : bool
-        Whether the verb draws realisations, and whether it makes pictures.
+        Whether the verb draws realisations, and whether it draws pictures.
     resumes : bool
         Whether a verb that draws no realisations can be resumed.
     observation : sequence of str
@@ -77,8 +77,8 @@ def takes_study(
     Returns
     -------
     callable
-        A decorator for functions whose first parameters are the study and the session. One named `given` receives the
-        flags; others are options of its own.
+        Decorator of functions whose first parameters are the study and the session. A parameter `given` receives the
+        flags; others are the verb's own options.
     """
 
     def decorate(verb: Callable[..., None]) -> Callable[..., None]:
@@ -165,7 +165,7 @@ def takes_study(
 def command_of(
     name: str, *, draws: bool | None = None, resumes: bool = False
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a function of the study and the session the command of a verb of the registry.
+    """Make a function of the study and the session the command of a registered verb.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def command_of(
     draws : bool, optional
         Whether a pool draws; by default if the verb counts something.
     resumes : bool
-        As in `takes_study`.
+        As for `takes_study`.
     """
     verb = VERBS[name]
     return takes_study(
@@ -190,7 +190,7 @@ def command_of(
 
 
 def add_plain_commands() -> None:
-    """Add the commands of verbs that have no function of their own: they ask, and print the answer."""
+    """Add the commands of verbs without their own function, which compute and print the answer."""
 
     def ask(study: Study, session: Session) -> None:
         session.answer(session.ask(study))

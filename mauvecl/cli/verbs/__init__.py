@@ -1,1 +1,1 @@
-"""The verbs, a few to a file: each asks for an answer, and shows it."""
+"""Commands with their own functions."""

@@ -46,7 +46,7 @@ def selftest(
 ) -> None:
     """Check that your device computes what it should.
 
-    Known answers, the slow twin in NumPy, tests of chance and closed forms, in some ten seconds.
+    Known answers, the NumPy reference, tests of chance and closed forms; takes about ten seconds.
 
     Exit code 1 if a check fails. Later run records on the same device carry the outcome.
 

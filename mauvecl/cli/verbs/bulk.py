@@ -1,4 +1,4 @@
-"""Verbs of raw spectra in bulk: draw them, verify them, export a part to one file."""
+"""Commands of stores of raw spectra: drawing, verification and export."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def realise(study: Study, session: Session) -> None:
     mauvecl realise --star G2V --magnitude 7.4 --amplitude 0.24 --exposure 5 -n 1000 --output frames.fits
     """
     from mauvecl.cli.foresight import question_room
-    from mauvecl.cli.session import told_of_interrupts, working
+    from mauvecl.cli.session import report_interrupts, working
     from mauvecl.schema.errors import InputError
     from mauvecl.store import bulk
     from mauvecl.store.export import ENDINGS
@@ -61,7 +61,7 @@ def realise(study: Study, session: Session) -> None:
     folder = bulk.unfinished(place) if one_file else place
     question_room(Store(folder, study), insist=session.insist)
     with (
-        told_of_interrupts(lambda: f"what was written to {str(folder)!r} is kept, and --resume draws the rest"),
+        report_interrupts(lambda: f"what was written to {str(folder)!r} is kept, and --resume draws the rest"),
         session.metered("spectra") as meter,
         working(session.device, session.cluster) as workers,
     ):
@@ -159,14 +159,14 @@ def verify(
     else:
         if faults:
             show_view(View(f"Not as it was written: {store}", bulk.FAULT_COLUMNS, [asdict(one) for one in faults]))
-        told = "with what was written" if not redraw else "with what the engine draws"
-        show([f"{len(faults) - left} repaired, {left} left as found." if faults else f"Everything agrees {told}."])
+        source = "with what was written" if not redraw else "with what the engine draws"
+        show([f"{len(faults) - left} repaired, {left} left as found." if faults else f"Everything agrees {source}."])
     if left:
         raise typer.Exit(1)
 
 
 def _verify_answer(folder: Path, *, as_json: bool) -> None:
-    """Print what is not as the run record has it; exit code 1 if anything."""
+    """Print files that differ from the run record, with exit code 1 if there are any."""
     from mauvecl.answers.checked import FAULT_COLUMNS, verify_answer
     from mauvecl.cli.console import show, show_view
     from mauvecl.schema.tables import View
