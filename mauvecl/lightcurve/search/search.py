@@ -101,6 +101,11 @@ class Search:
         """Rows of all half-widths and phases, with everything that does not depend on data."""
         return [row for template in self.bank.templates for row in self._rows_of(template)]
 
+    @property
+    def n_filters(self) -> int:
+        """Number of searched templates: half-widths, phases, onsets and temperatures."""
+        return len(self.bank.directions) * int(sum(np.count_nonzero(row.per_amplitude) for row in self.grid))
+
     def largest(self, sums: NDArray[Any]) -> LargestValue:
         """Return the largest value of each stare and its template.
 
