@@ -1,1 +1,1 @@
-"""One module for each question that a study asks, and the files that are written of its answer."""
+"""Answers to studies, one module per verb, and their files."""

@@ -27,51 +27,51 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class InCell:
-    """A star in a cell of the sweep."""
+    """Star in a cell of the sweep."""
 
     label: str
     at: Mapping[str, float | str]
 
     @property
     def title(self) -> str:
-        """The star and what is swept, for pictures."""
+        """Star and swept values, for pictures."""
         return full_label(self.label, self.at)
 
 
 class Answer(Drawable, ContentEquality, ABC):
-    """The answer of a verb to a study: tables and how people read them, messages, pictures and files."""
+    """Answer of a verb to a study: tables, printed views, messages, pictures and files."""
 
-    #: Endings of the files of each table; the first table's alone in some answers.
+    #: File extensions of each table; in some answers only of the first table.
     ENDINGS: ClassVar[tuple[str, ...]] = ("ecsv",)
     #: Parts of the study that the answer uses.
     USES: ClassVar[tuple[Use, ...]]
 
-    #: Properties with the tables that JSON holds, by key; "rows" is the first table by default.
+    #: Properties with the tables in JSON, by key; by default "rows" with the first table.
     JSON: ClassVar[Mapping[str, str]] = {}
 
     if TYPE_CHECKING:
 
         @property
         def study(self) -> Study:
-            """The study that was asked."""
+            """Study of the answer."""
 
         @property
         def messages(self) -> Sequence[str]:
-            """Messages for the reader, the most severe first."""
+            """Messages for users, the most severe first."""
 
     @property
     @abstractmethod
     def tables(self) -> dict[str, Table]:
-        """Every table by the name of its file; the first is the answer itself."""
+        """All tables by file name; the first is the answer itself."""
 
     @property
     @abstractmethod
     def inputs(self) -> list[Expectation]:
-        """Expectations on which the answer rests, for the run record."""
+        """Expectations on which the answer is based, for the run record."""
 
     @property
     def assumed(self) -> str:
-        """One line with the study's assumptions about the parts that the answer uses."""
+        """Line with the study's assumptions about the parts that the answer uses."""
         from mauvecl.study.assumptions import assumption_line
 
         return assumption_line(self.study, self.uses)
@@ -83,7 +83,7 @@ class Answer(Drawable, ContentEquality, ABC):
 
     @property
     def views(self) -> list[View]:
-        """Tables as people read them, in the terminal and on the page."""
+        """Printed tables, for the terminal and the page."""
         return []
 
     @cached_property
@@ -147,11 +147,11 @@ class Answer(Drawable, ContentEquality, ABC):
 
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:
-        """Files that are more than a table, by their full names: what makes their content."""
+        """Functions that make the content of documents, by full file name."""
         return documents_of(self)
 
     @property
     def files(self) -> dict[str, Table]:
-        """The tables by the full names of their files."""
+        """Tables by full file name."""
         near = {} if self.neighbours is None else {"neighbours": self.neighbours}
         return {f"{name}.{ending}": table for name, table in (self.tables | near).items() for ending in self.ENDINGS}

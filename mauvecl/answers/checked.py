@@ -1,4 +1,4 @@
-"""Comparison of an answer's folder with what its run wrote, by digests of its files and of the run record."""
+"""Verification of an answer's folder by the digests of its files and of the run record."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column
 from mauvecl.study.study_text import read_embedded_study
 
-#: Name of the run record in a folder, and its key that holds the digest of all others.
+#: File name of the run record, and its key with the digest of all other keys.
 RECORD, OWN_DIGEST = "run.json", "record_digest"
 
 
 @dataclass(frozen=True)
 class FileFault:
-    """A file that is not as the run wrote it.
+    """File that differs from what the run wrote.
 
     Attributes
     ----------
     file : str
     state : str
-        "changed", "missing", or what else is wrong.
+        "changed", "missing" or another fault.
     """
 
     file: str
@@ -70,18 +70,18 @@ def _is_table_of_answer(path: Path) -> bool:
 def verify_answer(folder: str | Path) -> list[FileFault]:
     """Compare an answer's folder with the digests in its run record.
 
-    Notices any change of a file that the run wrote, and of the record itself. It is no signature: who changes a file
-    and computes the digests anew is not noticed. Other files in the folder are ignored.
+    Any change of a file of the run, and of the record itself, is detected, unless digests are also recomputed: the
+    digest is not a signature. Other files in the folder are ignored.
 
     Parameters
     ----------
     folder : str or Path
-        As a verb's ``--output`` names it.
+        Value of a verb's ``--output``.
 
     Returns
     -------
     list of FileFault
-        Empty if everything is as it was written.
+        Empty if all files are unchanged.
     """
     from mauvecl.answers.files import json_text
 

@@ -58,11 +58,11 @@ def write_table(table: Table, path: Path) -> Path:
     Raises
     ------
     InputError
-        If it cannot be written; what was at its place is still there.
+        If it cannot be written; an existing file is then kept.
     """
     if path.suffix == ".fits":
         plain, packed = table.copy(), io.BytesIO()
-        # FITS keywords have eight letters and short values: the study has its own file.
+        # FITS keywords are limited to eight letters and short values, so the study has its own file.
         plain.meta = {FITS_KEYWORDS[k]: v for k, v in plain.meta.items() if k in FITS_KEYWORDS}
         plain.write(packed, format="fits")
         write_whole(path, packed.getbuffer())
@@ -166,7 +166,7 @@ def write_record(
         "packages": _versions("numpy", "scipy", "astropy", "synphot", "pyopencl"),
     }
     if pool is not None or opened is not None:
-        # What the self-test found on these devices, if the user has run it.
+        # Outcome of the self-test on these devices, if it was run.
 
         devices = pool.devices if pool is not None else [opened.record] if opened is not None else []
         record["devices"] = [asdict(device) for device in devices]
@@ -182,7 +182,7 @@ def write_record(
         record["files"] = {path.name: digest_of(path) for path in files}
         if whole:
             stale = [path for path in _left_by_another(folder) if path.name not in record["files"]]
-    # Numbers and names as JSON has them, so that the record that is read again has the same digest.
+    # Converted to JSON and back, so that the digest of a record that is read again is the same.
     record = json.loads(json_text(record))
     record[OWN_DIGEST] = record_digest(record)
     written = write_json(record, folder / RECORD)
@@ -198,7 +198,7 @@ def _left_by_another(folder: Path) -> list[Path]:
         files = [(folder / name, digest) for name, digest in named.items() if Path(name).name == name]
         return [path for path, digest in files if path.is_file() and digest_of(path) == digest]
     except (InputError, OSError, ValueError, AttributeError, RecursionError):
-        # No record, or none of ours.
+        # No record, or not one of mauvecl's.
         return []
 
 

@@ -230,7 +230,7 @@ def test_invalid_manifests_are_refused(content: str, tmp_path: Path) -> None:
     for folder, name in (("store", "zarr.json"), ("run/checkpoint", "manifest.json")):
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / name).write_text(content)
-    assert "no store" in refused("verify", "store", folder=tmp_path)
+    assert "not a store" in refused("verify", "store", folder=tmp_path)
     from mauvecl.runs.checkpoint import Checkpoint
 
     with (

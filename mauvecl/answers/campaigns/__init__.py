@@ -1,1 +1,1 @@
-"""Answers over a season: when targets are seen, and what a campaign on them would bring."""
+"""Answers about campaigns: visibility of targets, and expected flares."""

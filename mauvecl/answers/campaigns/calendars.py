@@ -1,4 +1,4 @@
-"""Windows as a calendar that programs for appointments read: iCalendar, RFC 5545."""
+"""Windows as a calendar in the format iCalendar (RFC 5545)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from mauvecl.host.version import VERSION
 
 @dataclass(frozen=True)
 class Entry:
-    """One appointment.
+    """Appointment in a calendar.
 
     Attributes
     ----------
     start, stop : str
-        UTC, ISO 8601 to the second; days alone make an entry of whole days, the last of them included.
+        UTC, ISO 8601 to the second; dates without time make an entry of whole days, including the last.
     title, text : str
     """
 
@@ -40,7 +40,7 @@ def calendar_bytes(entries: Iterable[Entry], name: str) -> bytes:
         lines += [
             "BEGIN:VEVENT",
             f"UID:{unique}@mauvecl",
-            # When it was made would make the same plan another file.
+            # A fixed time, so that equal plans give equal files.
             f"DTSTAMP:{_moment(entry.start).removeprefix(':').removeprefix(';VALUE=DATE:')[:8]}T000000Z",
             f"DTSTART{_moment(entry.start)}",
             f"DTEND{_moment(_day_after(entry.stop) if _is_day(entry.stop) else entry.stop)}",

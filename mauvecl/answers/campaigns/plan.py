@@ -1,4 +1,4 @@
-"""A campaign: how long each target is seen, which flares are recovered, how many are expected, what alarms falsely."""
+"""Plan of a campaign: visibility of targets, recovered and expected flares, and false alarms."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def _interval(low: int | None, high: int | None) -> str:
     return "" if low is None else f"{low} to {high}"
 
 
-#: Columns of the table of targets, but for false alarms, which stand before the last.
+#: Columns of the table of targets, without false alarms, which precede the last.
 COLUMNS = (
     Column("target", "name", "", "name of the target", "target"),
     Column("seen", "seen_h", "h", "time in which the target is seen", "seen (h)", ".0f"),
@@ -80,7 +80,7 @@ THROUGHPUT_COLUMNS = (
            "relative standard error of the recovered flares by the calibration of the throughput",
            "flares by throughput", percent(".2g")),
 )  # fmt: skip
-#: Columns of the table of what is put in.
+#: Columns of the table of inputs.
 STAR_COLUMNS = (
     Column("target", "name", "", "name of the target"),
     Column("ra", "observation.target.ra_deg", "deg", "right ascension"),
@@ -111,7 +111,7 @@ STAR_COLUMNS = (
     Column("scatter", lambda one: np.nan if one.rates is None else one.rates.scatter_dex, "",
            "standard deviation of the rate's logarithm, dex"),
 )  # fmt: skip
-#: Columns of the table of shares and rates by energy.
+#: Columns of the table of recovered fractions and rates by energy.
 ENERGY_COLUMNS = (
     Column("target", description="name of the target", kind=str),
     Column("energy", "", "erg", "bolometric"),
@@ -122,7 +122,7 @@ ENERGY_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class PlanAnswer(Answer):
-    """The answer of `plan`.
+    """Answer of `plan`.
 
     Attributes
     ----------
@@ -159,12 +159,12 @@ class PlanAnswer(Answer):
 
     @property
     def stars(self) -> QTable:
-        """What is put in: one row per target."""
+        """Inputs, one row per target."""
         return table_of(STAR_COLUMNS, self.planned, study=self.study.text())
 
     @property
     def by_energy(self) -> QTable:
-        """The share recovered and the rate by energy: one row per target and energy, where either changes."""
+        """Recovered fraction and rate by energy, one row per target and energy where either changes."""
         rows = []
         for one in self.planned:
             if one.completeness is None:
@@ -178,7 +178,7 @@ class PlanAnswer(Answer):
 
     @property
     def assumptions(self) -> Table:
-        """Everything that is assumed, with where it is from."""
+        """All assumptions with their sources."""
         law = self.study.plan.law()
         orbit = self.study.orbit.orbit()
         rows = list(self.seen.visibility.limits.assumptions)
@@ -238,7 +238,7 @@ class PlanAnswer(Answer):
 
     @property
     def tables(self) -> dict[str, Table]:
-        """Targets, what is put in, shares and rates by energy, months, days, assumptions."""
+        """Targets, inputs, fractions and rates by energy, months, days, assumptions."""
         return {
             "plan": self.table,
             "stars": self.stars,
@@ -260,7 +260,7 @@ class PlanAnswer(Answer):
 
     @property
     def messages(self) -> list[str]:
-        """What saturates, which targets have no answer and why, what is extrapolated, what is said of visibility."""
+        """Messages on saturation, targets without an answer, extrapolations and visibility."""
         lines = of_kind(collect_messages(self.inputs), SATURATED)
         for case in self.observed:
             if case.neighbours is not None:
@@ -312,19 +312,19 @@ def plan(
     Parameters
     ----------
     study : Study
-        Its ``plan`` names the targets, its ``orbit`` when and from where.
+        Its ``plan`` defines the targets, its ``orbit`` time and position.
     engine : Stares or Pool, optional
-        Who draws injections; the default device. The checkpoint of a pool keeps each target that is finished.
+        Simulator of injections; by default that of the default device. The checkpoint of a pool keeps finished targets.
     progress : callable, optional
         Called as ``progress(done, total)`` in targets.
     completeness : callable, optional
-        The share of flares recovered by bolometric energy; as the study's ``plan.completeness`` has it unless given: by
-        injections into drawn noise, or in closed form.
+        Recovered fraction of flares by bolometric energy. By default the study's ``plan.completeness`` decides between
+        injections into drawn noise and the closed form.
 
     Raises
     ------
     InputError
-        If there are no targets, or a target's place, type, magnitude or distance is not known.
+        If there are no targets, or a target's position, type, magnitude or distance is unknown.
 
     Examples
     --------
@@ -377,7 +377,7 @@ def plan(
     planned: list[Planned] = []
     if progress is not None:
         progress(0, len(stars))
-    # With a pool, the noise of one target is drawn while the threshold of the next is sampled.
+    # With a pool, the noise of a target is drawn while the threshold of the next one is sampled.
     for one in map_in_order(engine, planned_for, observations()):
         planned.append(one)
         if progress is not None:

@@ -1,4 +1,4 @@
-"""Words of a plan's report: each number of a target with the table and column that it is from."""
+"""Texts of a plan's report: each number of a target with its table and column."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.campaigns.plan import PlanAnswer
 
 SUMMARY_TABLE = "plan.ecsv"
-#: What the columns mean.
+#: Explanation of the columns.
 LEGEND = (
     "E50 and E90: bolometric energies from which on half and 90 % of the flares are recovered. Flares: recovered "
     "in the hours observed, expected by the rates as they are; 95 % of campaigns recover the numbers beside them, by "

@@ -33,7 +33,7 @@ SMALL = 0.01
 
 @dataclass(frozen=True, eq=False)
 class TargetObservation:
-    """A target as the satellite observes it."""
+    """Target as observed by the satellite."""
 
     target: Target
     case: Case  # of one frame, with the sky and the conditions below
@@ -43,7 +43,7 @@ class TargetObservation:
 
     @property
     def star(self) -> Star:
-        """The star of the library that stands for the target."""
+        """Library star that represents the target."""
         return self.case.star
 
     @property
@@ -80,7 +80,7 @@ CompletenessOf = Callable[[TargetObservation], Completeness]
 
 @dataclass(frozen=True, eq=False)
 class Planned:
-    """A target of a plan, with the flares that are expected of it."""
+    """Target of a plan with its expected flares."""
 
     observation: TargetObservation
     seen_h: float  # visible time
@@ -162,7 +162,7 @@ def rates_of(text: PlanTarget, observation: TargetObservation) -> tuple[Rates | 
 
 
 def star_of(text: PlanTarget, simbad: bool) -> Star:
-    """Return the star of the library that stands for a target.
+    """Return the library star that represents a target.
 
     Raises InputError if its type, magnitude or distance is neither given nor known.
     """

@@ -1,4 +1,4 @@
-"""When targets can be seen from the orbit: windows, hours by day and month, elongation and zodiacal light."""
+"""Visibility of targets from the orbit: windows, hours by day and month, elongation and zodiacal light."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Rows of the table of windows beyond which it is not written.
+#: Largest number of rows for which the table of windows is written.
 MOST_WINDOWS = 100_000
-#: Hours of exposure in a day from which a day without single windows counts as one on which the target is seen.
+#: Smallest exposure per day, hours, for which a target counts as visible on a day if windows are not known.
 SEEN_H = 0.5
 
 
-#: Targets whose hours of each month are shown, at most.
+#: Largest number of targets with printed hours per month.
 MOST_MONTHLY = 12
 TARGET_COLUMN = Column("target", description="name of the target", heading="target")
 #: Columns of the table of targets; one for each limit in force follows `share`.
@@ -80,13 +80,13 @@ WINDOW_COLUMNS = (
 
 
 def assumption_columns(first: str) -> tuple[Column, ...]:
-    """Return the columns of a table of assumptions, for rows of what is assumed, its value and its source."""
+    """Return the columns of a table of assumptions, for rows of quantity, value and source."""
     return tuple(Column(name, itemgetter(k)) for k, name in enumerate((first, "value", "source")))
 
 
 @dataclass(frozen=True, eq=False)
 class VisibleAnswer(Answer):
-    """The answer of `visible`.
+    """Answer of `visible`.
 
     Attributes
     ----------
@@ -104,19 +104,19 @@ class VisibleAnswer(Answer):
 
     @property
     def times(self) -> TimeGrid:
-        """The time grid."""
+        """Time grid."""
         return self.visibility.track.times
 
     @cached_property
     def days(self) -> list[str]:
-        """Its UTC days, such as "2027-01-31"."""
+        """UTC days of the time grid, such as "2027-01-31"."""
         first = np.datetime64(self.times.iso(0.0)[:10], "D")
         count = int(np.floor(self.times.julian[1][-1])) + 1
         return [str(first + n) for n in range(count)]
 
     @cached_property
     def noons(self) -> Bodies:
-        """Sun and Moon at the noon of each day, UTC."""
+        """Positions of Sun and Moon at noon of each day, UTC."""
         return Bodies.at(TimeGrid(self.days[0], len(self.days), DAY_S))
 
     def elongation_deg(self, k: int) -> Float:
@@ -125,12 +125,12 @@ class VisibleAnswer(Answer):
 
     @cached_property
     def zodiacal(self) -> Float:
-        """V mag arcsec^-2 behind each target at noon of each day, (n_target, n_day); NaN near the Sun."""
+        """Sky behind each target at noon of each day, V mag arcsec^-2, (n_target, n_day); NaN near the Sun."""
         return np.array([zodiacal_light(self.noons, one.direction) for one in self.targets])
 
     @cached_property
     def windows(self) -> tuple[Windows, ...]:
-        """Those of each target."""
+        """Windows of each target."""
         return tuple(self.visibility.windows(k) for k in range(len(self.targets)))
 
     @property
@@ -243,7 +243,7 @@ class VisibleAnswer(Answer):
 
     @property
     def assumptions(self) -> Table:
-        """Each limit in force, with its value and where its default is from."""
+        """Active limits with their values and the sources of their defaults."""
         return table_of(assumption_columns("limit"), self.visibility.limits.assumptions)
 
     @property
@@ -260,7 +260,7 @@ class VisibleAnswer(Answer):
 
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:
-        """The calendar: each window, or where these are not known the days on which a target is seen."""
+        """Calendar of windows or, if these are not known, of the days on which a target is visible."""
         return {"visible.ics": partial(calendar_bytes, self.entries(), "Mauve")}
 
     def entries(self) -> list[Entry]:
@@ -284,12 +284,12 @@ class VisibleAnswer(Answer):
 
     @property
     def inputs(self) -> list[Expectation]:
-        """None: nothing is exposed."""
+        """No expectations, since nothing is exposed."""
         return []
 
     @property
     def messages(self) -> list[str]:
-        """What the orbit is, what is assumed, what is not modelled, and which targets are never seen."""
+        """Messages on the orbit, assumptions, effects that are not modelled, and targets that are never visible."""
         never = [one.name for one, part in zip(self.targets, self.visibility.share, strict=True) if part == 0]
         lines = [f"{name} is never seen: {self.reason(name)}." for name in never]
         lines += self.study.orbit.orbit().messages(self.times)
@@ -319,7 +319,7 @@ def visible(
     Parameters
     ----------
     study : Study
-        Its ``orbit`` says from where, when, and what must hold.
+        Its ``orbit`` defines position, time and limits.
     engine : Engine or Pool, optional
         Not used: nothing is drawn.
     progress : callable, optional
@@ -328,7 +328,7 @@ def visible(
     Raises
     ------
     InputError
-        If there are no targets, or one is unknown; for elements that cannot be followed that far.
+        If there are no targets, a target is unknown, or the orbital elements cannot be propagated that far.
 
     Examples
     --------

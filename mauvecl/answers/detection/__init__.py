@@ -1,1 +1,1 @@
-"""Would flares be seen: detect, map, gaussian, and what it costs not to know the instrument."""
+"""Answers about detection: detect, map, gaussian, and the cost of unknowns."""

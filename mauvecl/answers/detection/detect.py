@@ -44,9 +44,9 @@ if TYPE_CHECKING:
     from mauvecl.study.questions import CampaignQuestion
 
 
-#: Columns of what is found of one flare by one statistic.
+#: Columns of the detection of a flare by a statistic.
 FOUND = COLUMNS[1:]
-#: Rows of the tables of ROC and of extremes, which many flares share.
+#: Largest number of rows of the tables of ROC curves and extremes, divided among flares.
 MOST_ROWS = 100_000
 
 
@@ -65,7 +65,7 @@ class StarDetection(InCell):
 
 @dataclass(eq=False)
 class DetectAnswer(Answer):
-    """The answer of `mauvecl detect`.
+    """Answer of `mauvecl detect`.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class DetectAnswer(Answer):
     stars : list of StarDetection
         One per star and cell of the sweep.
     messages : list of str
-        Messages for the reader, the most severe first.
+        Messages for users, the most severe first.
     paper : list of str
         Comparison with the paper's values, if the study has its G2V star.
     """
@@ -105,9 +105,9 @@ class DetectAnswer(Answer):
 
     @cached_property
     def departures(self) -> QTable:
-        """One row per star, cell and statistic, and flare where its shape matters: see `departures.Departure`.
+        """One row per star, cell and statistic, and per flare for shaped statistics; see `departures.Departure`.
 
-        Empty where thresholds are not counted.
+        The table is empty if thresholds are not counted.
         """
         fap = self.study.run.fap
         parts = [(star, departure_table(star.detection, star.amplitudes, fap)) for star in self.stars]
@@ -140,7 +140,7 @@ class DetectAnswer(Answer):
 
     @property
     def roc(self) -> QTable:
-        """Every receiver operating characteristic, with its area; see `roc.Roc`.
+        """All receiver operating characteristics with their areas; see `roc.Roc`.
 
         Many flares share `MOST_ROWS` rows, so that each curve has fewer than its 200.
         """
@@ -222,7 +222,7 @@ def detect(
     progress : callable, optional
         Called as ``progress(done, total)`` in stars.
     """
-    # Bad input is refused before anything is drawn.
+    # Invalid input raises an error before anything is drawn.
     run = study.run
     check_fap(run.fap, run.realisations, run.tails)
     prepared = cases(study)
@@ -246,7 +246,7 @@ def detect(
     paper: list[str] = []
     for star in map_in_order(engine, detected, prepared):
         if not stars:
-            # The devices count the next star meanwhile.
+            # Meanwhile, the devices count the next star.
             paper = _paper(prepared)
         stars.append(star)
         if progress is not None:
@@ -294,7 +294,7 @@ def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
 
 
 def _other_templates(case: Case) -> list[Linear]:
-    """Return matched statistics that look for flares of other temperatures than the study's."""
+    """Return matched statistics that search for flares of other temperatures than the study's."""
     filters, quiet = [], case.quiet
     for temperature in case.study.run.template_temperatures_k:
         (shape,) = case.expect(case.with_value("flare_temperature", temperature).flaring(case.amplitudes[0]))

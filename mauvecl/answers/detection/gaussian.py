@@ -1,4 +1,4 @@
-"""Where the usual root-of-N formula is wrong, and by how much, over magnitude and exposure.
+"""Errors of the usual root-of-N formula over magnitude and exposure.
 
 The formula promises three things: the S/N of a spectrum, that the true signal lies within one estimated standard
 deviation of the observed one in 68.27 % of all spectra, and the false-alarm probability of a threshold.
@@ -53,7 +53,7 @@ ELEMENT_COLUMNS = (
     Column("bias", description="mean over expected S/N, less one"),
     Column("coverage", description="share of 1-sigma intervals of its pixels that hold the truth; 0.6827 promised"),
 )
-#: Columns of the worst of each promise.
+#: Columns of the largest error of each prediction.
 WORST_COLUMNS = (
     Column("best_snr", description="largest S/N per element by the formula", heading="best S/N", format=".2f"),
     Column("snr_off_by",
@@ -163,7 +163,7 @@ def _promises(result: SnrResult) -> QTable:
 
 @dataclass(eq=False)
 class GaussianAnswer(Answer):
-    """The answer of `gaussian_report`.
+    """Answer of `gaussian_report`.
 
     Attributes
     ----------
@@ -184,7 +184,7 @@ class GaussianAnswer(Answer):
 
     @property
     def tables(self) -> dict[str, Table]:
-        """The worst of each promise, each element's, each threshold's."""
+        """Largest errors of each prediction, errors by element, and errors by threshold."""
         return {"gaussian": self.cells, "elements": self.elements, "thresholds": self.thresholds}
 
     @property
@@ -193,7 +193,7 @@ class GaussianAnswer(Answer):
 
     @cached_property
     def elements(self) -> QTable:
-        """One row per star, cell and resolution element: what the formula promises and what the simulation finds."""
+        """Predictions and simulation, one row per star, cell and resolution element."""
         return self.signal.together(_promises)
 
     @property
@@ -203,7 +203,7 @@ class GaussianAnswer(Answer):
 
     @cached_property
     def cells(self) -> QTable:
-        """One row per star and cell: the worst of each promise."""
+        """Largest error of each prediction, one row per star and cell."""
         tables = [_by_star(t, len(self.signal.stars)) for t in (self.elements, self.thresholds, self.detection.table)]
         rows = [
             {"star": star} | _of_signal(star.result, elements) | _of_thresholds(tested, flares)
@@ -252,7 +252,7 @@ def _of_thresholds(tested: QTable, flares: QTable) -> dict[str, float | str]:
     off = tested[tested["differs"]]
     wrong = off[np.argmax(np.abs(np.log(np.maximum(off["ratio"], SMALLEST_RATIO))))] if len(off) else None
     missed = flares["probability"] - flares["closed_form_probability"]
-    # The threshold's own error is in the interval.
+    # The interval includes the error of the threshold.
     sure = np.abs(missed) > (flares["high"] - flares["low"]) * SURE / ERRORS_IN_INTERVAL
     missed = np.where(sure, missed, 0.0)
     return {
@@ -293,7 +293,7 @@ def gaussian(
     return GaussianAnswer(study, snr(study, engine, progress_of(0)), detect(study, engine, progress_of(1)))
 
 
-#: The older name.
+#: Former name.
 gaussian_report = gaussian
-#: The older name of the class.
+#: Former name of the class.
 GaussianReport = GaussianAnswer

@@ -50,7 +50,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class MapAnswer(Answer):
-    """The answer of `detection_map`, for the study's first star.
+    """Answer of `detection_map`, for the study's first star.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class MapAnswer(Answer):
 
     @property
     def views(self) -> list[View]:
-        """The map of each statistic: a row per value of y, a column per value of x."""
+        """Map of each statistic, with a row per value of y and a column per value of x."""
         draws = f"{self.study.unknowns.draws} draws of what is unknown"
         lines = [
             View(f"{statistic}, averaged over {draws}: its scatter is from {describe_shares(parts)}.")
@@ -147,7 +147,7 @@ def map(
     Parameters
     ----------
     study : Study
-        Its ``map`` names the axes; what no axis names stays as the study has it.
+        Its ``map`` defines the axes; other quantities have the study's values.
     engine : Engine or Pool, optional
     progress : callable, optional
         Called as ``progress(done, total)`` in cells.
@@ -206,7 +206,7 @@ def map(
 
 
 def _cost(case: Case, x: tuple[float | str, ...], y: tuple[float | str, ...]) -> list[str]:
-    """Return the sentence on what unknowns cost in the middle of the map."""
+    """Return the sentence on the cost of unknowns in the middle of the map."""
     middle, study = (x[len(x) // 2], y[len(y) // 2]), case.study
     there = _cell(case, *middle)
     (flare,) = there.flares

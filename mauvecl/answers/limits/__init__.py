@@ -1,1 +1,1 @@
-"""How faint, how small, how short: the value of a quantity at which a flare is detected, and what moves it."""
+"""Limits: the value of a quantity at which a flare is detected, and its dependence on assumptions."""

@@ -1,4 +1,4 @@
-"""How far a limit moves with what is only assumed of the instrument, and which assumption moves it most."""
+"""Changes of a limit with assumptions about the instrument."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Assumption:
-    """One uncertain value of the payload, with both ends of its sensible range (docs: what is nominal)."""
+    """Uncertain value of the payload with both ends of its range (documentation: what is nominal)."""
 
     name: str
     ends: tuple[str, str]
@@ -50,7 +50,7 @@ def assumptions(nominal: Instrument) -> tuple[Assumption, ...]:
 
 @dataclass(frozen=True)
 class Moved:
-    """A limit with one assumption at either end of its range."""
+    """Limit with one assumption at both ends of its range."""
 
     star: str
     amplitude: float

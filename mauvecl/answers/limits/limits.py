@@ -1,4 +1,4 @@
-"""The value of one quantity at which a flare is detected with a wanted probability, with its interval."""
+"""Limit of a quantity: the value at which a flare is detected with a given probability."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Limit:
-    """One limit.
+    """Limit of a quantity.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class Limit:
     of, statistic : str
     fap, power : float
     value : Interval
-        With its 95 % interval, including that of the threshold.
+        Limit with its 95 % interval, including that of the threshold.
     closed_form : float
         Limit for Gaussian noise.
     check : Point
@@ -110,7 +110,7 @@ class Limit:
 
 @dataclass(eq=False)
 class LimitAnswer(Answer):
-    """The answer of `limit`.
+    """Answer of `limit`.
 
     Attributes
     ----------
@@ -245,7 +245,7 @@ def solve(case: Case, statistic: str, engine: Engine | Pool) -> Limit:
     Raises
     ------
     InputError
-        If the power is not crossed in the range searched, or the false-alarm probability cannot be settled.
+        If the power is not crossed in the searched range, or too few realisations lie beyond the threshold.
     """
     study = case.study
     check_fap(study.run.fap, study.run.realisations, study.run.tails)
@@ -292,7 +292,7 @@ def limit(
     Parameters
     ----------
     study : Study
-        Its ``limit`` says of what (magnitude, amplitude or exposure) and at which power.
+        Its ``limit`` defines the quantity (magnitude, amplitude or exposure) and the power.
     engine : Engine or Pool, optional
     progress : callable, optional
         Called as ``progress(done, total)`` in limits.
@@ -300,7 +300,7 @@ def limit(
     Raises
     ------
     InputError
-        As `solve`, if it holds of every limit; else see `LimitAnswer.failed`.
+        As for `solve`, if all limits fail; otherwise see `LimitAnswer.failed`.
     """
     from mauvecl.device.engine import Engine as Default
     from mauvecl.runs.pool import map_in_order
@@ -338,9 +338,9 @@ def limit(
     return result
 
 
-#: The older name.
+#: Former name.
 limiting_magnitude = limit
-#: The older name of the class.
+#: Former name of the class.
 LimitResult = LimitAnswer
 
 

@@ -1,4 +1,4 @@
-"""A study's flares measured along one simulated stare: in bins of its frames, and by a fit to all of them."""
+"""Measurement of a study's flares along a simulated stare: in bins of frames, and by a fit to all frames."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ JOINT_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class JointFit:
-    """A fit of shape and spectrum to all frames, next to the flare that was drawn."""
+    """Fit of shape and spectrum to all frames, with the drawn flare."""
 
     found: Measurement
     truth: Float  # shape (n_derived,)
@@ -58,7 +58,7 @@ class JointFit:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredStare(InCell):
-    """The flares of one simulated stare, measured in bins of its frames by one model, and by a joint fit."""
+    """Flares of a simulated stare, measured in bins of frames with one model, and by a joint fit."""
 
     model: str
     staring: StareExpectation

@@ -1,4 +1,4 @@
-"""Errors that the measurement of a flare will have, in closed form."""
+"""Expected errors of the measurement of a flare, in closed form."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ExpectedMeasurement(InCell):
-    """One model and one flare: the truth, and what a fit is expected to make of it."""
+    """Model and flare with true values and expected errors of a fit."""
 
     amplitude: float  # of the study's flare
     model: str
@@ -54,7 +54,7 @@ class ExpectedMeasurement(InCell):
     def region(self, rise: float, n: int = 161) -> tuple[Float, Float, Float]:
         """Return the expected confidence region of temperature and amplitude, with everything else profiled.
 
-        For models of one temperature.
+        Only for models of one temperature.
 
         Parameters
         ----------
@@ -91,7 +91,7 @@ class ExpectedMeasurement(InCell):
             if 0 <= k < nodes.size else inner
             for inner, k in zip(known, beyond, strict=True)
         ]  # fmt: skip
-        # Dense at the ends, where the amplitudes meet like a root.
+        # Dense at the ends, where the two amplitudes converge like a root.
         log_k = (ends[0] + ends[1]) / 2 + (ends[1] - ends[0]) / 2 * np.sin(np.linspace(-np.pi / 2, np.pi / 2, n))
         amplitude, power, left = at(log_k)
         reach = np.sqrt(np.maximum(left, 0.0) / power)

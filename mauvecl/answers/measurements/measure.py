@@ -42,24 +42,24 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Exposures drawn and fitted at once, which bounds the memory.
+#: Number of exposures drawn and fitted at once, which limits the memory.
 BATCH = 4096
-#: S/N below which the coverage of intervals differs from their nominal one, by bench/coverage.py.
+#: S/N below which the coverage of intervals differs from the nominal one (bench/coverage.py).
 WILKS_SNR = 10.0
-#: A good fit is rejected where one of its p-value is less probable.
+#: p-value below which a fit is rejected.
 REJECTED = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredFlare(ExpectedMeasurement):
-    """One model, fitted to simulated exposures of one flare."""
+    """Model fitted to simulated exposures of a flare."""
 
     found: Measurement  # fits to simulated exposures
     selected: NDArray[np.bool_]  # exposures that a matched filter detects at the study's false-alarm probability
     frame: Float  # the first exposure, DN, less the quiescent mean; shape (n_pixel,)
 
     def fitted_dn(self) -> tuple[Float, Float]:
-        """Return the mean of the fitted flare in the first exposure, and the best values of what is unknown, DN."""
+        """Return the mean of the fitted flare in the first exposure, and the best values of unknowns, DN."""
         mean = self.fitted.counts(np.exp(self.found.log_k[0]), self.found.amplitudes[0])
         if self.unknown is None:
             return mean, np.zeros_like(mean)
@@ -171,16 +171,16 @@ MODEL_COLUMN = Column("model", description="model that is fitted", heading="mode
 
 @dataclass(eq=False)
 class MeasureAnswer(Answer):
-    """The answer of `mauvecl measure`.
+    """Answer of `mauvecl measure`.
 
     Attributes
     ----------
     study : Study
     flares : list of MeasuredFlare
-        Every model of every flare of every star in every cell of the sweep.
+        All models of each flare of each star and cell of the sweep.
     messages : list of str
     stares : list of MeasuredStare
-        One stare of every star in every cell, if the study requests bins of a stare or a joint fit.
+        One stare per star and cell, if the study requests bins of a stare or a joint fit.
     """
 
     USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "processes", "nuisances", "seed")
@@ -276,15 +276,15 @@ def _bin_columns(bins: MeasuredBins) -> list[Column]:
 def measure(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> MeasureAnswer:
-    """Forecast and simulate what is measured of a study's flares in one exposure.
+    """Forecast and simulate the measurement of a study's flares in one exposure.
 
     Parameters
     ----------
     study : Study
     engine : Engine or Pool, optional
-        Draws the exposures; the default device. The checkpoint of a pool keeps the fits that are finished.
+        Simulator of the exposures; by default that of the default device. The checkpoint of a pool keeps finished fits.
     progress : callable, optional
-        Receives the flares that are done, and all of them.
+        Called as ``progress(done, total)`` in flares.
     """
     if study.flare.geometry != "added":
         raise InputError.of("flare.geometry", "replaces", "'added': fits take light for added")
@@ -368,7 +368,7 @@ def _faint(flares: Sequence[MeasuredFlare]) -> list[str]:
 
 
 def _wrong(flares: Sequence[MeasuredFlare]) -> list[str]:
-    """Say which models do not fit, and what they make of the temperature."""
+    """Return messages on models that do not fit, with the temperature that they give."""
     lines = []
     for one in flares:
         lost, truth = float(one.perfect.chi2[0]), one.truth[0]

@@ -1,4 +1,4 @@
-"""The true values of what is measured of a simulated flare."""
+"""True values of the quantities that are measured of a simulated flare."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ class Truth:
         nm = lit.wavelength_nm
         added = lit.flux_flam - np.interp(nm, quiet.wavelength_nm, quiet.flux_flam)
         added = added - light.flux_at_telescope(nm)
-        # Flux at the telescope over that of the flare's spectrum.
+        # Ratio of the flux at the telescope to that of the flare's spectrum.
         self._scale = float(np.trapezoid(added, nm) / np.trapezoid(light.flux(nm), nm))
         self._continuum = light.continuum if isinstance(light, FlareWithLines) else light
         self._two = self._continuum if isinstance(self._continuum, TwoBlackbodies) else None
         self._amplitude = np.nan
         if self._continuum.temperature_k is not None:
             at = quiet.wavelength_nm
-            # Of the blackbodies, without recombination.
+            # Flux of the blackbodies without recombination.
             light = self._continuum if self._two else Blackbody(self._continuum.temperature_k)
             body = photons(at, light.flux(at), band)
             self._amplitude = self._scale * body / photons(at, quiet.flux_flam, band)
 
     def value(self, name: str) -> float:
-        """Return the true value of a quantity by the name that fits give it; NaN where the flare has none."""
+        """Return the true value of a quantity by its name in fits; NaN if the flare has none."""
         far = np.nan if self._star.distance_pc is None else self._star.distance_pc * PARSEC_CM
         first, _, rest = name.partition(" ")
         if first in ("flux", "luminosity", "energy"):
@@ -72,7 +72,7 @@ class Truth:
         return float(area / (np.pi * radius**2))
 
     def _temperatures(self) -> dict[str, float]:
-        """Return temperatures, and the area of the hotter blackbody over that of the cooler one."""
+        """Return the temperatures, and the ratio of the hotter blackbody's area to that of the cooler one."""
         kelvin, two = self._continuum.temperature_k, self._two
         if kelvin is None:
             return {}
