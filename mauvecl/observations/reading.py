@@ -69,6 +69,55 @@ def read_frames(path: str | Path, mapping: FrameMapping | str | Path | None = No
         return _frames_in(file, how, stem)
 
 
+def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any = None) -> Frames:
+    """Build frames from a container of another package.
+
+    Parameters
+    ----------
+    container : Table, TimeSeries, LightCurve or Spectrum
+        A table of astropy, of which its time series and those of lightkurve are kinds; or spectra as of specutils, with
+        the attributes ``flux`` of shape (n_frame, n_pixel), ``spectral_axis``, ``uncertainty`` and ``mask``.
+    mapping : FrameMapping, optional
+        Where the quantities of a table are; columns with known names need none.
+    time : Time, optional
+        Middles of the frames, for spectra.
+    """
+    from astropy.table import Table
+
+    if not hasattr(container, "colnames"):
+        names = ("flux", "spectral_axis")
+        if not all(hasattr(container, name) for name in names) or time is None or len(container.flux.shape) != 2:
+            raise InputError.of("container", type(container).__name__, "a table with times, or spectra of shape "
+                                "(n_frame, n_pixel) with flux, spectral_axis and `time`")  # fmt: skip
+        masked = getattr(container, "mask", None)
+        mask = np.zeros(container.flux.shape, np.bool_) if masked is None else np.asarray(masked, np.bool_)
+        columns: dict[str, Any] = {"time": time, "flux": np.ma.MaskedArray(container.flux.value, mask)}
+        if getattr(container, "uncertainty", None) is not None:
+            columns["flux_err"] = _standard_deviation(container.uncertainty)
+        nm = container.spectral_axis.to_value("nm", equivalencies=_spectral())
+        columns["wavelength"] = np.tile(nm, (len(columns["flux"]), 1))
+        container = Table(
+            columns, meta=dict(container.meta or {}), units={"flux": container.flux.unit, "wavelength": "nm"}
+        )
+        mapping = FrameMapping(time="time", flux="flux", wavelength="wavelength",
+                               error="flux_err" if "flux_err" in columns else None)  # fmt: skip
+    file = TableFile(container, type(container).__name__)
+    return _frames_in(file, mapping or _recognised(file), str(container.meta.get("LABEL", "frames")))
+
+
+def _spectral() -> Any:
+    import astropy.units as u
+
+    return u.spectral()
+
+
+def _standard_deviation(uncertainty: Any) -> Float:
+    """Return the standard deviations of an uncertainty of astropy's NDData, without unit."""
+    from astropy.nddata import StdDevUncertainty
+
+    return np.asarray(uncertainty.represent_as(StdDevUncertainty).array, np.float64)
+
+
 @dataclass(frozen=True, eq=False)
 class ReducedFrames:
     """Spectra reduced to weighted sums.
