@@ -19,9 +19,11 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Units of frames of the instrument: counts of an exposure with bias and dark current, and rates without these, as
-#: `stare` writes them.
-RAW_UNITS, RATE_UNITS = ("adu", "DN"), ("adu / s", "DN / s")
+#: Units of frames of the instrument: counts of an exposure, with bias and dark current or without, and rates without
+#: these, as `stare` writes them.
+COUNT_UNITS, RATE_UNITS = ("adu", "DN"), ("adu / s", "DN / s")
+#: Share of bias and dark current below which the median of a pixel cannot include them.
+LEAST_OF_OFFSET = 0.5
 #: Largest distance of a wavelength from that of the instrument, as a share of the step between pixels.
 MAX_OFFSET = 0.5
 #: Largest relative difference between exposure times.
@@ -61,8 +63,8 @@ class FrameModel:
         Raises InputError if their wavelengths or their unit are others.
         """
         unit = _plain(frames.unit)
-        if unit not in {_plain(each) for each in (*RAW_UNITS, *RATE_UNITS)}:
-            raise InputError.of("unit", frames.unit, f"one of {', '.join((*RAW_UNITS, *RATE_UNITS))}")
+        if unit not in {_plain(each) for each in (*COUNT_UNITS, *RATE_UNITS)}:
+            raise InputError.of("unit", frames.unit, f"one of {', '.join((*COUNT_UNITS, *RATE_UNITS))}")
         exposure = float(np.median(frames.exposure_s))
         if np.ptp(frames.exposure_s) > SAME_EXPOSURE * exposure:
             raise InputError.of("exposure_s", f"{frames.exposure_s.min():g} to {frames.exposure_s.max():g} s",
@@ -80,8 +82,12 @@ class FrameModel:
                 f"the {quiet.wavelength_nm.size} pixels or {quiet.element_wavelength_nm.size} resolution elements of "
                 f"{quiet.instrument}",
             )  # fmt: skip
-        raw = unit in {_plain(each) for each in RAW_UNITS}
-        return cls(quiet, flare, bins, 1.0 if raw else 1.0 / exposure, raw)
+        if unit not in {_plain(each) for each in COUNT_UNITS}:
+            return cls(quiet, flare, bins, 1.0 / exposure, False)
+        raw = cls(quiet, flare, bins, 1.0, True)
+        # Light is added to bias and dark current: where a pixel has far less than these, they were subtracted.
+        included = np.nanmedian(frames.flux, axis=0) >= LEAST_OF_OFFSET * raw.offset
+        return raw if included.all() else replace(raw, raw=False)
 
     @cached_property
     def offset(self) -> Float:

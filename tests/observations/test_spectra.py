@@ -158,6 +158,23 @@ def test_saturated_pixels_and_missing_errors_of_raw_frames_are_stated() -> None:
     assert ratio.mean() == pytest.approx(1.0, abs=0.005)
 
 
+def test_counts_with_and_without_bias_and_dark_current_are_told_apart() -> None:
+    """Relative sizes of flares depend on it: bias and dark current are a hundred times the light of this star."""
+    rng = np.random.default_rng(312)
+    quiet = model().quiet
+    raw = rng.normal(quiet.recorded_dn, np.sqrt(quiet.variance_dn2), (40, quiet.wavelength_nm.size))
+    levels = []
+    for flux in (raw, raw - quiet.bias_dn - quiet.dark_dn):
+        frames = Frames.of(TIME[:40], flux, exposure_s=5.0, wavelength_nm=quiet.wavelength_nm, unit="adu")
+        found = frame_model(STUDY, frames)
+        assert isinstance(found, FrameModel)
+        assert found.raw == (flux is raw)
+        levels.append(float(np.median(clean_spectra(frames, found).frames.white_light[0])))
+    assert levels[0] == pytest.approx(levels[1], rel=1e-6)
+    # The noise of 40 frames is 1 % of the light.
+    assert levels[0] == pytest.approx(quiet.light_dn.sum(), rel=0.06)
+
+
 @pytest.mark.parametrize(
     ("kind", "spectrum", "size"),
     [("throughput", "light", 0.3), ("dark current", "dark", 1.5), ("flare", "", 0.5)],
