@@ -30,8 +30,8 @@ def zodiacal_light(bodies: Bodies, target: NDArray[np.float64]) -> NDArray[np.fl
     size = float(np.linalg.norm(along))
     # At the pole the longitude is arbitrary.
     difference = np.degrees(np.arccos(np.clip(flat @ along / size, -1, 1))) if size > 1e-9 else np.zeros(len(flat))
-    places = zip(difference, elongation_deg(bodies.sun, target), strict=True)
-    return np.array([_brightness(HelioEcliptic(float(x), abs(latitude), float(away))) for x, away in places])
+    positions = zip(difference, elongation_deg(bodies.sun, target), strict=True)
+    return np.array([_brightness(HelioEcliptic(float(x), abs(latitude), float(away))) for x, away in positions])
 
 
 def _brightness(place: HelioEcliptic) -> float:

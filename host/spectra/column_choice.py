@@ -59,16 +59,16 @@ def choose(names: Sequence[str], roles: Sequence[Role], asked: Sequence[str] = (
 
 
 def _named(name: str, names: Sequence[str]) -> int:
-    places = [i for i, one in enumerate(names) if one.strip() == name]
-    places = places or [i for i, one in enumerate(names) if plain(one) == plain(name)]
-    if len(places) != 1:
+    indices = [i for i, one in enumerate(names) if one.strip() == name]
+    indices = indices or [i for i, one in enumerate(names) if plain(one) == plain(name)]
+    if len(indices) != 1:
         raise InputError(
-            f"{'several columns are' if places else 'no column is'} named {shortened(name)}",
+            f"{'several columns are' if indices else 'no column is'} named {shortened(name)}",
             f"one of {listed(names)}",
             key="columns",
             value=name,
         )
-    return places[0]
+    return indices[0]
 
 
 def _wavelength(names: Sequence[str], roles: Sequence[Role]) -> tuple[int, ...]:
@@ -107,17 +107,17 @@ def _best(scored: list[tuple[int, int]]) -> list[int]:
     return [i for score, i in scored if score == most]
 
 
-def _only(what: str, names: Sequence[str], places: Sequence[int]) -> int:
-    if len(places) == 1:
-        return places[0]
-    if not places:
+def _only(what: str, names: Sequence[str], indices: Sequence[int]) -> int:
+    if len(indices) == 1:
+        return indices[0]
+    if not indices:
         raise InputError(
             f"no column is the {what} among {listed(names)}",
             "both edges or the wavelength itself",
             key="columns",
             value=names,
         )
-    several = [names[i].strip() for i in places]
+    several = [names[i].strip() for i in indices]
     raise InputError(
         f"{len(several)} columns may be the {what}: {listed(several)}",
         f"one: name it as in FILE[{several[-1][:40]}]",

@@ -91,12 +91,12 @@ def _column(rows: Sequence[Row], place: int, name: str, unit: str | None = None,
 
 def _unnamed(rows: Sequence[Row], n: int, asked: Sequence[str], messages: list[str]) -> list[Column]:
     """Return columns by number: the first two, or those selected by the user."""
-    places = [int(one) - 1 for one in asked if one.isascii() and one.isdigit() and 1 <= int(one[:6]) <= n]
-    if len(places) != len(asked) or len(places) > 2:
+    indices = [int(one) - 1 for one in asked if one.isascii() and one.isdigit() and 1 <= int(one[:6]) <= n]
+    if len(indices) != len(asked) or len(indices) > 2:
         raise InputError.of("columns", asked, f"their numbers, 1 to {n}")
     if not asked and n > 2:
         messages.append(f"the first two of its {n} columns are used, which have no names")
-    wave, value = (0, 1) if not places else (0, places[0]) if len(places) == 1 else (places[0], places[1])
+    wave, value = (0, 1) if not indices else (0, indices[0]) if len(indices) == 1 else (indices[0], indices[1])
     roles = {wave: Role("wavelength", 1), value: Role("flux", 1)}
     return [_column(rows, k, str(k + 1), role=roles.get(k, Role("unknown"))) for k in range(max(n, 2))]
 

@@ -134,8 +134,8 @@ def _devices() -> list[Any]:
             continue
     if not handles:
         # If a variable names a folder, loaders search only that.
-        places = ", ".join(f"{name}={os.environ[name]}" for name in vendors.FOLDER_VARIABLES if os.environ.get(name))
-        searched = f" ({places})" if places else ""
+        folders = ", ".join(f"{name}={os.environ[name]}" for name in vendors.FOLDER_VARIABLES if os.environ.get(name))
+        searched = f" ({folders})" if folders else ""
         raise DeviceError(f"no OpenCL device found{searched}: install {driver_sources()}")
     # PoCL on the CPU comes first, because the first device is the default.
     return sorted(handles, key=lambda d: (d.platform.name != POCL, "cpu" not in _kind(d)))

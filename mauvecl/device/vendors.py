@@ -45,8 +45,8 @@ def _folder() -> Path | None:
     if library is None:
         return None
     system = os.environ.get(FOLDER_VARIABLES[1]) or DEFAULT_FOLDER
-    places = [system, os.path.join(sys.prefix, "etc", "OpenCL", "vendors")]
-    known = {path.name: _text(path) for place in reversed(places) for path in sorted(Path(place).glob("*.icd"))}
+    folders = [system, os.path.join(sys.prefix, "etc", "OpenCL", "vendors")]
+    known = {path.name: _text(path) for place in reversed(folders) for path in sorted(Path(place).glob("*.icd"))}
     drivers = {name: text for name, text in known.items() if DRIVER not in text or Path(text.strip()).exists()}
     if any(DRIVER in text for text in drivers.values()):
         # The system lists Intel's runtime already.

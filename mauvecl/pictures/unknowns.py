@@ -25,9 +25,9 @@ def unknowns(plt: Any, answer: UnknownAnswer) -> Any:
     names = list(next(iter(answer.costs.values())))
     fap = answer.study.run.fap
     figure = plt.figure(figsize=(2.6 * len(stars) + 1.6, 5.2))
-    places = figure.add_gridspec(2, len(stars))
+    grid = figure.add_gridspec(2, len(stars))
     for k, star in enumerate(stars):
-        axis = figure.add_subplot(places[0, k])
+        axis = figure.add_subplot(grid[0, k])
         amplitude, costs = next((a, c) for (s, a), c in answer.costs.items() if s == star)
         relative = np.geomspace(0.03, 300.0, 200) * answer.smallest(star, None)
         known = next(iter(costs.values())).known
@@ -41,7 +41,7 @@ def unknowns(plt: Any, answer: UnknownAnswer) -> Any:
         if k == 0:
             axis.set_ylabel("detection probability")
     axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), title="solid: marginalised\ndashed: plain")
-    below = figure.add_subplot(places[1, :])
+    below = figure.add_subplot(grid[1, :])
     width = 0.8 / (len(names) + 1)
     every: list[str | None] = [None, *names]
     for i, name in enumerate(every):

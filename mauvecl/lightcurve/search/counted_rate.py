@@ -54,8 +54,8 @@ class CountedRate:
                 value=rate,
             )
         low, high = central_counts(n, 1 - alarmed)
-        places = np.clip([round(n * (1 - alarmed)), low, high], 0, n - 1)
-        return Interval(*(float(self.maxima[k]) for k in places))
+        ranks = np.clip([round(n * (1 - alarmed)), low, high], 0, n - 1)
+        return Interval(*(float(self.maxima[k]) for k in ranks))
 
 
 def consecutive_alarm_rate(points: int, sigma: float, frame_s: float) -> float:
