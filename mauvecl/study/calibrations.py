@@ -15,7 +15,6 @@ from mauvecl.study.sections import Star
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
-    from mauvecl.study.study import Study
 
 #: Keys of an observation that hold paths.
 PATHS = ("frames", "mapping", "spectrum")
@@ -76,11 +75,3 @@ def resolve_calibration_paths(data: dict[str, Any], folder: Path) -> None:
         for key in PATHS:
             if isinstance(one, dict) and isinstance(one.get(key), str):
                 one[key] = str(folder / one[key])
-
-
-def drop_default_calibration(data: dict[str, Any], study: Study) -> None:
-    """Remove a default section from a study's data and make its paths absolute, in place."""
-    if study.calibrate == CalibrateQuestion():
-        del data["calibrate"]
-    else:
-        resolve_calibration_paths(data, Path.cwd())

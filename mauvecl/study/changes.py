@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
@@ -12,9 +12,6 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, Widget
 from mauvecl.schema.physical import Positive
 from mauvecl.schema.section import Section
-
-if TYPE_CHECKING:
-    from mauvecl.study.study import Study
 
 #: Changes by default: the indices of the four lines, the Balmer jump, two bands and the colour.
 DEFAULT_CHANGES = ("Mg II", "Ca II", "H beta", "H alpha", "balmer jump", "200-320", "320-700", "colour")
@@ -75,11 +72,3 @@ def resolve_change_paths(data: dict[str, Any], folder: Path) -> None:
     section = data.get("change")
     if isinstance(section, dict) and isinstance(section.get("file"), str):
         section["file"] = str(folder / section["file"])
-
-
-def drop_default_change(data: dict[str, Any], study: Study) -> None:
-    """Remove a default section from a study's data and make its path absolute, in place."""
-    if study.change == ChangeQuestion():
-        del data["change"]
-    else:
-        resolve_change_paths(data, Path.cwd())

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from mauvecl.schema.fields import Flag, Help
 from mauvecl.schema.section import Section
-
-if TYPE_CHECKING:
-    from mauvecl.study.study import Study
 
 
 class DataChoice(Section):
@@ -36,11 +33,3 @@ def resolve_data_paths(data: dict[str, Any], folder: Path) -> None:
     for key in ("file", "mapping"):
         if isinstance(section, dict) and isinstance(section.get(key), str):
             section[key] = str(folder / section[key])
-
-
-def drop_default_data(data: dict[str, Any], study: Study) -> None:
-    """Remove an empty section from a study's data and make its paths absolute, in place."""
-    if study.data == DataChoice():
-        del data["data"]
-    else:
-        resolve_data_paths(data, Path.cwd())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import model_validator
 
@@ -81,9 +81,3 @@ def fitted_models(asked: MeasureQuestion, flare: Flare) -> list[tuple[FittedMode
     with_lines = "two-temperatures" if light.second_area is not None else "lines"
     return [(name, name in ("balmer", "lines"), lines if name in ("lines", with_lines) else ())
             for name in dict.fromkeys(models)]  # fmt: skip
-
-
-def drop_default_measure(data: dict[str, Any], asked: MeasureQuestion) -> None:
-    """Remove the section from a study's data if it has its default values, in place."""
-    if asked == MeasureQuestion():
-        del data["measure"]

@@ -327,13 +327,3 @@ def resolve_plan_paths(data: dict[str, Any], folder: Path) -> None:
         for key in PATH_KEYS:
             if isinstance(one, dict) and isinstance(one.get(key), str):
                 one[key] = str(folder / one[key])
-
-
-def drop_default_plan(data: dict[str, Any], study: Study) -> None:
-    """Remove default values of orbit and plan from a study's data and make its paths absolute, in place."""
-    for name, default in (("orbit", OrbitQuestion()), ("plan", PlanQuestion())):
-        if getattr(study, name) == default:
-            del data[name]
-    if "orbit" in data and study.orbit.limits == Limits():
-        del data["orbit"]["limits"]
-    resolve_plan_paths(data, Path.cwd())

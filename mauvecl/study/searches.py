@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -17,7 +17,6 @@ from mauvecl.study.stare_section import ShapeName
 if TYPE_CHECKING:
     from mauvecl.lightcurve.search.bank import Bank, Baseline
     from mauvecl.lightcurve.stares.stare import Stare
-    from mauvecl.study.study import Study
 
 #: Window, in orbits, of a baseline with the orbital cycle. Shorter ones cannot separate the cycle from a flare.
 CYCLE_ORBITS = 3.0
@@ -153,12 +152,3 @@ class InjectionQuestion(Section):
         if self.widths == 1:
             return (self.half_width_low_s,)
         return tuple(float(w) for w in np.geomspace(self.half_width_low_s, self.half_width_high_s, self.widths))
-
-
-def drop_default_search(data: dict[str, Any], study: Study) -> None:
-    """Remove default values of search and injections from a study's data, in place."""
-    for name, default in (("search", SearchChoice()), ("injections", InjectionQuestion())):
-        if getattr(study, name) == default:
-            del data[name]
-    if "search" in data and not data["search"]["frame"]:
-        del data["search"]["frame"]

@@ -195,16 +195,3 @@ def resolve_stare_paths(data: dict[str, Any], folder: Path) -> None:
     for one, key in [*((curve, "file") for curve in curves), *((shape, "shape_file") for shape in shapes)]:
         if isinstance(one.get(key), str):
             one[key] = str(folder / one[key])
-
-
-def drop_default_stare(data: dict[str, Any], study: Study) -> None:
-    """Remove default values of stare and events from a study's data and make its paths absolute, in place."""
-    if study.stare == StareQuestion():
-        del data["stare"]
-    else:
-        for how in COURSES:
-            if not data["stare"][how]:
-                del data["stare"][how]
-    if not study.events:
-        del data["events"]
-    resolve_stare_paths(data, Path.cwd())

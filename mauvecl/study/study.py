@@ -9,19 +9,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 from pydantic import Field, ValidationError, model_validator
 
 from mauvecl.host.files.parsing import possible, read_text, toml
+from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.noise.processes import NONE, Processes
+from mauvecl.noise.unknowns import COURSES
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import AnyUnit
 from mauvecl.schema.records import input_error
 from mauvecl.schema.text import shortened
-from mauvecl.study.calibrations import CalibrateQuestion, drop_default_calibration, resolve_calibration_paths
-from mauvecl.study.changes import ChangeQuestion, drop_default_change, resolve_change_paths
-from mauvecl.study.data import DataChoice, drop_default_data, resolve_data_paths
+from mauvecl.study.calibrations import CalibrateQuestion, resolve_calibration_paths
+from mauvecl.study.changes import ChangeQuestion, resolve_change_paths
+from mauvecl.study.data import DataChoice, resolve_data_paths
 from mauvecl.study.flare_light import drop_default_spectrum, resolve_spectrum_paths
-from mauvecl.study.measurements import MeasureQuestion, drop_default_measure
+from mauvecl.study.measurements import MeasureQuestion
 from mauvecl.study.nuisances import NuisanceChoice
-from mauvecl.study.orbits import OrbitQuestion, PlanQuestion, drop_default_plan, resolve_plan_paths
+from mauvecl.study.orbits import OrbitQuestion, PlanQuestion, resolve_plan_paths
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.questions import (
     Axis,
@@ -32,14 +34,27 @@ from mauvecl.study.questions import (
     SignalQuestion,
     Sweep,
 )
-from mauvecl.study.searches import InjectionQuestion, SearchChoice, drop_default_search
+from mauvecl.study.searches import InjectionQuestion, SearchChoice
 from mauvecl.study.sections import Flare, Observation, Run, Section, SkyLight, Star, Unknowns
-from mauvecl.study.stare_section import EventChoice, StareQuestion, drop_default_stare, resolve_stare_paths
+from mauvecl.study.stare_section import EventChoice, StareQuestion, resolve_stare_paths
 from mauvecl.study.study_text import locate_files, parse_toml_value, read_embedded_study, set_key, with_file_digests
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
 
+#: Sections that a study's text leaves out if they have their default values.
+OMITTED = (
+    "bulk", "nuisances", "stare", "events", "search", "injections", "orbit", "plan", "measure", "data", "calibrate",
+    "change",
+)  # fmt: skip
+#: Functions that resolve the paths of sections against a folder.
+RESOLVERS = (
+    resolve_stare_paths,
+    resolve_plan_paths,
+    resolve_data_paths,
+    resolve_calibration_paths,
+    resolve_change_paths,
+)
 #: The paper's two stars.
 PAPER_STARS = (Star(library="K3V", magnitude=3.7), Star(library="G2V", magnitude=7.4))
 
@@ -125,12 +140,8 @@ class Study(Section):
         for one in own.values() if isinstance(own, dict) else ():
             if isinstance(one, dict) and isinstance(one.get("file"), str):
                 one["file"] = str(path.parent / one["file"])
-        resolve_stare_paths(data, path.parent)
-        resolve_plan_paths(data, path.parent)
-        resolve_data_paths(data, path.parent)
-        resolve_calibration_paths(data, path.parent)
-        resolve_change_paths(data, path.parent)
-        resolve_spectrum_paths(data, path.parent)
+        for resolve in (*RESOLVERS, resolve_spectrum_paths):
+            resolve(data, path.parent)
         return cls.build(data, path.name)
 
     @classmethod
@@ -185,21 +196,21 @@ class Study(Section):
             del data["unknowns"]
         if self.signal.snr is None:
             del data["signal"]
-        if self.bulk == BulkQuestion():
-            del data["bulk"]
-        if self.nuisances == NuisanceChoice():
-            del data["nuisances"]
-        else:
-            for one in data["nuisances"]["own"].values():
-                if "file" in one:
-                    one["file"] = str(Path(one["file"]).resolve())
-        drop_default_stare(data, self)
-        drop_default_search(data, self)
-        drop_default_plan(data, self)
-        drop_default_measure(data, self.measure)
-        drop_default_data(data, self)
-        drop_default_calibration(data, self)
-        drop_default_change(data, self)
+        for section in OMITTED:
+            if getattr(self, section) == type(self).model_fields[section].default:
+                del data[section]
+        for one in data.get("nuisances", {}).get("own", {}).values():
+            if "file" in one:
+                one["file"] = str(Path(one["file"]).resolve())
+        for course in COURSES:
+            if "stare" in data and not data["stare"][course]:
+                del data["stare"][course]
+        if "search" in data and not data["search"]["frame"]:
+            del data["search"]["frame"]
+        if "orbit" in data and self.orbit.limits == Limits():
+            del data["orbit"]["limits"]
+        for resolve in RESOLVERS:
+            resolve(data, Path.cwd())
         drop_default_spectrum(data, self.flare.spectrum)
         for section in ("processes", "campaign"):
             if not data[section]:
