@@ -300,3 +300,22 @@ def test_long_stares_with_gaps_are_drawn(stares):
     for name in long.pictures:
         assert name in ("light-curve-1", "dynamic-spectrum-1")
     assert long.plot() is not None
+
+
+def test_light_curves_state_the_light_lost_in_pointing_drifts(stares):
+    study = SHORT.with_settings(["stare.pointing={rate_per_h=100.0, duration_s=60.0, depth=1.0}", "stare.number=4"])
+    answer = stare(study, stares)
+    (one,), curve = answer.stares, answer.light_curve()
+    lost = one.staring.stare.pointing_losses(np.array([4], np.uint64), study.run.seed)[0]
+    np.testing.assert_array_equal(curve["pointing_loss"], lost)
+    assert lost.max() > 0.2
+    with fits.open(io.BytesIO(answer.documents["light-curve-1.fits"]())) as hdus:
+        np.testing.assert_allclose(hdus["LIGHTCURVE"].data["POINTING_LOSS"], lost, rtol=1e-6)
+        assert hdus["LIGHTCURVE"].header["LOSTFRMS"] == np.count_nonzero(lost) == answer.table["drifting_frames"][0]
+        # An observer does not know which frames these are.
+        assert not hdus["LIGHTCURVE"].data["QUALITY"].any()
+    # Drawn light is the mean without drifts times the share that is left, within its noise.
+    excess = (one.light.flux[:, 0] - (1 - lost) * one.light.mean[:, 0]) / one.light.sd[:, 0]
+    assert np.abs(excess).max() < 5.5
+    assert any("lose light" in text and "assumed" in text for text in answer.messages)
+    assert "pointing drifts (assumed)" in answer.assumed

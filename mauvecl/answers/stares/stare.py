@@ -421,7 +421,7 @@ def _pointing_lines(one: StarStare) -> list[str]:
     many = int(np.count_nonzero(lost))
     return [
         f"POINTING DRIFTS: {many} of {lost.size} frames at {one.title} lose light, up to {100 * lost.max():.3g} %; "
-        f"assumed: {drifts.rate_per_h:g} drifts per hour of {drifts.duration_s:g} s on average, with up to "
+        f"assumed: {drifts.rate_per_h:g} per hour, {drifts.duration_s:g} s long on average, with up to "
         f"{100 * drifts.depth:g} % of the light lost. The search marginalises over the level of each frame."
     ]
 
