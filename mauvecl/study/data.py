@@ -18,7 +18,7 @@ class DataChoice(Section):
     mapping: Annotated[Path | None, Help("Where time, flux and error are in that file (TOML)"), Flag("--mapping")] = (
         None
     )
-    report: Annotated[Literal["html", "pdf"], Help("Form of the report"), Flag("--report")] = "html"
+    report: Annotated[Literal["pdf", "html"], Help("Form of the report"), Flag("--report")] = "html"
 
     barycentric: Annotated[
         str | None,

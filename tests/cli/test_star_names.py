@@ -17,8 +17,9 @@ from mauvecl.host.orbit.targets import target_table
 from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
 
+#: The argument of `analyse` is a file of frames.
 VERBS = [name for name, one in get_command(app).commands.items()  # type: ignore[attr-defined]
-         if {"study_file", "star"} <= {p.name for p in one.params}]  # fmt: skip
+         if {"study_file", "star"} <= {p.name for p in one.params} and name != "analyse"]  # fmt: skip
 
 
 def spectrum(folder: Path, name: str) -> str:
