@@ -20,6 +20,7 @@ from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import FirstRealisation, Realisations
 from mauvecl.schema.tables import Column
+from mauvecl.store.description import without_later_attributes
 from mauvecl.store.export import Selection, export
 from mauvecl.store.layout import CRC_BYTES, Chunk, Store, StoredScene, crc, digest
 from mauvecl.study.cases import Case
@@ -394,7 +395,8 @@ def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
         try:
             data = there.read_bytes()
             if name.endswith("zarr.json"):
-                same, seen = json.loads(data) == json.loads(content), "foreign"
+                found, made = json.loads(data), json.loads(content)
+                same, seen = found in (made, without_later_attributes(made)), "foreign"
             else:
                 same, seen = data == content, "damaged"
         except FileNotFoundError:

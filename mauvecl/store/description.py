@@ -34,6 +34,15 @@ COMMON_DRAWS = (
 )
 NOMINAL = "the throughput is nominal, not a flight calibration"
 
+#: Attributes of a star that stores of earlier versions do not have.
+LATER_ATTRIBUTES = ("instrument", "saturation_dn", "dark_unit", "temperature_c")
+
+
+def without_later_attributes(described: dict[str, Any]) -> dict[str, Any]:
+    """Return the description of a group as earlier versions wrote it."""
+    attributes = described.get("attributes", {})
+    return described | {"attributes": {k: v for k, v in attributes.items() if k not in LATER_ATTRIBUTES}}
+
 
 def describe(store: Store, folder: Path) -> None:
     """Write groups, descriptions of arrays and calibration of a store to a folder."""
