@@ -12,6 +12,7 @@ from stores import study
 
 from mauvecl import read_frames
 from mauvecl.device.engine import Engine
+from mauvecl.observations.reading import reduce_frames
 from mauvecl.store import bulk
 from mauvecl.store.export import Selection, export
 from mauvecl.store.layout import Store
@@ -45,6 +46,21 @@ def test_stores_are_read_back_with_their_metadata(tmp_path: Path, engine: Engine
     np.testing.assert_allclose((frames.error**2).mean(), (x.variance_dn2 / x.n_frames * n).mean(), rtol=0.03)
     assert frames.quality is not None
     assert not frames.quality.any()
+
+
+@pytest.mark.parametrize("ending", ["zarr", "fits", "h5"])
+def test_stores_are_reduced_in_pieces(
+    tmp_path: Path, engine: Engine, ending: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = f"{_written(tmp_path, study(40, **SINGLE), engine, ending)}[star-1/flare-1]"
+    light, error = read_frames(path).white_light
+    # Seven frames at once, which divide realisations of two frames.
+    monkeypatch.setattr("mauvecl.observations.values.PIECE_BYTES", 7 * 8 * 197)
+    (curve,) = reduce_frames(path).light_curves
+    np.testing.assert_allclose(curve.flux, light, rtol=1e-12)
+    assert curve.error is not None
+    assert error is not None
+    np.testing.assert_allclose(curve.error, error, rtol=1e-12)
 
 
 def test_store_of_several_arrays_asks_for_one(tmp_path: Path, engine: Engine) -> None:
