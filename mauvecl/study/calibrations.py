@@ -55,7 +55,7 @@ class CalibrateQuestion(Section):
     observations: Annotated[
         tuple[CalibrationObservation, ...], Help("Observations of standard stars and of no light")
     ] = ()
-    knots: Annotated[int, Range(4, 60), Help("Intervals of the spline of the throughput"), Flag("--knots")] = 24
+    knots: Annotated[int, Range(4, 200), Help("Intervals of the spline of the throughput"), Flag("--knots")] = 100
     light_error: Annotated[
         float, Range(0, 1), Help("Relative error of the light of an observation, by pointing"), Flag("--light-error")
     ] = 0.0

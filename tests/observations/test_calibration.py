@@ -120,6 +120,20 @@ def test_fit_recovers_throughput(answer: CalibrateAnswer) -> None:
     assert 0.005 < np.median(f.error) < 0.02
 
 
+@pytest.mark.long
+def test_throughput_with_kinks_is_followed() -> None:
+    """A quantum efficiency of another shape, whose ratio to the nominal one has kinks every 25 to 50 nm.
+
+    Some tens of independent values lie within 4 standard errors, and nothing is blamed on the stars.
+    """
+    true = truth(throughput_factor=None, quantum_efficiency_a_per_w=Curve.flat(0.15))
+    f = answer_of(STARS, true, 7).throughput
+    off = f.log_factor - np.log(true.throughput(f.wavelength_nm) / NOMINAL.throughput(f.wavelength_nm))
+    assert np.abs(off / f.error).max() < FAR
+    assert f.spectrum_error == 0
+    assert f.p_value > 1e-4
+
+
 def test_written_instrument_is_the_fitted_one(answer: CalibrateAnswer, tmp_path: Path) -> None:
     answer.write(tmp_path)
     read = Instrument.load(tmp_path / "instrument.toml")
@@ -149,6 +163,7 @@ def test_one_star_determines_throughput_alone() -> None:
     assert any(text.startswith("One star") for text in one.messages)
 
 
+@pytest.mark.long
 def test_wrong_spectrum_is_noticed() -> None:
     """A standard star that is 10 % too bright: the fit is rejected, or its spectra are taken for wrong."""
     rng = np.random.default_rng(3)
