@@ -247,9 +247,12 @@ def test_flares_are_detected_as_often_as_their_signal_to_noise_says(rare: float)
 
 @pytest.mark.long
 def test_intervals_of_temperature_and_energy_cover(threshold: float) -> None:
-    """68 % intervals of flares of S/N 20-100; each binomial bound fails by chance once in a thousand times."""
+    """68 % intervals of flares of S/N 20-100 cover 68 to 90 %; each binomial bound fails once in a thousand times.
+
+    They allow for drifts as large as the noise of the surroundings may hide; here nothing drifts: they are wide.
+    """
     rng = np.random.default_rng(310)
-    number, inside = 40, {"temperature": 0, "energy bolometric": 0}
+    number, inside = 100, {"temperature": 0, "energy bolometric": 0}
     for _ in range(number):
         kelvin, size = rng.uniform(7000, 15_000), rng.uniform(0.5, 2.0)
         added = flare(rng.uniform(900, 2700), rng.uniform(30, 90), size, kelvin)
@@ -268,7 +271,7 @@ def test_intervals_of_temperature_and_energy_cover(threshold: float) -> None:
         for name, value in truth.items():
             k = measured.column(name)
             inside[name] += measured.low[0, 0, k] <= value <= measured.high[0, 0, k]
-    low, high = stats.binom.ppf([0.0005, 0.9995], number, 0.6827)
+    low, high = stats.binom.ppf([0.0005, 0.9995], number, [0.6827, 0.9])
     assert all(low <= count <= high for count in inside.values()), inside
 
 
