@@ -11,6 +11,7 @@ import warnings
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.device import vendors
@@ -107,6 +108,7 @@ def load_opencl() -> Any:
         os.environ["POCL_CACHE_DIR"] = str(kernel_cache().work)
     except OSError as error:
         raise DeviceError(f"{error}: set MAUVECL_CACHE_DIR to a folder that can") from error
+    _provide_libraries(kernel_cache().work / "libraries")
     if kernel_cache().pid != os.getpid():
         # PoCL's threads do not survive a fork; its next call would wait forever.
         raise DeviceError("OpenCL was loaded before a fork, expected a process of its own start (use spawn)")
@@ -117,6 +119,20 @@ def load_opencl() -> Any:
     except ImportError as error:
         raise DeviceError(f"pyopencl cannot be loaded ({error}): install {driver_sources()}") from error
     return pyopencl
+
+
+def _provide_libraries(folder: Path) -> None:
+    """Let kernels be linked where no compiler is installed.
+
+    PoCL links each kernel as a compiler links a program: with libraries that come with compilers, although kernels call
+    none of their functions. Empty archives take their places, and are searched after those that are installed.
+    """
+    if folder.exists():
+        return
+    folder.mkdir()
+    for name in ("gcc", "gcc_s", "c"):
+        (folder / f"lib{name}.a").write_bytes(b"!<arch>\n")
+    os.environ["LIBRARY_PATH"] = os.pathsep.join(filter(None, (os.environ.get("LIBRARY_PATH"), str(folder))))
 
 
 def _devices() -> list[Any]:

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.measurements.expected import forecast_model
 from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import COLOURS, NULL, headline, styled_picture
 from mauvecl.results.measurements.flare_model import FlareModel
@@ -105,6 +104,8 @@ def pulls(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
 @styled_picture
 def errors(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
     """Plot forecast errors of temperature and amplitude against the amplitude, with and without unknowns."""
+    from mauvecl.answers.measurements.expected import forecast_model
+
     figure, axes = plt.subplots(1, len(flares), figsize=(3.4 * len(flares), 3.0), squeeze=False)
     for axis, one in zip(axes[0], flares, strict=True):
         log_k, linear = one.perfect.log_k[0], one.perfect.amplitudes[0]

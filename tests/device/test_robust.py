@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -40,6 +41,31 @@ def test_error_names_missing_linker(tmp_path) -> None:
     )
     assert "no linker `ld`" in run.stdout
     assert "binutils" in run.stdout
+
+
+def test_kernels_are_linked_without_a_compiler(tmp_path) -> None:
+    """Link with a linker that knows none of the folders where compilers install their libraries."""
+    code = (
+        "from mauvecl.device.selftest import toy; from mauvecl import Engine; Engine().realise(toy(), count=64, seed=1)"
+    )
+    (tmp_path / "bin").mkdir()
+    linker = tmp_path / "bin" / "ld"
+    linker.write_text(
+        f"#!{sys.executable}\nimport os, sys\n"
+        "words = [w for w in sys.argv[1:] if not w.startswith('-L') or 'libraries' in w]\n"
+        f"open({str(tmp_path / 'log')!r}, 'a').write(' '.join(words) + chr(10))\n"
+        f"os.execv({shutil.which('ld')!r}, ['ld', '-nostdlib', *words])\n",
+        encoding="utf-8",
+    )
+    linker.chmod(0o755)
+    environment = os.environ | {
+        "PATH": f"{linker.parent}{os.pathsep}{os.environ['PATH']}",
+        "MAUVECL_CACHE_DIR": str(tmp_path / "cache"),
+    }
+    environment.pop("LIBRARY_PATH", None)
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert "-lgcc" in (tmp_path / "log").read_text(encoding="utf-8")
 
 
 def test_no_device_raises(monkeypatch: pytest.MonkeyPatch) -> None:
