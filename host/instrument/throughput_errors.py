@@ -104,7 +104,7 @@ class ThroughputErrors(ContentEquality):
         return f"{len(self.modes)} modes, {self.source}"
 
     def at(self, wavelength_nm: ArrayLike) -> Float:
-        """Return the modes at wavelengths in nm, shape (n_mode, *shape of `wavelength_nm`)."""
+        """Return the modes at wavelengths in nm, one row per mode."""
         nm = np.asarray(wavelength_nm, np.float64)
         return np.array([np.interp(nm, self.wavelength_nm, mode) for mode in self.modes]).reshape(-1, *nm.shape)
 

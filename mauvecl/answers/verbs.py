@@ -264,7 +264,7 @@ VERBS: dict[str, Verb] = {
 
     Over energy (or amplitude) and half-width, with the errors of what is recovered.
 
-    Flares are injected into drawn stares and searched for with a bank of filters. A stare of a day unless told.
+    Flares are injected into drawn stares and searched for with a bank of filters. The stare lasts a day by default.
 
     Examples: mauvecl inject --star G2V --magnitude 7.4 --distance 14.1 --false-alarms 1 --alarms-per month
 

@@ -1,4 +1,4 @@
-"""Colour of an event in a sequence of spectra, which tells a flare from a change of throughput."""
+"""Colour of an event in a sequence of spectra, which distinguishes a flare from a change of throughput."""
 
 from __future__ import annotations
 

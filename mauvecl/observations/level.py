@@ -140,7 +140,7 @@ def _scatter(numbers: NDArray[np.int64], values: Float) -> float:
 def single_frames(frames: Frames, sigmas: Float, fine: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return single frames far above the level whose neighbours on both sides are not.
 
-    A flare decays over several frames; one that is shorter than a frame cannot be told from a cosmic ray.
+    A flare decays over several frames; one that is shorter than a frame cannot be distinguished from a cosmic ray.
 
     Parameters
     ----------

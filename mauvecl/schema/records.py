@@ -84,7 +84,7 @@ def input_error(where: str, model: type[BaseModel], error: ValidationError) -> I
 def _first_fault(model: type[BaseModel], error: ValidationError) -> InputError:
     first = error.errors()[0]
     path = [str(part) for part in first["loc"]]
-    key, value, told = ".".join(path) or model.__name__.lower(), first.get("input"), first["msg"]
+    key, value, message = ".".join(path) or model.__name__.lower(), first.get("input"), first["msg"]
     match first["type"]:
         case "extra_forbidden":
             fields = list(_fields(model, path[:-1]))
@@ -99,26 +99,26 @@ def _first_fault(model: type[BaseModel], error: ValidationError) -> InputError:
         case "value_error":
             return _own_error(model, path, key, first)
         case "too_long" | "too_short":
-            expected = told.partition("should have ")[2].partition(" after")[0]
+            expected = message.partition("should have ")[2].partition(" after")[0]
         case "truth":
             expected = "a number or text, not true or false"
         case "path_type":
             expected = "a path"
         case _:
-            expected = told.removeprefix("Input should be ")
-            if expected == told:
-                return InputError(f"{key} = {shown(value)}: {told.lower()}", key=key, value=value)
+            expected = message.removeprefix("Input should be ")
+            if expected == message:
+                return InputError(f"{key} = {shown(value)}: {message.lower()}", key=key, value=value)
     return InputError.of(key, value, expected)
 
 
 def _own_error(model: type[BaseModel], path: list[str], key: str, first: Any) -> InputError:
     """Return the error that a validator raised, with the key where its sentence does not name it."""
     inner = first["ctx"]["error"]
-    told, field = str(inner), _fields(model, path[:-1]).get(path[-1]) if path else None
+    message, field = str(inner), _fields(model, path[:-1]).get(path[-1]) if path else None
     # A record's own error names the key; that of a single value's validator may not.
-    own = field is None or model_in(field.annotation) is not None or path[-1] in told
+    own = field is None or model_in(field.annotation) is not None or path[-1] in message
     if not isinstance(inner, InputError):
-        fault, _, expected = told.partition(", expected ")
+        fault, _, expected = message.partition(", expected ")
         inner = InputError(fault, expected or None, key=key if path else None, value=first.get("input"))
     # What read the value knows more of it than where it stands.
     found = inner if own else inner.within(key)

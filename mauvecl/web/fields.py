@@ -209,7 +209,7 @@ class Field:
         Text of a new page.
     read : callable
         Converts text to the value; raises InputError with what is accepted.
-    told : str
+    hint : str
         Explanation for visitors.
     unit : str
     slider : Slider, optional
@@ -226,7 +226,7 @@ class Field:
     label: str
     first: str
     read: Callable[[str], Any]
-    told: str = ""
+    hint: str = ""
     unit: str = ""
     slider: Slider | None = None
     group: str = ""

@@ -126,19 +126,19 @@ class Canvas:
         source = self.source(name, "x", "y")
         kind: Any = partial(self.plot.step, mode="center") if step else self.plot.line
         made = kind("x", "y", source=source, color=self.ink[colour], **({"line_width": 1.6} | how))
-        return self._told(made, called, colour, "dash" if "line_dash" in how else "line", show)
+        return self._described(made, called, colour, "dash" if "line_dash" in how else "line", show)
 
     def band(self, name: str, called: str, colour: str, *, show: str = "", alpha: float = 0.22) -> Any:
         """Add a band of columns x, low and high."""
         source = self.source(name, "x", "low", "high")
         made = self.plot.varea("x", "low", "high", source=source, fill_color=self.ink[colour], fill_alpha=alpha)
-        return self._told(made, called, colour, "band", show)
+        return self._described(made, called, colour, "band", show)
 
     def dots(self, name: str, called: str, colour: str, *, size: float = 5, show: str = "", **how: Any) -> Any:
         """Add dots of columns x and y."""
         source = self.source(name, "x", "y")
         made = self.plot.scatter("x", "y", source=source, size=size, color=self.ink[colour], **how)
-        return self._told(made, called, colour, "dot", show)
+        return self._described(made, called, colour, "dot", show)
 
     def pinned(self, kind: Any = None, *columns: str, halo: str = "") -> None:
         """Add a line for each scenario that can be pinned; its columns are x and y or as named."""
@@ -158,7 +158,7 @@ class Canvas:
             "x", "y", source=source, size=13, marker="circle", fill_color=self.ink.own, line_color=self.ink.ground,
             line_width=2,
         )  # fmt: skip
-        return self._told(made, called, "own", "dot", "")
+        return self._described(made, called, "own", "dot", "")
 
     def rule(self, name: str, called: str, along: str, colour: str = "threshold", dash: str = "dashed") -> Any:
         """Add a straight line whose position is set later."""
@@ -191,7 +191,7 @@ class Canvas:
             )
         )
 
-    def _told(self, made: Any, called: str, colour: str, form: str, show: str) -> Any:
+    def _described(self, made: Any, called: str, colour: str, form: str, show: str) -> Any:
         """Add an entry to the page's legend, with the tag that shows or hides it."""
         made.name, made.tags, made.visible = called, [show], not show
         self.legend.append((called, self.ink[colour], form, show))

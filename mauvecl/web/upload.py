@@ -36,7 +36,7 @@ def read_upload(name: str, content: bytes) -> Source:
     ------
     InputError
         If it is too large or holds no usable spectrum. Called on a thread of its own; any other
-        exception is told to the visitor too.
+        exception is reported to the visitor too.
     """
     if len(content) > MOST_UPLOADED:
         size, most = len(content) / 2**20, MOST_UPLOADED / 2**20

@@ -47,7 +47,7 @@ _closed_forms = ThreadPoolExecutor(2, thread_name_prefix="mauvecl-closed")
 MOST_KEPT = 4
 #: Things that are done for a visitor at a time.
 MOST_TASKS = 8
-#: What is told where the page itself is wrong.
+#: Message if the page itself fails.
 OWN_FAULT = "the page has made a mistake of its own, and there is no answer: please report what was entered"
 #: Why a connection was ended, for the page.
 UNUSED = 4000
@@ -90,7 +90,7 @@ class Visitor(WebSocketHandler):
     def open(self, *args: str, **kwargs: str) -> None:
         """Register the visitor."""
         self.here.add(self)
-        self.tell(hello=VERSION)
+        self.send(hello=VERSION)
 
     def on_close(self) -> None:
         """Cancel all work for a visitor who has left."""
@@ -100,12 +100,12 @@ class Visitor(WebSocketHandler):
                 job.cancel()
         self._folder.cleanup()
 
-    def tell(self, content: bytes | None = None, **told: Any) -> None:
+    def send(self, content: bytes | None = None, **message: Any) -> None:
         """Send a message, followed by bytes."""
         if self.ws_connection is None:
             return
         try:
-            self.write_message(json.dumps(told, allow_nan=False))
+            self.write_message(json.dumps(message, allow_nan=False))
             if content is not None:
                 self.write_message(content, binary=True)
         except WebSocketClosedError:
@@ -155,19 +155,19 @@ class Visitor(WebSocketHandler):
 
     async def _answer(self, asked: dict[str, Any]) -> None:
         n, state = asked["n"], self.state(asked["link"])
-        told: dict[str, Any] = {"n": n, "stray": state.stray, "faults": state.faults}
+        message: dict[str, Any] = {"n": n, "stray": state.stray, "faults": state.faults}
         if state.faults:
-            self.tell(**told)
+            self.send(**message)
             return
 
         async def answer() -> None:
-            closed = await self._beside(partial(self.closed, state))
+            closed = await self._in_thread(partial(self.closed, state))
             answers = self._answers.get(self._key(state), {})
-            self.tell(**told, answer=await self._beside(partial(card, closed, answers)))
+            self.send(**message, answer=await self._in_thread(partial(card, closed, answers)))
             if self._next is None:
-                self.tell(n=n, **await self._beside(partial(shown, str(asked.get("tab")), closed, answers)))
+                self.send(n=n, **await self._in_thread(partial(shown, str(asked.get("tab")), closed, answers)))
 
-        await self._or_why(answer(), **told)
+        await self._or_why(answer(), **message)
 
     def closed(self, state: State) -> ClosedForms:
         """Return the closed forms of a question; the last ones are cached."""
@@ -187,26 +187,26 @@ class Visitor(WebSocketHandler):
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    def _give(self, work: Coroutine[Any, Any, None], **told: Any) -> None:
+    def _give(self, work: Coroutine[Any, Any, None], **message: Any) -> None:
         """Run a function that the page may request a limited number of times."""
         if len(self._tasks) < MOST_TASKS:
-            self._begin(self._or_why(work, **told))
+            self._begin(self._or_why(work, **message))
             return
         work.close()
-        self.tell(**told, refused="too many requests at the same time, expected one after the other")
+        self.send(**message, refused="too many requests at the same time, expected one after the other")
 
-    async def _or_why(self, work: Coroutine[Any, Any, None], **told: Any) -> None:
+    async def _or_why(self, work: Coroutine[Any, Any, None], **message: Any) -> None:
         """Run a function, and report an invalid request or an internal error."""
         try:
             await work
         except (InputError, DeviceError) as error:
-            self.tell(**told, refused=str(error))
+            self.send(**message, refused=str(error))
         except Exception:
             log.exception("no answer")
-            self.tell(**told, refused=OWN_FAULT)
+            self.send(**message, refused=OWN_FAULT)
 
     @staticmethod
-    async def _beside(work: Callable[[], Any]) -> Any:
+    async def _in_thread(work: Callable[[], Any]) -> Any:
         """Run a function in a thread."""
         return await asyncio.get_running_loop().run_in_executor(_closed_forms, work)
 
@@ -218,9 +218,9 @@ class Visitor(WebSocketHandler):
     async def _pinned(self, n: int, state: State, name: str) -> None:
         tab = tab_of(name)
         pictures = [picture for picture in tab.pictures if picture.pins]
-        closed = await self._beside(partial(ClosedForms.of, state.question(), Path(self._folder.name)))
-        drawn = await self._beside(lambda: {p.name: p.drawn(closed, {}).sources[p.pins] for p in pictures})
-        self.tell(n=n, pins={name: {c: packed(v) for c, v in columns.items()} for name, columns in drawn.items()})
+        closed = await self._in_thread(partial(ClosedForms.of, state.question(), Path(self._folder.name)))
+        drawn = await self._in_thread(lambda: {p.name: p.drawn(closed, {}).sources[p.pins] for p in pictures})
+        self.send(n=n, pins={name: {c: packed(v) for c, v in columns.items()} for name, columns in drawn.items()})
 
     # Draws and simulations
 
@@ -239,7 +239,7 @@ class Visitor(WebSocketHandler):
             if self._closed is None or self._closed[1] is not closed or future.cancelled() or future.exception():
                 return
             answers = self._answers.get(self._key(state), {}) | {"draw": future.result()}
-            self.tell(n=asked["n"], **shown(str(asked.get("tab")), closed, answers))
+            self.send(n=asked["n"], **shown(str(asked.get("tab")), closed, answers))
 
         self._when_done(self._drawing, came)
 
@@ -247,13 +247,13 @@ class Visitor(WebSocketHandler):
         """Simulate, report progress, and send the answer."""
         n, kind, state = asked["n"], asked.get("kind"), self.state(asked["link"])
         if self.job is not None or kind not in SIMULATIONS or state.faults:
-            self.tell(n=n, ended="", refused="there is a simulation already, or nothing to simulate")
+            self.send(n=n, ended="", refused="there is a simulation already, or nothing to simulate")
             return
         self._begin(self._or_why(self._simulate(n, kind, state), n=n, ended=""))
 
     async def _simulate(self, n: int, kind: str, state: State) -> None:
         key = self._key(state)
-        closed = await self._beside(partial(self.closed, state))
+        closed = await self._in_thread(partial(self.closed, state))
         if self.job is not None:
             raise InputError("there is a simulation already", "its end first", key="simulate", value=kind)
         job = self.job = Job(partial(SIMULATIONS[kind], closed.study), drawing=kind in DRAWING)
@@ -262,15 +262,15 @@ class Visitor(WebSocketHandler):
             while not (await asyncio.wait([done], timeout=LOOK_S))[0]:
                 standing = job.standing
                 done_part = standing.done / standing.total if standing is not None and standing.total else 0.0
-                self.tell(n=n, progress=min(done_part, 1.0), told=job.told)
+                self.send(n=n, progress=min(done_part, 1.0), message=job.words)
             kept = self._answers.setdefault(key, {})
             kept |= done.result()
             self._answers.move_to_end(key)
             while len(self._answers) > MOST_KEPT:
                 self._answers.popitem(last=False)
-            self.tell(n=n, ended=f"Done: {job.told}.", kind=kind)
+            self.send(n=n, ended=f"Done: {job.words}.", kind=kind)
         except (Cancelled, CancelledError, asyncio.CancelledError):
-            self.tell(n=n, ended="Cancelled.")
+            self.send(n=n, ended="Cancelled.")
         finally:
             self.job = None
 
@@ -302,15 +302,15 @@ class Visitor(WebSocketHandler):
             try:
                 self._uploads[field] = future.result()
             except InputError as error:
-                self.tell(n=n, field=field, lacks=str(error))
+                self.send(n=n, field=field, lacks=str(error))
             except Exception as error:
                 log.exception("an upload failed")
-                self.tell(
+                self.send(
                     n=n, field=field,
                     lacks=f"upload {shortened(name)} cannot be read ({type(error).__name__}), expected a spectrum",
                 )  # fmt: skip
             else:
-                self.tell(n=n, field=field, entered=entered)
+                self.send(n=n, field=field, entered=entered)
 
         loop = asyncio.get_running_loop()
         future = reading(read, name, content)
@@ -322,8 +322,8 @@ class Visitor(WebSocketHandler):
         self._give(self._file(n, self.state(asked["link"]), *which), n=n, file="")
 
     async def _file(self, n: int, state: State, tab: str, name: str, ending: str) -> None:
-        file, content = await self._beside(partial(self.file, state, tab, name, ending))
-        self.tell(content, n=n, file=file)
+        file, content = await self._in_thread(partial(self.file, state, tab, name, ending))
+        self.send(content, n=n, file=file)
 
     def file(self, state: State, tab: str, name: str, ending: str) -> tuple[str, bytes]:
         """Send a table or study of the question; the last ones are cached."""
@@ -344,10 +344,10 @@ class Visitor(WebSocketHandler):
         try:
             question = self.state(asked["link"]).question()
         except InputError as error:
-            self.tell(n=asked["n"], refused=str(error))
+            self.send(n=asked["n"], refused=str(error))
             return
         uploaded = question.uploaded is not None
-        self.tell(
+        self.send(
             n=asked["n"], python=as_python(question), command=as_command(question), uploaded=uploaded,
             study="" if uploaded else question.study().toml(),
         )  # fmt: skip

@@ -108,7 +108,7 @@ class Job:
         return None if self._pool is None else self._pool.standing
 
     @property
-    def told(self) -> str:
+    def words(self) -> str:
         """Return the progress in words."""
         s = self.standing
         if s is None or self._started is None:

@@ -129,7 +129,7 @@ def enter(page: Page, label: str, value: str) -> None:
 def shown(page: Page) -> str:
     """Return the answer in the words of the card."""
     settled(page)
-    return page.locator("#card .told").inner_text()
+    return page.locator("#card .message").inner_text()
 
 
 def answerless(page: Page) -> None:
@@ -471,7 +471,7 @@ def test_scenarios_are_compared(page: Page) -> None:
         lines = f"page.pictures.all.{picture}.plot.renderers.filter(r => r.name?.startsWith('pinned'))"
         drawn = page.evaluate(f"{lines}.map(r => r.glyph.line_color.value)")
         assert [colour for colour in drawn if colour != "#ffffff"][:2] == colours
-        key = page.locator(f"#panel-{page.evaluate('page.seen.tab')} .beside")
+        key = page.locator(f"#panel-{page.evaluate('page.seen.tab')} .pins")
         assert key.locator("path").evaluate_all(strokes) == colours
         assert "2: G2V, V = 8, 2 %, 50 s" in key.inner_text()
     # What is left keeps its colour.

@@ -559,7 +559,7 @@ def test_cancel_ends_every_computation(served: Any, kind: str) -> None:
         talk = await Talk.begin(host)
         await talk.answer(link)
         await talk._connection.write_message(json.dumps({"ask": "simulate", "n": 99, "kind": kind, "link": link}))
-        while "waiting" in (told := await talk.next()).get("told", "waiting"):
+        while "waiting" in (told := await talk.next()).get("message", "waiting"):
             assert "ended" not in told, told
         used = resource.getrusage(resource.RUSAGE_SELF).ru_utime
         await talk._connection.write_message(json.dumps({"ask": "cancel", "n": 100}))

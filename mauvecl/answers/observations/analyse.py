@@ -114,6 +114,13 @@ class EventRow:
         return self.event.value >= self.analysis.threshold
 
     @property
+    def verdict(self) -> str:
+        """Whether the event is a detected flare, a candidate, or rejected because it is of another kind."""
+        if self.event.kind != "flare":
+            return "rejected"
+        return "detected" if self.significant else "candidate"
+
+    @property
     def rates(self) -> tuple[float, float]:
         """False alarms per star-day, in normal noise and in noise as measured."""
         return self.analysis.false_alarms(self.event)
@@ -217,8 +224,9 @@ EVENTS = (
            "upper limit if none reaches it"),
     Column("probability", "probability", "", "probability of such an event from noise anywhere in these frames, by "
            "the larger rate", "from noise", _rate),
-    Column("significant", "significant", "", "whether the rate is at most the wanted one", "detected",
-           lambda value: "yes" if value else "candidate", kind=bool),
+    Column("significant", "significant", "", "whether the rate is at most the wanted one", kind=bool),
+    Column("verdict", "verdict", "", "detected: a flare with at most the wanted rate; candidate: a flare with a larger "
+           "one; rejected: it resembles a flare, but its spectrum or shape is of another kind", "verdict", kind=str),
     Column("blue_over_red", lambda row: row.colour[0], "", "rise relative to the star in the blue half of the pixels "
            "over that in the red half: 1 for a change of throughput; nan: no spectra", "blue/red", number(".3g")),
     Column("blue_over_red_error", lambda row: row.colour[1], "", "its standard error"),
@@ -417,10 +425,11 @@ class AnalyseAnswer(Answer):
             f"Events in {one.days:.3g} star-days of {one.frames.name}; detected above {one.threshold:.2f} ({wanted}), "
             f"candidates above {one.candidates:.2f}"
         )
+        measured = self.measured if one.spectra else ()
         nothing = f"Nothing above {one.candidates:.2f} in {one.days:.3g} star-days of {one.frames.name} ({wanted})."
         return [
             View(title, EVENTS, self.events) if one.events else View(nothing),
-            *([View("Measured in the summed spectra of each event", MEASURED, self.measured)] if one.spectra else []),
+            *([View("Measured in the summed spectra of each event", MEASURED, measured)] if len(measured) else []),
             *self._blends,
             View("Smallest flares that would have been detected, by injecting into these frames", LIMITS, self.limits),
             View("Noise of quiescent frames", NOISE, self.noise),

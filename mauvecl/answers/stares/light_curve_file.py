@@ -1,6 +1,6 @@
 """A stare as a FITS file: light curve, good time intervals, dynamic spectrum.
 
-The names and units of the first table are those that lightkurve reads without being told (`lightkurve.read`), and with
+The names and units of the first table are those that lightkurve recognises (`lightkurve.read`), and with
 it AltaiPony: TIME in days, FLUX, FLUX_ERR, QUALITY, CADENCENO.
 """
 

@@ -9,7 +9,7 @@ function element(tag, text, more = {}) {
 export class Card {
   constructor() {
     this.box = byId("card")
-    this.told = this.box.querySelector(".told")
+    this.message = this.box.querySelector(".message")
     this.dismissed = new Set()
     this.unfolded = false
   }
@@ -21,7 +21,7 @@ export class Card {
   // What is shown is no answer to what is entered.
   fade() {
     this.busy(true)
-    for (const part of [this.told, byId("facts"), ...document.querySelectorAll(".pictures, .rows")]) part.classList.add("dim")
+    for (const part of [this.message, byId("facts"), ...document.querySelectorAll(".pictures, .rows")]) part.classList.add("dim")
   }
 
   // The pictures of a tab are those of the answer; other tabs may still hold an earlier one's.
@@ -32,7 +32,7 @@ export class Card {
   tell(answer) {
     this.box.classList.remove("none")
     this.box.style.minHeight = ""
-    for (const part of [this.told, byId("facts")]) part.classList.remove("dim")
+    for (const part of [this.message, byId("facts")]) part.classList.remove("dim")
     byId("chance").textContent = answer.shown
     byId("interval").textContent = answer.interval
     byId("words-of").textContent = answer.words
@@ -44,7 +44,7 @@ export class Card {
     // What is below stays where it is.
     this.box.style.minHeight = `${this.box.offsetHeight}px`
     this.box.classList.add("none")
-    this.told.classList.remove("dim")
+    this.message.classList.remove("dim")
     byId("chance").textContent = "No answer."
     byId("interval").textContent = ""
     byId("words-of").textContent = why
@@ -52,10 +52,10 @@ export class Card {
     this.busy(false)
   }
 
-  progress(share, told, idle = false) {
+  progress(share, message, idle = false) {
     byId("progress").value = share
     byId("progress").classList.toggle("idle", idle)
-    byId("status").textContent = told
+    byId("status").textContent = message
   }
 
   ended(text) {
@@ -81,9 +81,9 @@ export class Card {
   }
 
   // Sentences that can be put away; one that was stays away as long as it is the same.
-  notices(told) {
+  notices(message) {
     const box = byId("notices")
-    const shown = told.filter(([text]) => !this.dismissed.has(text))
+    const shown = message.filter(([text]) => !this.dismissed.has(text))
     const key = JSON.stringify(shown)
     if (box.dataset.key === key) return
     box.dataset.key = key

@@ -49,10 +49,10 @@ export class Compare {
     return this.drawn.flatMap((one, slot) => {
       if (!one) return []
       const {star, band, magnitude, amplitude_percent, exposure_s} = one.entered
-      const told = element("span", null)
-      told.innerHTML = dashed(...look[slot])
-      told.append(`${slot + 1}: ${star}, ${band} = ${magnitude}, ${amplitude_percent} %, ${exposure_s} s`)
-      return told
+      const message = element("span", null)
+      message.innerHTML = dashed(...look[slot])
+      message.append(`${slot + 1}: ${star}, ${band} = ${magnitude}, ${amplitude_percent} %, ${exposure_s} s`)
+      return message
     })
   }
 

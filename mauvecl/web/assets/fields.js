@@ -136,10 +136,10 @@ export class Fields {
   tell(faults) {
     for (const name of Object.keys(this.words.fields)) {
       const field = byId(`f-${name}`)
-      const told = byId(`w-${name}`)
+      const message = byId(`w-${name}`)
       const fault = faults[name] ?? ""
-      if (told.textContent !== fault) told.textContent = fault
-      told.hidden = !fault
+      if (message.textContent !== fault) message.textContent = fault
+      message.hidden = !fault
       if (fault) {
         field.setAttribute("aria-invalid", "true")
         document.querySelector(`[data-field="${name}"]`)?.removeAttribute("hidden")

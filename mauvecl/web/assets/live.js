@@ -3,7 +3,7 @@
 const AGAIN_MS = 1000
 
 export class Live {
-  // came: told what comes; back: called when there is a connection (again); lost: when there is none, with its code.
+  // came: message what comes; back: called when there is a connection (again); lost: when there is none, with its code.
   constructor(back, lost) {
     this.back = back
     this.lost = lost
@@ -53,14 +53,14 @@ export class Live {
       if (head) this.waiting.get(head.n)?.(head, data)
       return
     }
-    const told = JSON.parse(data)
-    if (told.hello !== undefined) {
-      this.back(told.hello)
-    } else if (told.file) {
+    const message = JSON.parse(data)
+    if (message.hello !== undefined) {
+      this.back(message.hello)
+    } else if (message.file) {
       // Its bytes come next.
-      this.head = told
+      this.head = message
     } else {
-      this.waiting.get(told.n)?.(told)
+      this.waiting.get(message.n)?.(message)
     }
   }
 

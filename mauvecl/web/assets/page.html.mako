@@ -18,13 +18,13 @@
 <%def name="help(name, about)">\
 <button type="button" class="help" popovertarget="help-${name}" aria-label="What is ${about}?">?</button>\
 </%def>
-<%def name="meaning(name, about, told)">
-<div class="meaning" id="help-${name}" popover><strong>${about}</strong> ${told}</div>
+<%def name="meaning(name, about, message)">
+<div class="meaning" id="help-${name}" popover><strong>${about}</strong> ${message}</div>
 </%def>
 <%def name="control(name)">
 <% field = fields.FIELDS[name] %>
 <div class="field" data-field="${name}">
-<div class="head"><label for="f-${name}">${field.label}</label>${help(name, field.label)}${meaning(name, field.label, field.told)}</div>
+<div class="head"><label for="f-${name}">${field.label}</label>${help(name, field.label)}${meaning(name, field.label, field.hint)}</div>
 % if name == "star":
 <div class="combo">
 <input id="f-star" name="star" type="text" role="combobox" autocomplete="off" spellcheck="false" value="${field.first}"
@@ -120,7 +120,7 @@ ${control(name)}
 <section id="answer" aria-labelledby="answer-head" tabindex="-1">
 <h2 id="answer-head" class="quiet">Answer</h2>
 <div id="card" class="card" aria-busy="true">
-<div class="told" aria-live="polite" aria-atomic="true">
+<div class="message" aria-live="polite" aria-atomic="true">
 <p class="chance"><span id="chance">…</span></p>
 <p class="interval" id="interval">the answer is on its way</p>
 <p class="words" id="words-of"></p>
@@ -144,7 +144,7 @@ ${control(name)}
 <div role="tabpanel" id="panel-${tab.name}" aria-labelledby="tab-${tab.name}"${"" if k == 0 else " hidden"}>
 <p class="about">${tab.about}</p>
 % if any(p.pins for p in tab.pictures):
-<div class="beside" hidden><label><input type="checkbox" data-marks="pins" checked> Pinned</label></div>
+<div class="pins" hidden><label><input type="checkbox" data-marks="pins" checked> Pinned</label></div>
 % endif
 <div class="pictures${" one" if len(tab.pictures) == 1 else ""}">
 % for picture in tab.pictures:
@@ -222,6 +222,6 @@ ${control(name)}
 <h3>Citation</h3><p>Please cite mauvecl ${version} (The mauvecl developers: “mauvecl: would the Mauve satellite see this stellar flare?”) and the paper whose instrument model it implements: Saba, A., et al., “MauveSim: the instrument simulator software for the Blue Skies Space Mauve satellite”, RAS Techniques and Instruments. The file <code>CITATION.cff</code> has both.</p>
 <div class="row"><button type="button" data-closes>Close</button></div>
 </dialog>
-<div id="lost" role="alertdialog" aria-labelledby="lost-told" hidden><div><p id="lost-told"></p><button type="button" class="main" id="go-on" hidden>Go on</button></div></div>
+<div id="lost" role="alertdialog" aria-labelledby="lost-message" hidden><div><p id="lost-message"></p><button type="button" class="main" id="go-on" hidden>Go on</button></div></div>
 </body>
 </html>

@@ -30,7 +30,7 @@ class Page {
       this.changed(last, other)
     }, (field, file) => this.upload(field, file))
     this.pictures = new Pictures(words, given => this.enter(given), (name, blob) => this.give(name, blob))
-    this.beside = new Map()
+    this.pins = new Map()
     this.compare = new Compare(words.pins, link => { this.follow(link); this.changed(true, true) }, () => this.pinned())
     this.wire()
     this.follow(window.location.search)
@@ -139,10 +139,10 @@ class Page {
     this.asking = true
     this.dirty = false
     const question = this.question
-    const n = this.live.ask("answer", {link: this.link + (this.stray ? `&${this.stray}` : ""), tab: this.seen.tab}, told => {
-      if (told.pictures) {
+    const n = this.live.ask("answer", {link: this.link + (this.stray ? `&${this.stray}` : ""), tab: this.seen.tab}, message => {
+      if (message.pictures) {
         this.live.done(n)
-        if (question === this.question) this.draw(told)
+        if (question === this.question) this.draw(message)
         return
       }
       this.asking = false
@@ -150,28 +150,28 @@ class Page {
         this.ask()
         return
       }
-      this.show(told)
+      this.show(message)
     })
   }
 
-  show(told) {
-    this.faults = told.faults
-    this.fields.tell(told.faults)
+  show(message) {
+    this.faults = message.faults
+    this.fields.tell(message.faults)
     // Without an answer the notes of the last one keep their room, unseen: nothing jumps while a number is typed.
-    const stray = told.stray ? [[told.stray, "stray"]] : []
-    if (told.answer || told.stray) this.card.notices([...stray, ...(told.answer?.notes ?? [])])
-    if (told.answer) this.tell(told.answer)
-    else this.none(told.faults, told.refused)
+    const stray = message.stray ? [[message.stray, "stray"]] : []
+    if (message.answer || message.stray) this.card.notices([...stray, ...(message.answer?.notes ?? [])])
+    if (message.answer) this.tell(message.answer)
+    else this.none(message.faults, message.refused)
   }
 
-  async draw(told) {
-    this.card.rows(told.tab, told.rows)
+  async draw(message) {
+    this.card.rows(message.tab, message.rows)
     this.pinned()
-    await this.pictures.put(told.pictures)
+    await this.pictures.put(message.pictures)
     if (this.answer === null) return
-    this.card.fresh(told.tab)
+    this.card.fresh(message.tab)
     clearTimeout(this.soon)
-    if (DRAWN.has(told.tab) && !told.draws) this.soon = setTimeout(() => this.drawOne(), DRAW_MS)
+    if (DRAWN.has(message.tab) && !message.draws) this.soon = setTimeout(() => this.drawOne(), DRAW_MS)
   }
 
   // Pinned scenarios in the pictures of this tab; their data are requested once.
@@ -179,30 +179,30 @@ class Page {
     const name = this.seen.tab, tab = words.tabs[name]
     // A pinned upload is drawn as long as it is the one that is here.
     const pins = this.compare.drawn.map(pin => pin && pin.files === this.filesOf(pin.entered) ? pin : undefined)
-    for (const box of document.querySelectorAll(".beside")) {
+    for (const box of document.querySelectorAll(".pins")) {
       box.hidden = !pins.some(Boolean)
       box.replaceChildren(box.firstElementChild, ...this.compare.key())
     }
     if (!tab.pictures.some(picture => picture.pins)) return
     for (const pin of pins.filter(Boolean)) {
       const key = `${name} ${pin.link}`
-      if (this.beside.has(key) || !this.live?.open) continue
-      this.beside.set(key, {})
-      const n = this.live.ask("pinned", {link: pin.link, tab: name}, told => {
+      if (this.pins.has(key) || !this.live?.open) continue
+      this.pins.set(key, {})
+      const n = this.live.ask("pinned", {link: pin.link, tab: name}, message => {
         this.live.done(n)
-        this.beside.set(key, told.pins ?? {})
+        this.pins.set(key, message.pins ?? {})
         this.pinned()
       })
     }
-    const known = pins.map(pin => pin && {entered: pin.entered, columns: this.beside.get(`${name} ${pin.link}`) ?? {}})
+    const known = pins.map(pin => pin && {entered: pin.entered, columns: this.pins.get(`${name} ${pin.link}`) ?? {}})
     this.pictures.pin(tab, known, this.fields.entered)
   }
 
   drawOne() {
     const question = this.question
-    const n = this.live.ask("draw", {link: this.link, tab: this.seen.tab}, told => {
+    const n = this.live.ask("draw", {link: this.link, tab: this.seen.tab}, message => {
       this.live.done(n)
-      if (question === this.question && told.tab === this.seen.tab) this.draw({...told, draws: true})
+      if (question === this.question && message.tab === this.seen.tab) this.draw({...message, draws: true})
     })
   }
 
@@ -239,18 +239,18 @@ class Page {
     if (this.running !== null || this.answer === null) return
     const question = this.question
     this.card.progress(0, "waiting for its turn")
-    const n = this.running = this.live.ask("simulate", {kind, link: this.link}, told => {
-      if (told.ended === undefined) {
-        this.card.progress(told.progress, told.told)
+    const n = this.running = this.live.ask("simulate", {kind, link: this.link}, message => {
+      if (message.ended === undefined) {
+        this.card.progress(message.progress, message.message)
         return
       }
       this.live.done(n)
       this.running = null
-      this.card.ended(told.ended)
+      this.card.ended(message.ended)
       this.offer()
       if (question !== this.question) return
-      if (told.refused) this.card.notices([[told.refused, "danger"]])
-      else if (told.kind) this.simulated()
+      if (message.refused) this.card.notices([[message.refused, "danger"]])
+      else if (message.kind) this.simulated()
     })
     this.offer()
   }
@@ -307,22 +307,22 @@ class Page {
   // The browser keeps the file: a server that has lost it gets it again.
   send(field, name, content) {
     const serial = this.serial = (this.serial ?? 0) + 1
-    const n = this.live.ask("upload", {field, name}, told => {
+    const n = this.live.ask("upload", {field, name}, message => {
       this.live.done(n)
       if (serial !== this.serial && field === this.field) return
-      if (told.lacks) {
-        if (field in this.lacks) this.lack(field, told.lacks)
+      if (message.lacks) {
+        if (field in this.lacks) this.lack(field, message.lacks)
         return
       }
       this.files[field] = {at: Date.now(), ...this.files[field], name, content}
       if (!(field in this.lacks)) return
       delete this.lacks[field]
-      if (this.fields.entered[field] === told.entered) {
+      if (this.fields.entered[field] === message.entered) {
         // Sent again: the same question, and what was simulated for it.
         this.ask()
         return
       }
-      this.fields.put({[field]: told.entered})
+      this.fields.put({[field]: message.entered})
       this.changed(true, true)
     })
     this.field = field
@@ -344,19 +344,19 @@ class Page {
 
   take(tab, name, ending, button) {
     button.disabled = true
-    const n = this.live.ask("file", {link: this.link, tab, name, ending}, (told, content) => {
+    const n = this.live.ask("file", {link: this.link, tab, name, ending}, (message, content) => {
       this.live.done(n)
       this.offer()
-      if (told.refused) this.card.notices([[told.refused, "danger"]])
-      else this.give(told.file, content)
+      if (message.refused) this.card.notices([[message.refused, "danger"]])
+      else this.give(message.file, content)
     })
   }
 
   export() {
-    const n = this.live.ask("export", {link: this.link}, told => {
+    const n = this.live.ask("export", {link: this.link}, message => {
       this.live.done(n)
-      byId("as-command").textContent = told.refused ?? told.command
-      byId("as-python").textContent = told.refused ?? told.python
+      byId("as-command").textContent = message.refused ?? message.command
+      byId("as-python").textContent = message.refused ?? message.python
       byId("export").showModal()
     })
   }
@@ -392,7 +392,7 @@ class Page {
     byId("lost").hidden = true
     for (const part of document.body.children) if (part.id !== "lost") part.inert = false
     this.asking = false
-    this.beside.clear()
+    this.pins.clear()
     // What the server knew of this page is gone with the connection; the browser has it all.
     const kept = Object.entries(this.files).filter(([field]) => this.fields.entered[field] === words.uploads[field])
     this.wanted = this.seen.simulated.split(",").filter(Boolean)
@@ -408,7 +408,7 @@ class Page {
     this.running = null
     this.withdraw()
     this.card.ended("")
-    byId("lost-told").textContent = unused
+    byId("lost-message").textContent = unused
       ? "This page was not used for a long time, and the server let it go."
       : "The connection to the server is lost. The page comes back by itself as soon as the server answers."
     byId("lost").hidden = false

@@ -25,8 +25,8 @@ class AgainstMagnitude(Picture):
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         canvas = Canvas(ink, "magnitude", "smallest change (%)", logs | {"y"}, y_range=(0.01, 1e4))
         for name, colour in SHOWN.items():
-            told = canvas.line(name, name, colour, line_width=2)
-            canvas.tooltips(told, ("magnitude", "x"), (f"{name} (%)", "y"))
+            curve = canvas.line(name, name, colour, line_width=2)
+            canvas.tooltips(curve, ("magnitude", "x"), (f"{name} (%)", "y"))
         canvas.own_point("this star, 320-700")
         return canvas
 

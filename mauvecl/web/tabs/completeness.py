@@ -34,8 +34,8 @@ class Shares(Picture):
         for k, (called, colour) in enumerate(zip(LENGTHS, ink.lengths, strict=True)):
             canvas.band(f"band {k}", f"{called} flares", colour)
             canvas.legend.pop()
-            told = canvas.line(f"line {k}", f"{called} flares", colour, line_width=2)
-            canvas.tooltips(told, ("amplitude (%)", "x"), (f"found of the {called}", "y"))
+            curve = canvas.line(f"line {k}", f"{called} flares", colour, line_width=2)
+            canvas.tooltips(curve, ("amplitude (%)", "x"), (f"found of the {called}", "y"))
         canvas.rule("own", "amplitude of your question", "x", "own")
         return canvas
 

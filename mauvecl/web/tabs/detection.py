@@ -28,9 +28,9 @@ class Excess(Picture):
         canvas.saturated()
         canvas.dots("drawn", "drawn exposure", "drawn", size=5)
         canvas.line("pixel", "expected per pixel", "sky", line_width=1.2)
-        told = canvas.line("element", "expected per element of 10.5 nm", "flare", step=True, line_width=2.2)
+        curve = canvas.line("element", "expected per element of 10.5 nm", "flare", step=True, line_width=2.2)
         canvas.pinned(partial(canvas.plot.step, mode="center"))
-        canvas.tooltips(told, ("wavelength (nm)", "x"), ("sigma per element", "y"))
+        canvas.tooltips(curve, ("wavelength (nm)", "x"), ("sigma per element", "y"))
         return canvas
 
     def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
@@ -79,8 +79,8 @@ class Distributions(Picture):
         for name, called, colour in (("null", "no flare", "star"), ("flare", "flare", "flare")):
             canvas.band(f"{name} area", called, colour, alpha=0.18)
             canvas.legend.pop()
-            told = canvas.line(name, called, colour, line_width=2)
-            canvas.tooltips(told, ("statistic", "x"), ("density", "y"))
+            curve = canvas.line(name, called, colour, line_width=2)
+            canvas.tooltips(curve, ("statistic", "x"), ("density", "y"))
         canvas.pinned()
         canvas.rule("threshold", "threshold", "x")
         return canvas
@@ -131,10 +131,10 @@ class Trade(Picture):
             y_range=(-0.02, 1.03),
         )  # fmt: skip
         canvas.band("simulated", "simulated, 95 %", "drawn", alpha=0.4)
-        told = canvas.line("closed form", "closed form", "flare", line_width=2)
+        curve = canvas.line("closed form", "closed form", "flare", line_width=2)
         canvas.pinned()
         canvas.own_point()
-        canvas.tooltips(told, ("false-alarm probability", "x"), ("detection probability", "y"))
+        canvas.tooltips(curve, ("false-alarm probability", "x"), ("detection probability", "y"))
         return canvas
 
     def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:

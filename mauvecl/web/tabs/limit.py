@@ -120,12 +120,12 @@ class Curve(Picture):
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         canvas = Canvas(ink, "magnitude", "detection probability", logs, x_range=MAGNITUDES, y_range=(-0.03, 1.05))
-        told = canvas.line("closed form", "closed form", "flare", line_width=2)
+        curve = canvas.line("closed form", "closed form", "flare", line_width=2)
         canvas.rule("power", "wanted: 90 %", "y")
         canvas.dots("simulated", "simulated", "drawn", size=8)
         canvas.pinned()
         canvas.own_point()
-        canvas.tooltips(told, ("magnitude", "x"), ("detected", "y"))
+        canvas.tooltips(curve, ("magnitude", "x"), ("detected", "y"))
         return canvas
 
     def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:

@@ -66,8 +66,8 @@ class Errors(Picture):
         )
         for name, colour in zip(("known", "usual", "free"), ("flare", "star", "sky"), strict=True):
             called = list(ASSUMED)[("known", "usual", "free").index(name)]
-            told = canvas.line(name, called, colour, line_width=2)
-            canvas.tooltips(told, ("amplitude (%)", "x"), (f"{called} (%)", "y"))
+            curve = canvas.line(name, called, colour, line_width=2)
+            canvas.tooltips(curve, ("amplitude (%)", "x"), (f"{called} (%)", "y"))
         canvas.pinned()
         canvas.own_point()
         return canvas

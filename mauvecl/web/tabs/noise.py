@@ -38,9 +38,9 @@ class Budget(Picture):
         for name, (called, colour) in PARTS.items():
             # What is nearly all of it stays in sight behind the sum.
             how: dict[str, Any] = {"line_dash": "dashed"} if name == "total" else {}
-            told = canvas.line(name, called, colour, line_width=2, **how)
+            curve = canvas.line(name, called, colour, line_width=2, **how)
             lines = (("wavelength (nm)", "x"),) if name == "total" else ()
-            canvas.tooltips(told, *lines, (f"{called} (DN)", "y"))
+            canvas.tooltips(curve, *lines, (f"{called} (DN)", "y"))
         canvas.pinned()
         return canvas
 

@@ -38,8 +38,8 @@ class Recovered(Picture):
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         name = "bolometric energy of the flare (erg)"
         canvas = Canvas(ink, name, "share recovered", logs | {"x"}, x_range=ENERGIES, y_range=(-0.03, 1.05))
-        told = canvas.line("recovered", "share recovered", "flare", line_width=2)
-        canvas.tooltips(told, ("energy (erg)", "x"), ("recovered", "y"))
+        curve = canvas.line("recovered", "share recovered", "flare", line_width=2)
+        canvas.tooltips(curve, ("energy (erg)", "x"), ("recovered", "y"))
         return canvas
 
     def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
@@ -62,8 +62,8 @@ class Expected(Picture):
         name = "bolometric energy of the flare (erg)"
         canvas = Canvas(ink, name, "flares", logs | {"x", "y"}, x_range=ENERGIES, y_range=(1e-3, 1e4))
         canvas.line("all", "all of them", "star", line_width=2)
-        told = canvas.line("found", "recovered", "flare", line_width=2)
-        canvas.tooltips(told, ("energy (erg)", "x"), ("recovered", "y"))
+        curve = canvas.line("found", "recovered", "flare", line_width=2)
+        canvas.tooltips(curve, ("energy (erg)", "x"), ("recovered", "y"))
         return canvas
 
     def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:

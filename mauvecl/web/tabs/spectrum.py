@@ -32,10 +32,10 @@ class Recorded(Picture):
         canvas.line("sky", "sky", "sky")
         canvas.line("dark", "dark", "dark", show="pedestals")
         canvas.line("bias", "bias", "bias", show="pedestals")
-        told = canvas.line("star", "star", "star", line_width=2)
+        curve = canvas.line("star", "star", "star", line_width=2)
         flare = canvas.line("flare", "star with flare", "flare", line_width=2)
         canvas.pinned()
-        canvas.tooltips(told, ("wavelength (nm)", "x"), ("star (DN)", "y"))
+        canvas.tooltips(curve, ("wavelength (nm)", "x"), ("star (DN)", "y"))
         canvas.tooltips(flare, ("with flare (DN)", "y"))
         return canvas
 

@@ -18,7 +18,7 @@ from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 if TYPE_CHECKING:
     from mauvecl.web.closed_forms import ClosedForms
 
-#: What is told of one unknown: its name, and the matched S/N plain and marginalised.
+#: Name of an unknown, and the matched S/N plain and marginalised.
 Row = tuple[str, float, float]
 
 

@@ -25,8 +25,8 @@ class Hours(Picture):
         canvas = Canvas(ink, "", "hours in the day", logs, x_axis_type="datetime", y_range=(-0.5, 24.5))
         canvas.band("area", "hours seen", "star", alpha=0.3)
         canvas.legend.pop()
-        told = canvas.line("hours", "hours seen, day by day", "star", line_width=1.2)
-        canvas.tooltips(told, ("hours", "y"))
+        curve = canvas.line("hours", "hours seen, day by day", "star", line_width=1.2)
+        canvas.tooltips(curve, ("hours", "y"))
         return canvas
 
     def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
