@@ -102,6 +102,11 @@ class Analysis:
         """Star-days of the searched frames."""
         return self.survey.stare.observed_s / DAY_S
 
+    @cached_property
+    def changes_of_light(self) -> int:
+        """Number of events above the threshold that are steps or changes of throughput."""
+        return sum(one.kind in ("step", "throughput") and one.value >= self.threshold for one in self.events)
+
     def false_alarms(self, event: ObservedEvent) -> tuple[float, float]:
         """Return the false alarms per star-day at an event's statistic: in normal noise, and in noise as measured."""
         try:
@@ -136,6 +141,12 @@ class Analysis:
             lines.append(f"The scatter of quiescent frames is {self.level.excess:.2f} times the stated errors; the "
                          "measured scatter is used.")  # fmt: skip
         lines += [] if self.spectra is None else _spectral_messages(self.spectra)
+        if self.spectra is not None and (count := self.changes_of_light):
+            lines.append(
+                f"{count} {'event is a change' if count == 1 else 'events are changes'} of throughput, as by pointing "
+                "losses; shorter ones may resemble flares: `--set search.frame.light=free` searches without "
+                "the light that all pixels share, with a smaller S/N."
+            )
         red = next((one for one in self.scatter if one.red), None)
         if red is not None:
             lines.append(

@@ -58,6 +58,12 @@ class EventSpectrum:
     p_value: float
 
     @property
+    def ambiguous(self) -> bool:
+        """True if a flare explains the spectrum best, but hardly better than a change of the instrument does."""
+        others = min(value for cause, value in self.chi2.items() if cause != "flare")
+        return self.cause == "flare" and others < self.chi2["flare"] + CLEARLY
+
+    @property
     def reason(self) -> str:
         """Why the event is no flare, or what is doubtful if it is one; empty if nothing is."""
         if self.cause == "cosmic ray":
@@ -65,9 +71,8 @@ class EventSpectrum:
         if self.cause != "flare":
             gain = self.chi2["flare"] - self.chi2[self.cause]
             return f"its spectrum is that of a change of the {self.cause}: chi-squared is {gain:.3g} below a flare's"
-        others = min(value for cause, value in self.chi2.items() if cause != "flare")
-        if others < self.chi2["flare"] + CLEARLY:
-            return "its spectrum does not tell it from a change of the instrument"
+        if self.ambiguous:
+            return "its spectrum does not distinguish it from a change of the instrument"
         return "no flare of one temperature fits its spectrum" if self.p_value < NO_FIT else ""
 
 

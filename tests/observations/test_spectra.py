@@ -291,3 +291,18 @@ def test_answer_states_measurements_or_why_there_are_none() -> None:
     assert "distance" in event["unmeasured"]
     # The flux of a flare does not depend on the star.
     assert event["temperature"].value == pytest.approx(answer.events["temperature"][k].value, rel=1e-3)
+
+
+def test_flare_like_a_change_of_throughput_is_a_candidate_where_such_changes_occur() -> None:
+    """A rise of the throughput, a cool flare whose spectrum resembles it, and a hot flare."""
+    rise = 0.3 * flare(900.0, 60.0, 1.0).sum(axis=1, keepdims=True) * light() / light().sum()
+    cool, hot = flare(1800.0, 60.0, 0.3, 5000.0), flare(2900.0, 60.0, 1.0)
+    verdicts = []
+    for added in (rise + cool + hot, cool + hot):
+        answer = analyse(STUDY, frames=drawn(np.random.default_rng(312), added))
+        verdicts.append({round(float(answer.analysis.survey.time_s[row.event.brightest]), -2): row.verdict
+                         for row in answer.rows})  # fmt: skip
+        assert any("search.frame.light=free" in line for line in answer.messages) == (len(verdicts) == 1)
+    assert verdicts == [
+        {900.0: "rejected", 1800.0: "candidate", 2900.0: "detected"}, {1800.0: "detected", 2900.0: "detected"}
+    ]  # fmt: skip

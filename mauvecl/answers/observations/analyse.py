@@ -115,10 +115,14 @@ class EventRow:
 
     @property
     def verdict(self) -> str:
-        """Whether the event is a detected flare, a candidate, or rejected because it is of another kind."""
+        """Whether the event is a detected flare, a candidate, or rejected because it is of another kind.
+
+        Where the throughput changes, only a spectrum that is clearly that of a flare makes an event a detection.
+        """
         if self.event.kind != "flare":
             return "rejected"
-        return "detected" if self.significant else "candidate"
+        doubtful = self.spectrum is not None and self.spectrum.ambiguous and self.analysis.changes_of_light > 0
+        return "detected" if self.significant and not doubtful else "candidate"
 
     @property
     def rates(self) -> tuple[float, float]:
@@ -226,7 +230,8 @@ EVENTS = (
            "the larger rate", "from noise", _rate),
     Column("significant", "significant", "", "whether the rate is at most the wanted one", kind=bool),
     Column("verdict", "verdict", "", "detected: a flare with at most the wanted rate; candidate: a flare with a larger "
-           "one; rejected: it resembles a flare, but its spectrum or shape is of another kind", "verdict", kind=str),
+           "one, or one like the changes of throughput in these frames; rejected: it resembles a flare, but its "
+           "spectrum or shape is of another kind", "verdict", kind=str),
     Column("blue_over_red", lambda row: row.colour[0], "", "rise relative to the star in the blue half of the pixels "
            "over that in the red half: 1 for a change of throughput; nan: no spectra", "blue/red", number(".3g")),
     Column("blue_over_red_error", lambda row: row.colour[1], "", "its standard error"),
