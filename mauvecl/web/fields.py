@@ -324,7 +324,7 @@ def _group(name: str) -> tuple[str, ...]:
 ASKED = ("star", *(name for name in _group("") if name != "star"))
 ADVANCED = {
     name: _group(name)
-    for name in ("Detection", "Flare's spectrum", "Detector", "Sky", "Unknown", "Visibility and plan")
+    for name in ("Detection", "Flare's spectrum", "Detector", "Sky", "Unknown", "Visibility and plan", "Change")
 }
 #: Fields that ask for something under one sky only.
 ASKED_UNDER = {"sky_brightness": "brightness", "target": "target and time", "time": "target and time"}

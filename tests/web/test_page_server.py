@@ -765,6 +765,14 @@ def test_foreign_hosts_and_origins_are_refused(served: Any) -> None:
     served(work)
 
 
+def test_page_has_every_field_once(served: Any) -> None:
+    async def work(host: str) -> None:
+        _, page = await got(f"http://{host}/")
+        assert {name: page.count(f'id="f-{name}"') for name in FIELDS} == dict.fromkeys(FIELDS, 1)
+
+    served(work)
+
+
 def test_ipv6_is_served(served: Any) -> None:
     async def work(host: str) -> None:
         assert (await got(f"http://{host}/"))[0] == 200
