@@ -144,7 +144,7 @@ class Analysis:
         if self.spectra is not None and (count := self.changes_of_light):
             lines.append(
                 f"{count} {'event is a change' if count == 1 else 'events are changes'} of throughput, as by pointing "
-                "losses; shorter ones may resemble flares: `--set search.frame.light=free` searches without "
+                'losses; shorter ones may resemble flares: search.frame.light = "free" searches without '
                 "the light that all pixels share, with a smaller S/N."
             )
         red = next((one for one in self.scatter if one.red), None)

@@ -302,7 +302,7 @@ def test_flare_like_a_change_of_throughput_is_a_candidate_where_such_changes_occ
         answer = analyse(STUDY, frames=drawn(np.random.default_rng(312), added))
         verdicts.append({round(float(answer.analysis.survey.time_s[row.event.brightest]), -2): row.verdict
                          for row in answer.rows})  # fmt: skip
-        assert any("search.frame.light=free" in line for line in answer.messages) == (len(verdicts) == 1)
+        assert any("search.frame.light" in line for line in answer.messages) == (len(verdicts) == 1)
     assert verdicts == [
         {900.0: "rejected", 1800.0: "candidate", 2900.0: "detected"}, {1800.0: "detected", 2900.0: "detected"}
     ]  # fmt: skip
