@@ -34,7 +34,7 @@ CANDIDATES = 1.0
 
 @dataclass(frozen=True, eq=False)
 class SpectralAnalysis:
-    """What the analysis of spectra has beyond that of a light curve.
+    """Results that the analysis of spectra adds to that of a light curve.
 
     Attributes
     ----------

@@ -76,7 +76,7 @@ class ObservedEvent:
 
 @dataclass(frozen=True)
 class Detection:
-    """What the search detects.
+    """Event above the threshold of the search, before it is measured.
 
     Attributes
     ----------

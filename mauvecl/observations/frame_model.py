@@ -1,4 +1,4 @@
-"""What the pixels of observed frames record of flares, the star, the dark current and the sky."""
+"""Response of the pixels of observed frames to flares, the star, the dark current and the sky."""
 
 from __future__ import annotations
 

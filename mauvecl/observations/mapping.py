@@ -27,7 +27,7 @@ EPOCHS_MJD = {
 
 
 class FrameMapping(Record):
-    """Where the quantities of frames are in a file, or in the files of a folder.
+    """Places of the quantities of frames in a file, or in the files of a folder.
 
     A quantity is the name of a column; in FITS files also of an image, or ``EXTENSION/COLUMN``; in a folder of spectra
     also a keyword of each file's header. A pattern such as ``flux_*`` names several columns, one for each pixel.

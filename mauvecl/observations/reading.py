@@ -265,7 +265,7 @@ def _recognised(file: FrameFile) -> FrameMapping:
 
 @dataclass(frozen=True, eq=False)
 class Quantities:
-    """What a mapping names, as the file has it."""
+    """Columns, arrays and values of a file that a mapping names."""
 
     time: tuple[Values, ...]
     flux: Values

@@ -19,7 +19,7 @@ from mauvecl.schema.errors import InputError
 
 Float = NDArray[np.float64]
 
-#: Where the quantities of a stored scene are.
+#: Paths of the quantities of a stored scene.
 MAPPING = {"time": "time", "flux": "flux", "error": "error", "quality": "quality", "exposure": "exposure",
            "wavelength": "wavelength", "flux_unit": "adu"}  # fmt: skip
 #: Attributes that every scene has.
@@ -94,7 +94,7 @@ class StoredFile(FrameFile):
 
     @property
     def mapping(self) -> FrameMapping:
-        """Where the quantities are."""
+        """Paths of the quantities in the store."""
         more = {"temperature": "temperature"} if "temperature" in self.parts else {}
         return FrameMapping(**MAPPING, **more)
 

@@ -28,7 +28,7 @@ REFERENCES = {"MJDREF": 0.0, "BJDREF": -2_400_000.5, "JDREF": -2_400_000.5}
 
 @dataclass(frozen=True)
 class TimeSystem:
-    """What a header states about its times."""
+    """Time system of a FITS header."""
 
     epoch_mjd: float | None  # date of time zero
     scale: str  # in lower case, as astropy names it where it knows it; empty if unknown

@@ -103,7 +103,7 @@ class Values:
         return np.ma.asarray(np.stack([np.asarray(one) for one in values]) if len(values) else values.astype(float))
 
     def _parsed(self, values: Any, start: int) -> Float:
-        """Return texts as numbers; raise InputError that names the first that is none."""
+        """Return texts as numbers; raises InputError that names the first text that is not a number."""
         texts = [_plain(one) for one in np.ma.filled(values, "").ravel().tolist()]
         parsed = np.empty(len(texts))
         for place, text in enumerate(texts):

@@ -104,13 +104,10 @@ def pulls(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
 @styled_picture
 def errors(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
     """Plot forecast errors of temperature and amplitude against the amplitude, with and without unknowns."""
-    from mauvecl.answers.measurements.expected import forecast_model
-
     figure, axes = plt.subplots(1, len(flares), figsize=(3.4 * len(flares), 3.0), squeeze=False)
     for axis, one in zip(axes[0], flares, strict=True):
-        log_k, linear = one.perfect.log_k[0], one.perfect.amplitudes[0]
         for unknown, line in {None: "--", one.unknown: "-"}.items():
-            ahead = [forecast_model(one.quiet, one.fitted, log_k, factor * linear, unknown) for factor in FACTORS]
+            ahead = one.forecasts(FACTORS, unknown)
             for colour, q in zip(COLOURS, range(2), strict=False):
                 whose = "all known" if unknown is None else "unknowns free"
                 relative = [f.errors[q] / f.values[q] for f in ahead]

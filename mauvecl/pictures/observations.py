@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mauvecl.observations.analysis import Analysis
     from mauvecl.observations.events import ObservedEvent
 
-#: What the colours of events say.
+#: Title of the light curve, which explains its colours.
 KINDS = "events above {:.2f} (blue), candidates (grey), look-alikes (red)"
 #: Flux in standard deviations above which the light curve has a second panel near the level.
 BRIGHT = 30.0

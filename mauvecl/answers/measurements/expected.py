@@ -51,6 +51,11 @@ class ExpectedMeasurement(InCell):
         """The star, the flare and the model, for pictures."""
         return f"{self.title}, flare {100 * self.amplitude:g} %, {self.model}"
 
+    def forecasts(self, factors: Float, unknown: Nuisances | None) -> list[Forecast]:
+        """Return the expected errors for the flare times factors, with unknowns marginalised or all of them known."""
+        log_k, linear = self.perfect.log_k[0], self.perfect.amplitudes[0]
+        return [forecast_model(self.quiet, self.fitted, log_k, factor * linear, unknown) for factor in factors]
+
     def region(self, rise: float, n: int = 161) -> tuple[Float, Float, Float]:
         """Return the expected confidence region of temperature and amplitude, with everything else profiled.
 

@@ -115,7 +115,7 @@ class EventRow:
 
     @property
     def verdict(self) -> str:
-        """Whether the event is a detected flare, a candidate, or rejected because it is of another kind.
+        """Judgement of the event: a detected flare, a candidate, or rejected as an event of another kind.
 
         Where the throughput changes, only a spectrum that is clearly that of a flare makes an event a detection.
         """

@@ -89,7 +89,7 @@ class Measurement:
 
     @property
     def one_sided(self) -> NDArray[np.bool_]:
-        """Which intervals have one end, shape (n_level, n, n_derived); the other is infinite or a bound."""
+        """True for one-sided intervals, shape (n_level, n, n_derived); their other end is infinite or a bound."""
         return np.asarray((self.low <= self.bounds) != np.isinf(self.high))
 
     @classmethod

@@ -40,7 +40,7 @@ LEAST_KEPT = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class MeanSums:
-    """What a model's flares do to weighted sums of covariance one.
+    """Response of weighted sums with unit covariance to the flares of a model.
 
     Attributes
     ----------

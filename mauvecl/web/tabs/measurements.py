@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.measurements.expected import expected_measurements, forecast_model, models_of
+from mauvecl.answers.measurements.expected import expected_measurements, models_of
 from mauvecl.answers.measurements.measure import COLUMNS
 from mauvecl.results.measurements.flare_model import FlareModel
 from mauvecl.schema.tables import View, records
@@ -76,8 +76,7 @@ class Errors(Picture):
         own = 100 * closed.study.flare.amplitudes[0]
         sources: dict[str, Any] = {}
         for name, one in zip(("known", "usual", "free"), expected(closed).values(), strict=True):
-            log_k, linear = one.perfect.log_k[0], one.perfect.amplitudes[0]
-            ahead = [forecast_model(one.quiet, one.fitted, log_k, factor * linear, one.unknown) for factor in FACTORS]
+            ahead = one.forecasts(FACTORS, one.unknown)
             sources[name] = {"x": own * FACTORS, "y": [100 * f.errors[0] / f.values[0] for f in ahead]}
         known, *_, free = expected(closed).values()
         sources["own"] = {"x": [own], "y": [100 * known.ahead.errors[0] / known.ahead.values[0]]}
