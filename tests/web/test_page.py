@@ -471,7 +471,7 @@ def test_scenarios_are_compared(page: Page) -> None:
         lines = f"page.pictures.all.{picture}.plot.renderers.filter(r => r.name?.startsWith('pinned'))"
         drawn = page.evaluate(f"{lines}.map(r => r.glyph.line_color.value)")
         assert [colour for colour in drawn if colour != "#ffffff"][:2] == colours
-        key = page.locator(f"#panel-{page.evaluate('page.seen.tab')} .pins")
+        key = page.locator(f"#panel-{page.evaluate('page.routing.seen.tab')} .pins")
         assert key.locator("path").evaluate_all(strokes) == colours
         assert "2: G2V, V = 8, 2 %, 50 s" in key.inner_text()
     # What is left keeps its colour.

@@ -1,0 +1,59 @@
+// What visitors take along: tables, studies, pictures, commands, programs, and the link.
+
+const byId = id => document.getElementById(id)
+
+// Save content as a file.
+export function give(name, content) {
+  const link = document.createElement("a")
+  link.href = URL.createObjectURL(content instanceof Blob ? content : new Blob([content]))
+  link.download = name
+  link.click()
+  setTimeout(() => URL.revokeObjectURL(link.href), 10_000)
+}
+
+async function copy(button) {
+  const from = button.dataset.copy
+  const text = from === "address" ? window.location.href : byId(from).textContent
+  if (!navigator.clipboard) {
+    // Browsers have it for this machine and for https alone.
+    window.prompt("Copy with Ctrl-C:", text)
+    return
+  }
+  await navigator.clipboard.writeText(text)
+  const before = button.textContent
+  button.textContent = "Copied"
+  setTimeout(() => { button.textContent = before }, 1500)
+}
+
+export class Export {
+  // offer(): what can be done now is shown again; refused(why): it could not be made.
+  constructor(live, routing, offer, refused) {
+    Object.assign(this, {live, routing, offer, refused})
+    byId("study").onclick = () => this.take("", "study", "study", byId("study"))
+    for (const button of document.querySelectorAll("[data-file]")) {
+      const tab = button.closest("[role=tabpanel]").id.replace("panel-", "")
+      button.onclick = () => this.take(tab, button.dataset.file, button.dataset.ending, button)
+    }
+    for (const button of document.querySelectorAll("[data-copy]")) button.onclick = () => copy(button)
+  }
+
+  take(tab, name, ending, button) {
+    button.disabled = true
+    const n = this.live.ask("file", {link: this.routing.link, tab, name, ending}, (message, content) => {
+      this.live.done(n)
+      this.offer()
+      if (message.refused) this.refused(message.refused)
+      else give(message.file, content)
+    })
+  }
+
+  // Show the question as a command and as a program.
+  open() {
+    const n = this.live.ask("export", {link: this.routing.link}, message => {
+      this.live.done(n)
+      byId("as-command").textContent = message.refused ?? message.command
+      byId("as-python").textContent = message.refused ?? message.python
+      byId("export").showModal()
+    })
+  }
+}

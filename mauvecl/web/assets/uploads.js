@@ -1,0 +1,77 @@
+// Files of the visitor: they go to the server, and the browser keeps them for one that has lost them.
+
+const MIB = 2 ** 20
+
+export class Uploads {
+  // changed(last): the question is another; none(): it has no answer now; again(): ask it again.
+  constructor(words, fields, live, {changed, none, again}) {
+    Object.assign(this, {words, fields, live, changed, none, again})
+    this.files = {}
+    // Fields whose file is not read, with the reason.
+    this.lacks = {}
+    this.serials = {}
+  }
+
+  async choose(field, file) {
+    this.fields.put({[field]: ""})
+    delete this.files[field]
+    this.lacks[field] = `${file.name} is being read`
+    this.changed(false)
+    this.none()
+    if (file.size > this.words.most_uploaded) {
+      this.lack(field, `upload of ${(file.size / MIB).toFixed(1)} MiB, expected at most ${this.words.most_uploaded / MIB} MiB`)
+      return
+    }
+    this.send(field, file.name, await file.arrayBuffer())
+  }
+
+  send(field, name, content) {
+    const serial = this.serials[field] = (this.serials[field] ?? 0) + 1
+    const n = this.live.ask("upload", {field, name}, message => {
+      this.live.done(n)
+      // Another file was chosen since.
+      if (serial !== this.serials[field]) return
+      if (message.lacks) {
+        if (field in this.lacks) this.lack(field, message.lacks)
+        return
+      }
+      this.files[field] = {at: Date.now(), ...this.files[field], name, content}
+      if (!(field in this.lacks)) return
+      delete this.lacks[field]
+      if (this.fields.entered[field] === message.entered) {
+        // Sent again: the same question, and what was simulated for it.
+        this.again()
+        return
+      }
+      this.fields.put({[field]: message.entered})
+      this.changed(true)
+    })
+    this.live.send(content)
+  }
+
+  // Send the files that stand in fields again, and return true if there are any.
+  resend() {
+    const kept = Object.entries(this.files).filter(([field]) => this.fields.entered[field] === this.words.uploads[field])
+    for (const [field, {name, content}] of kept) {
+      this.lacks[field] = `${name} is being read`
+      this.send(field, name, content)
+    }
+    return kept.length > 0
+  }
+
+  lack(field, why) {
+    this.lacks[field] = why
+    this.none()
+  }
+
+  // These fields are changed: nobody waits for their files.
+  forget(names) {
+    for (const name of names) delete this.lacks[name]
+  }
+
+  // Which files stand in fields, for the comparison of two questions.
+  of(entered) {
+    const uploads = Object.entries(this.words.uploads).filter(([field, text]) => entered[field] === text)
+    return uploads.map(([field]) => this.files[field]?.at ?? "gone").join()
+  }
+}
