@@ -1,4 +1,4 @@
-"""Write the list of stars that are known by name, `host/orbit/targets.ecsv`.
+"""Write the list of stars that are known by name, `host/stars/library/well_known.ecsv`.
 
 python tools/build_targets.py HIP2.DAT STARS.14.JSON
 
@@ -19,7 +19,7 @@ from astropy.coordinates import SkyCoord, get_constellation
 from astropy.table import Table
 from astropy.utils import iers
 
-PLACE = Path(__file__).parent.parent / "host" / "orbit" / "targets.ecsv"
+PLACE = Path(__file__).parent.parent / "host" / "stars" / "library" / "well_known.ecsv"
 #: Right ascension and declination (rad), parallax (mas), proper motions (mas/yr), Hp.
 COLUMNS = ((15, 28), (29, 42), (43, 50), (51, 59), (60, 68), (129, 136))
 #: Name, HIP, spectral type, constellation, other names.

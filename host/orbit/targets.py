@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 import threading
 from collections.abc import Callable
@@ -18,9 +17,10 @@ from mauvecl.schema.text import shortened
 
 from ..files.ecsv import parse_ecsv
 from ..sky.helioecliptic import offline, parse_position
-from . import star_list
+from ..stars import well_known
+from ..stars.star_names import near_names
+from ..stars.well_known import by_key, name_key
 from .earth import direction
-from .star_list import name_key
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -54,19 +54,17 @@ class Target:
         simbad : bool
             Whether to query SIMBAD for a name that is not embedded (needs `mauvecl[names]` and a network).
         """
-        row = _names().get(name_key(text))
-        if row is not None:
-            return cls(name or row.name, row.ra_deg, row.dec_deg, row.source, row.distance_pc, row.magnitude,
-                       row.spectral_type)  # fmt: skip
+        star = by_key().get(name_key(text))
+        if star is not None:
+            return cls(name or star.name, star.ra_deg, star.dec_deg, f"embedded list ({star.source})",
+                       star.distance_pc, star.magnitude, star.spectral_type)  # fmt: skip
         if not re.match(r"\s*[+-]?\d", text):
             if simbad:
                 return _from_simbad(text, name)
-            near = difflib.get_close_matches(name_key(text), _names(), n=3, cutoff=0.5)
-            like = ", ".join(dict.fromkeys(_names()[one].name for one in near))
-            like = f"a name such as {like}" if like else "a name of the embedded list"
+            like = ", ".join(near_names(text, stars_only=True))
             raise InputError(
                 f"target {shortened(text)} is not in the embedded list",
-                f"{like}, coordinates such as '290.0 -11.2', or `simbad=True` to ask SIMBAD",
+                f"a name such as {like}, coordinates such as '290.0 -11.2', or `simbad=True` to ask SIMBAD",
                 key="target",
                 value=text,
             )
@@ -82,19 +80,7 @@ class Target:
 
 @cache
 def _list() -> Table:
-    return parse_ecsv(star_list.text(), "the embedded list of stars")
-
-
-@cache
-def _names() -> dict[str, Target]:
-    """Return the embedded stars by normalised name."""
-    return {
-        key: Target(
-            row["name"], float(row["ra"]), float(row["dec"]), f"embedded list ({row['source']})",
-            float(row["distance"]), float(row["V"]), row["spectral_type"],
-        )
-        for key, row in star_list.rows_by_name().items()
-    }  # fmt: skip
+    return parse_ecsv(well_known.text(), "the embedded list of stars")
 
 
 def target_table() -> Table:

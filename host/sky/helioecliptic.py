@@ -13,6 +13,9 @@ import numpy as np
 
 from mauvecl.schema.errors import InputError
 
+from ..stars.star_names import near_names
+from ..stars.well_known import by_key, name_key
+
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
     from astropy.time import Time
@@ -39,7 +42,8 @@ def helioecliptic(target: SkyCoord | str, time: Time | str) -> HelioEcliptic:
     Parameters
     ----------
     target : SkyCoord or str
-        Single position; a string is ICRS, in degrees ("290.0 -11.2") or sexagesimal hours and degrees.
+        Single position; a string is a well-known star, or ICRS in degrees ("290.0 -11.2") or sexagesimal hours and
+        degrees.
     time : Time or str
         Single time within 1990-2100; a string is ISO 8601, UTC.
     """
@@ -109,13 +113,18 @@ def parse_time(time: Time | str) -> Time:
 
 
 def parse_position(target: SkyCoord | str) -> SkyCoord:
-    """Return a single finite position; text is ICRS, in degrees or sexagesimal hours and degrees."""
+    """Return a single finite position; text is a name, or ICRS in degrees or sexagesimal hours and degrees."""
     import astropy.units as u
     from astropy.coordinates import SkyCoord
     from astropy.coordinates.baseframe import BaseCoordinateFrame
 
     expected = "right ascension and declination such as '290.0 -11.2' (degrees) or '19h22m00s -11d12m00s'"
     if isinstance(target, str):
+        star = by_key().get(name_key(target))
+        if star is not None:
+            return SkyCoord(star.ra_deg, star.dec_deg, unit=u.deg)
+        if re.match(r"\s*[^\W\d]", target):
+            expected = f"a name such as {', '.join(near_names(target, stars_only=True))}, or {expected}"
         unit = u.deg if _in_degrees(target) else (u.hourangle, u.deg)
         try:
             position = SkyCoord(target.replace(",", " "), unit=unit)

@@ -74,7 +74,8 @@ class Sky:
         Parameters
         ----------
         target : SkyCoord or str
-            Single position; a string is ICRS, in degrees ("290.0 -11.2") or sexagesimal ("19h22m00s -11d12m00s").
+            Single position; a string is a well-known star ("AU Mic"), or ICRS in degrees ("290.0 -11.2") or sexagesimal
+            ("19h22m00s -11d12m00s").
         time : Time or str
             Single time in 1990-2100; a string is ISO 8601, UTC.
         lookup : {"bilinear", "nearest"}

@@ -22,7 +22,7 @@ from mauvecl.schema.text import shortened
 
 from ..array_cache import array_cache
 from .band_names import known_band
-from .catalogue import band_table, find, spectrum_table
+from .catalogue import band_table, embedded, spectrum_table
 
 Float = NDArray[np.float64]
 
@@ -138,7 +138,9 @@ def photons(wavelength_nm: Float, flux_flam: Float, name: str) -> float:
 
 @cache
 def _vega() -> tuple[Float, Float]:
-    table = spectrum_table(find("Vega")["file"])
+    vega = embedded("Vega")
+    assert vega is not None
+    table = spectrum_table(vega["file"])
     return table["wavelength"], table["flux"]
 
 

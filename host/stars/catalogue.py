@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import csv
-import difflib
 from functools import cache, lru_cache
 from importlib.resources import files
 from typing import TYPE_CHECKING
 
-from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column
 
 from ..files.ecsv import Numbers, parse_numbers
+from .well_known import name_key
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -28,15 +27,27 @@ def _index() -> dict[str, dict[str, str]]:
 
 
 @cache
-def _names() -> dict[str, str]:
-    """Return the key of the index entry for every name and alias, in lower case."""
-    names = {}
+def _keys() -> dict[str, str]:
+    """Return the key of the index entry for every normalised name and alias."""
+    keys: dict[str, str] = {}
     for key, entry in _index().items():
-        names[key] = key
+        keys[name_key(key)] = key
         for other in (entry["alias"], entry["star"]):
-            names.setdefault(other.casefold(), key)
-    names.pop("", None)
-    return names
+            keys.setdefault(name_key(other), key)
+    keys.pop("", None)
+    return keys
+
+
+def entries() -> list[dict[str, str]]:
+    """Return the index entries of all embedded spectra."""
+    return list(_index().values())
+
+
+def names() -> list[str]:
+    """Return the distinct names of all embedded spectra: types, aliases and stars."""
+    each = [entry[column] for entry in entries() for column in ("name", "alias", "star")]
+    # A collection's name in front of a type says nothing that the type does not.
+    return [name for name in dict.fromkeys(each) if name and not name.startswith("Pickles ")]
 
 
 def _ratios(quality: str) -> str:
@@ -92,31 +103,13 @@ def library_table() -> Table:
 
 
 def embedded(name: str) -> dict[str, str] | None:
-    """Return the index entry of an embedded spectrum by name, alias or star in any case, or None."""
-    key = _names().get(name.strip().casefold())
-    return None if key is None else _index()[key]
+    """Return the index entry of an embedded spectrum by name, alias or star in any case and spacing, or None.
 
-
-def find(name: str) -> dict[str, str]:
-    """Return the index entry of an embedded spectrum by name, alias or star in any case.
-
-    Raises InputError for an unknown name; the message suggests the nearest names, including the user's own stars.
+    A type may lack its luminosity class: "M3" is M3V.
     """
-    from . import own_stars
-
-    entry = embedded(name)
-    if entry is not None:
-        return entry
-    known = {key: _index()[value]["name"] for key, value in _names().items()}
-    known |= {star.name.casefold(): star.name for star in own_stars.kept()}
-    near = difflib.get_close_matches(name.strip().casefold(), known, n=4, cutoff=0.3)
-    names = [known[one] for one in near] or [entry["name"] for entry in _index().values()]
-    raise InputError(
-        f"library spectrum {name!r} is unknown",
-        f"a name such as {', '.join(dict.fromkeys(names))}",
-        key="name",
-        value=name,
-    )
+    key = name_key(name)
+    found = _keys().get(key) or _keys().get(f"{key}v")
+    return None if found is None else _index()[found]
 
 
 @lru_cache(8)

@@ -119,8 +119,12 @@ class Source(Drawable, ContentEquality):
     def from_library(cls, name: str) -> Self:
         """Return an embedded spectrum or one of the user's own stars, by name in any case.
 
-        `catalogue.library_table` lists the names. For an unknown name the error suggests the nearest ones.
+        `catalogue.library_table` lists the names. For an unknown name the error suggests the nearest ones, and for a
+        well-known star without a spectrum that of its type.
         """
+        from .star_names import spectrum_name
+
+        name = spectrum_name(name, "name")
         mine = own_stars.find(name) if catalogue.embedded(name) is None else None
         if mine is not None:
             wavelength, flux = own_stars.spectrum(mine)
@@ -128,7 +132,8 @@ class Source(Drawable, ContentEquality):
                 wavelength, flux, mine.name, mine.origin, mine.notes,
                 messages=mine.messages, measured_nm=mine.measured_nm, unscaled=mine.unscaled,
             )  # fmt: skip
-        entry = catalogue.find(name)
+        entry = catalogue.embedded(name)
+        assert entry is not None
         table = catalogue.spectrum_table(entry["file"])
         noisy = entry["noisy_below_nm"]
         return cls(

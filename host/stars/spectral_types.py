@@ -7,7 +7,7 @@ import re
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
-from .catalogue import library_table
+from .catalogue import entries
 
 #: Spectral classes in order of decreasing temperature.
 CLASSES = "OBAFGKM"
@@ -27,13 +27,14 @@ def subtype(spectral_type: str) -> float:
     return 10.0 * CLASSES.index(matched[1]) + (5.0 if matched[2] is None else float(matched[2]))
 
 
+def as_type(text: str) -> str | None:
+    """Return the spectral type of a dwarf or subgiant that a text names, as in "M3.5V" for "m3.5", or None."""
+    found = re.fullmatch(rf"d?([{CLASSES}])(\d(?:\.\d+)?)(IV|V)?", "".join(text.split()), flags=re.IGNORECASE)
+    return None if found is None else f"{found[1]}{found[2]}{found[3] or 'V'}".upper()
+
+
 def nearest_spectrum(spectral_type: str) -> str:
     """Return the name of the embedded spectrum of the nearest type; of several, the first in the library."""
     wanted = subtype(spectral_type)
-    table = library_table()
-    names = [
-        (str(row["name"]), str(row["spectral_type"]))
-        for row in table
-        if str(row["kept"]) == "embedded" and _TYPE.match(str(row["spectral_type"]))
-    ]
+    names = [(one["name"], one["spectral_type"]) for one in entries() if _TYPE.match(one["spectral_type"])]
     return min(names, key=lambda one: abs(subtype(one[1]) - wanted))[0]

@@ -36,13 +36,13 @@ def question_values(study: Study, *, detects: bool) -> None:
     """
     from mauvecl.host.instrument.paths import instrument_path
     from mauvecl.host.stars.band_names import known_band
+    from mauvecl.host.stars.star_names import spectrum_name
     from mauvecl.results.requests.fap_checks import check_fap
     from mauvecl.statistics.names import check_statistic
-    from mauvecl.study.star_names import check_spectrum
 
     for star in study.star:
         if star.library is not None:
-            check_spectrum(star.library)
+            spectrum_name(star.library)
         elif star.file is not None:
             _check_file(star.file)
         known_band(star.band)

@@ -44,7 +44,7 @@ def study_of(
 
 def is_star(given: Path) -> bool:
     """Return whether the argument of the study is a star: a name of the library or a spectrum file."""
-    from mauvecl.study.star_names import has_spectrum, well_known
+    from mauvecl.host.stars.star_names import resolve
 
     text = str(given)
     if given.suffix.lower() == ".toml" or given.is_dir():
@@ -52,7 +52,8 @@ def is_star(given: Path) -> bool:
     if not _is_there(text):
         # The first name decides; a wrong name among others has its own message.
         first = text.split(",")[0].strip()
-        return bool(first) and (has_spectrum(first) or well_known(first) is not None)
+        star = resolve(first) if first else None
+        return star is not None and not (star.spectrum is None and star.known is None)
     if given.suffix.lower() == ".ecsv":
         return not holds_study(given)
     return not given.is_file() or not _is_toml(given)

@@ -180,11 +180,10 @@ class Star(Section):
         from dataclasses import replace
 
         from mauvecl.host.stars.source import Source
-        from mauvecl.study.star_names import check_spectrum
+        from mauvecl.host.stars.star_names import spectrum_name
 
         if self.library is not None:
-            check_spectrum(self.library)
-            source = Source.from_library(self.library)
+            source = Source.from_library(spectrum_name(self.library))
         else:
             source = Source.read(
                 self.file or "", wavelength_unit=self.wavelength_unit, flux_unit=self.flux_unit, extend=self.extend
@@ -355,9 +354,14 @@ class SkyLight(Section):
     ] = None
     target: Annotated[
         str | None,
-        Help("Coordinates whose zodiacal light is the sky, with the time", "such as '290.68 +11.12'"),
+        Help("Target whose zodiacal light is the sky, with the time", "a star such as 'AU Mic', or '290.68 +11.12'"),
         Flag("--target"),
-        Widget(label="Target", hint="Coordinates in degrees such as 290.68 +11.12.", group="Sky", place=1),
+        Widget(
+            label="Sky target",
+            hint="A star by name, such as AU Mic, or coordinates in degrees such as 290.68 +11.12.",
+            group="Sky",
+            place=1,
+        ),
     ] = None
     time: Annotated[
         str | None,

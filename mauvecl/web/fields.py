@@ -6,12 +6,12 @@ import itertools
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any, Literal, NamedTuple, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
-from mauvecl.host.stars.catalogue import embedded, library_table
+from mauvecl.host.stars.catalogue import embedded
+from mauvecl.host.stars.star_names import spectrum_name
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Slider, Unit, Widget, first, found, range_of, unit_of
 from mauvecl.schema.physical import LineFraction
@@ -145,12 +145,7 @@ def star_name(text: str) -> str:
         return UPLOADED
     if not text.strip():
         raise InputError("no star is chosen", "a name of the library, or an upload", key="star", value=text)
-    entry = embedded(_spaced().get(_key(text), text))
-    if entry is None:
-        raise InputError(
-            f"{shortened(text)} is not in the library", "a name such as G2V, HD 40307 or Vega", key="star", value=text
-        )
-    return entry["name"]
+    return spectrum_name(text, own=False)
 
 
 def seen_target(text: str) -> str:
@@ -168,24 +163,6 @@ def seen_target(text: str) -> str:
             value=text,
         ) from error
     return text
-
-
-def star_names() -> list[str]:
-    """Return the distinct names of all embedded stars."""
-    rows = [row for row in library_table() if row["kept"] == "embedded"]
-    names = [str(row[column]) for row in rows for column in ("name", "alias", "star")]
-    # A collection's name in front of a type says nothing that the type does not.
-    return [name for name in dict.fromkeys(names) if name and not name.startswith("Pickles ")]
-
-
-def _key(name: str) -> str:
-    return "".join(name.split()).casefold()
-
-
-@cache
-def _spaced() -> dict[str, str]:
-    """Normalise the case and spacing of a name, as in GJ581, gj 581 and GJ  581."""
-    return {_key(name): name for name in star_names()}
 
 
 def star_words(name: str) -> str:

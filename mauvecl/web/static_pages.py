@@ -54,6 +54,7 @@ def front() -> bytes:
     """Return the page."""
     from mako.lookup import TemplateLookup
 
+    from mauvecl.host.stars.star_names import all_names
     from mauvecl.web import fields
     from mauvecl.web.figures import DASHES, INKS
     from mauvecl.web.state import SEEN
@@ -69,7 +70,7 @@ def front() -> bytes:
             for name, field in fields.FIELDS.items()
             if (s := field.slider) is not None
         },
-        "stars": [*fields.star_names()],
+        "stars": all_names(),
         "uploads": {"star": fields.UPLOADED, "own_unknown": fields.UPLOADED_UNKNOWN},
         "under": fields.ASKED_UNDER,
         "presets": fields.PRESETS,

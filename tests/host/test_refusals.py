@@ -124,7 +124,7 @@ SKIES: list[Row] = [
     *each(
         lambda target: Sky.at(target, DAY),
         "target",
-        *("18 Sco", "290 -95", "", "nan nan", SkyCoord(np.nan * u.deg, 4 * u.deg)),
+        *("18 Sko", "290 -95", "", "nan nan", SkyCoord(np.nan * u.deg, 4 * u.deg)),
         facts=(ICRS,),
     ),
     (lambda: Sky.at("700 10", DAY), "target", "0 to 360 degrees"),

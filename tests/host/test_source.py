@@ -42,7 +42,8 @@ def test_library_is_small_and_complete() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_each_spectrum_is_usable_and_has_an_origin(name: str) -> None:
-    entry = catalogue.find(name)
+    entry = catalogue.embedded(name)
+    assert entry is not None
     assert all(entry[field] for field in ("origin", "citation", "licence", "treatment", "uv_quality"))
     source = Source.from_library(name)
     assert source.wavelength_nm[0] <= 180
