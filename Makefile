@@ -5,7 +5,7 @@ BIN := .venv/bin
 # Compiled files are kept whatever the shell says: the tests start Python some hundred times.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo check quick test lowest lint docs mutants clean
+.PHONY: demo check quick test lowest lint docs dist mutants clean
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "mauvecl needs Python 3.11 or newer, found " + sys.version.split()[0])'
@@ -53,8 +53,17 @@ lowest: .venv/test.stamp
 	$(BIN)/uv pip install --quiet --python build/lowest/bin/python --constraint build/lowest.txt '.[test]'
 	OPENBLAS_NUM_THREADS=1 build/lowest/bin/python -m pytest --dist loadfile -n 2 -q -m 'not long' --ignore tests/test_golden.py
 
+# Wheel and sdist, twice: the same files give the same bytes.
+dist: .venv/dist.stamp
+	rm -rf dist build/again
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/python -m build --outdir build/again .
+	diff -r dist build/again
+	$(BIN)/twine check --strict dist/*
+	cd dist && sha256sum *
+
 mutants: .venv/test.stamp
 	$(BIN)/python tools/mutation_check.py
 
 clean:
-	rm -rf .venv demo build docs/_build docs/_generated docs/jupyter_execute *.egg-info
+	rm -rf .venv demo build dist docs/_build docs/_generated docs/jupyter_execute *.egg-info

@@ -1,18 +1,18 @@
 """Sphinx configuration."""
 
-from importlib.metadata import version as installed
 from pathlib import Path
 
 from astropy.table import Table
 from pydantic import BaseModel
 
 from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.version import VERSION
 from mauvecl.schema.reference import keys_of
 from mauvecl.study.study import Study
 
 project = "mauvecl"
 author = "the mauvecl developers"
-release = version = installed("mauvecl")
+release = version = VERSION
 extensions = [
     "myst_nb",
     "numpydoc",
