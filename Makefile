@@ -5,7 +5,7 @@ BIN := .venv/bin
 # Compiled files are kept whatever the shell says: the tests start Python some hundred times.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo check quick test lowest lint docs dist mutants clean
+.PHONY: demo check quick test lowest lint page docs dist mutants clean
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "mauvecl needs Python 3.11 or newer, found " + sys.version.split()[0])'
@@ -32,6 +32,18 @@ lint: .venv/test.stamp .venv/lint.stamp
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/mypy
+	@if command -v npm >/dev/null && $(MAKE) --silent $(PAGE)/.stamp; then $(MAKE) --no-print-directory page; \
+	else echo "the page's script is not checked: that needs npm (Debian, Ubuntu: apt-get install npm) and its packages"; fi
+
+# Style and types of the page's script; the page itself needs no package of npm's.
+PAGE := tools/page/node_modules
+page: $(PAGE)/.stamp
+	$(PAGE)/.bin/eslint --config tools/page/eslint.config.js mauvecl/web/assets
+	$(PAGE)/.bin/tsc --project tools/page/jsconfig.json
+
+$(PAGE)/.stamp: tools/page/package-lock.json
+	@cd tools/page && npm ci --silent
+	@touch $@
 
 # While editing: checks of two minutes on two cores. Types are checked while the tests run.
 check: .venv/test.stamp .venv/lint.stamp
@@ -66,4 +78,4 @@ mutants: .venv/test.stamp
 	$(BIN)/python tools/mutation_check.py
 
 clean:
-	rm -rf .venv demo build dist docs/_build docs/_generated docs/jupyter_execute *.egg-info
+	rm -rf .venv tools/page/node_modules demo build dist docs/_build docs/_generated docs/jupyter_execute *.egg-info

@@ -1,19 +1,20 @@
+// @ts-check
 // The answer card, the notices below it, and what fades where there is no answer.
 
-const byId = id => document.getElementById(id)
+import {byId, element, every} from "./dom.js"
 
-function element(tag, text, more = {}) {
-  return Object.assign(document.createElement(tag), {textContent: text, ...more})
-}
+/** @typedef {import("./protocol.js").Answer} Answer */
 
 export class Card {
   constructor() {
     this.box = byId("card")
     this.message = this.box.querySelector(".message")
+    /** @type {Set<string>} */
     this.dismissed = new Set()
     this.unfolded = false
   }
 
+  /** @param {boolean} busy */
   busy(busy) {
     this.box.setAttribute("aria-busy", String(busy))
   }
@@ -21,14 +22,16 @@ export class Card {
   // What is shown is no answer to what is entered.
   fade() {
     this.busy(true)
-    for (const part of [this.message, byId("facts"), ...document.querySelectorAll(".pictures, .rows")]) part.classList.add("dim")
+    for (const part of [this.message, byId("facts"), ...every(".pictures, .rows")]) part.classList.add("dim")
   }
 
-  // The pictures of a tab are those of the answer; other tabs may still hold an earlier one's.
+  /** The pictures of a tab are those of the answer; other tabs may still hold an earlier one's.
+   * @param {string} tab */
   fresh(tab) {
-    for (const part of document.querySelectorAll(`#panel-${tab} :is(.pictures, .rows)`)) part.classList.remove("dim")
+    for (const part of every(`#panel-${tab} :is(.pictures, .rows)`)) part.classList.remove("dim")
   }
 
+  /** @param {Answer} answer */
   tell(answer) {
     this.box.classList.remove("none")
     this.box.style.minHeight = ""
@@ -40,6 +43,7 @@ export class Card {
     this.busy(false)
   }
 
+  /** @param {string} why */
   none(why) {
     // What is below stays where it is.
     this.box.style.minHeight = `${this.box.offsetHeight}px`
@@ -52,26 +56,33 @@ export class Card {
     this.busy(false)
   }
 
+  /**
+   * @param {number} share
+   * @param {string} message
+   */
   progress(share, message, idle = false) {
     byId("progress").value = share
     byId("progress").classList.toggle("idle", idle)
     byId("status").textContent = message
   }
 
+  /** @param {string} text */
   ended(text) {
     this.progress(0, text, true)
   }
 
-  // The small table of a tab.
+  /** The small table of a tab.
+   * @param {string} tab
+   * @param {string[][]} rows */
   rows(tab, rows) {
-    const box = document.querySelector(`#panel-${tab} .rows`)
+    const box = every(`#panel-${tab} .rows`)[0]
     if (!box) return
     box.hidden = rows.length === 0
     const table = document.createElement("table")
     rows.forEach((cells, k) => {
       const row = table.insertRow()
       for (const text of cells) {
-        const cell = document.createElement(k ? "td" : "th")
+        const cell = element(k ? "td" : "th")
         if (!k) cell.scope = "col"
         cell.textContent = text
         row.append(cell)
@@ -80,14 +91,15 @@ export class Card {
     box.replaceChildren(table)
   }
 
-  // Sentences that can be put away; one that was stays away as long as it is the same.
+  /** Sentences that can be put away; one that was stays away as long as it is the same.
+   * @param {[string, string][]} message */
   notices(message) {
     const box = byId("notices")
     const shown = message.filter(([text]) => !this.dismissed.has(text))
     const key = JSON.stringify(shown)
     if (box.dataset.key === key) return
     box.dataset.key = key
-    const item = ([text, kind]) => {
+    const item = (/** @type {[string, string]} */ [text, kind]) => {
       const made = element("li", "", {className: kind}), away = element("button", "×", {type: "button", className: "plain"})
       away.setAttribute("aria-label", `Put away: ${text.slice(0, 60)}`)
       away.onclick = () => { this.dismissed.add(text); made.remove() }

@@ -1,16 +1,27 @@
+// @ts-check
 // Scenarios that are pinned, side by side, and what was simulated; the browser's tab keeps them.
 
+import {byId, element} from "./dom.js"
 import {dashed} from "./pictures.js"
+
+/** @typedef {import("./protocol.js").Entered} Entered */
+/**
+ * A question with its answer: its slot is how pictures draw it, and at is when it was simulated.
+ * @typedef {{link: string, entered: Entered, files: string, shown: string, interval: string, words: string,
+ *   facts: [string, string][], slot?: number, at?: string}} Scenario
+ */
 
 const MOST = 8
 const KEY = "mauvecl-compare"
+/** @type {[string, (entered: Entered) => string][]} */
 const ROWS = [
   ["Star", e => e.star], ["Magnitude", e => `${e.band} = ${e.magnitude}`], ["Flare", e => `${e.amplitude_percent} %`],
   ["Flare's spectrum", e => spectrum(e)], ["Exposure", e => `${e.exposure_s} s`],
   ["Statistic", e => e.statistic], ["False-alarm probability", e => e.fap], ["Unknown", e => e.unknown],
 ]
 
-// The flare's light in a few words; scenarios that were kept before may lack fields.
+/** The flare's light in a few words; scenarios that were kept before may lack fields.
+ * @param {Entered} entered */
 function spectrum(entered) {
   const second = entered.second_temperature_k
   const parts = [`${entered.flare_temperature_k} K`, entered.balmer_jump && `jump ${entered.balmer_jump}`,
@@ -18,26 +29,26 @@ function spectrum(entered) {
   return parts.filter(Boolean).join(", ")
 }
 
-function element(tag, text, more = {}) {
-  const made = document.createElement(tag)
-  if (text !== null) made.textContent = text
-  Object.assign(made, more)
-  return made
-}
-
 export class Compare {
-  // pins: how pinned scenarios are drawn, by theme; open(link): show a scenario again; changed(): others are pinned.
+  /**
+   * @param {Record<string, [string, string][]>} pins how pinned scenarios are drawn, by theme
+   * @param {(link: string) => void} open show a scenario again
+   * @param {() => void} changed others are pinned
+   */
   constructor(pins, open, changed) {
-    Object.assign(this, {pins, open, changed})
+    this.pins = pins
+    this.open = open
+    this.changed = changed
+    /** @type {{pinned: Scenario[], history: Scenario[]}} */
+    this.kept = {pinned: [], history: []}
     window.addEventListener("mauvecl-theme", () => this.show())
     try {
-      this.kept = JSON.parse(sessionStorage.getItem(KEY)) ?? {pinned: [], history: []}
-    } catch {
-      this.kept = {pinned: [], history: []}
-    }
+      this.kept = JSON.parse(sessionStorage.getItem(KEY)) ?? this.kept
+    } catch { /* not kept */ }
     this.show()
   }
 
+  /** @param {Scenario} scenario */
   pin(scenario) {
     this.kept.pinned = [...this.kept.pinned.filter(one => one.link !== scenario.link), scenario].slice(-MOST)
     this.keep()
@@ -49,20 +60,22 @@ export class Compare {
     return this.drawn.flatMap((one, slot) => {
       if (!one) return []
       const {star, band, magnitude, amplitude_percent, exposure_s} = one.entered
-      const message = element("span", null)
-      message.innerHTML = dashed(...look[slot])
+      const message = element("span")
+      message.innerHTML = dashed(look[slot])
       message.append(`${slot + 1}: ${star}, ${band} = ${magnitude}, ${amplitude_percent} %, ${exposure_s} s`)
       return message
     })
   }
 
-  // Those that pictures show, by their slots: a scenario keeps its colour as long as it is pinned.
+  /** Those that pictures show, by their slots: a scenario keeps its colour as long as it is pinned.
+   * @returns {(Scenario | undefined)[]} */
   get drawn() {
     const slots = this.pins.light.map((_, k) => this.kept.pinned.find(one => one.slot === k))
     const others = this.kept.pinned.filter(one => !slots.includes(one))
     return slots.map((one, slot) => one ?? (others.length ? Object.assign(others.shift(), {slot}) : undefined))
   }
 
+  /** @param {Scenario} scenario */
   ran(scenario) {
     this.kept.history = [scenario, ...this.kept.history.filter(one => one.link !== scenario.link)].slice(0, 20)
     this.keep()
@@ -76,6 +89,11 @@ export class Compare {
     this.changed()
   }
 
+  /**
+   * @param {string} text
+   * @param {string} called
+   * @param {() => void} act
+   */
   button(text, called, act) {
     const made = element("button", text, {type: "button", className: "plain", onclick: act})
     made.setAttribute("aria-label", called)
@@ -85,22 +103,22 @@ export class Compare {
   show() {
     const {pinned, history} = this.kept
     const drawn = this.drawn, look = this.pins[document.documentElement.dataset.theme]
-    const box = document.getElementById("pinned")
+    const box = byId("pinned")
     if (pinned.length) {
-      const table = element("table", null)
+      const table = element("table")
       table.append(element("caption", "Pinned scenarios", {className: "quiet"}))
-      const row = (head, cells) => {
-        const made = element("tr", null)
+      const row = (/** @type {string} */ head, /** @type {Element[]} */ cells) => {
+        const made = element("tr")
         made.append(element("th", head, {scope: "row"}), ...cells)
         table.append(made)
       }
       row("Drawn as", pinned.map(one => {
         const slot = drawn.indexOf(one), cell = element("td", slot < 0 ? "not drawn" : `pinned ${slot + 1} `)
-        if (slot >= 0) cell.insertAdjacentHTML("beforeend", dashed(...look[slot]))
+        if (slot >= 0) cell.insertAdjacentHTML("beforeend", dashed(look[slot]))
         return cell
       }))
       row("Detected", pinned.map(one => {
-        const cell = element("td", null)
+        const cell = element("td")
         cell.append(element("strong", one.shown))
         return cell
       }))
@@ -110,7 +128,7 @@ export class Compare {
         row(head, pinned.map(one => element("td", Object.fromEntries(one.facts)[head] ?? "")))
       }
       row("", pinned.map((one, k) => {
-        const cell = element("td", null)
+        const cell = element("td")
         cell.append(
           this.button("Open", `Open scenario ${k + 1}`, () => this.open(one.link)),
           this.button("Remove", `Remove scenario ${k + 1}`, () => {
@@ -124,8 +142,8 @@ export class Compare {
     } else {
       box.replaceChildren(element("p", "Nothing is pinned yet: Pin keeps the present question and its answer here."))
     }
-    document.getElementById("no-history").hidden = history.length > 0
-    document.getElementById("history").replaceChildren(...history.map((one, k) => {
+    byId("no-history").hidden = history.length > 0
+    byId("history").replaceChildren(...history.map((one, k) => {
       const item = element("li", `${one.at}: ${one.shown} (${one.interval}), ${one.words} `)
       item.append(this.button("Open", `Open run ${history.length - k}`, () => this.open(one.link)))
       return item

@@ -1,8 +1,14 @@
+// @ts-check
 // What visitors take along: tables, studies, pictures, commands, programs, and the link.
 
-const byId = id => document.getElementById(id)
+import {byId, every} from "./dom.js"
 
-// Save content as a file.
+/** @typedef {import("./protocol.js").Live} Live */
+/** @typedef {import("./routing.js").Routing} Routing */
+
+/** Save content as a file.
+ * @param {string} name
+ * @param {Blob | ArrayBuffer} content */
 export function give(name, content) {
   const link = document.createElement("a")
   link.href = URL.createObjectURL(content instanceof Blob ? content : new Blob([content]))
@@ -11,6 +17,7 @@ export function give(name, content) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000)
 }
 
+/** @param {HTMLButtonElement} button */
 async function copy(button) {
   const from = button.dataset.copy
   const text = from === "address" ? window.location.href : byId(from).textContent
@@ -26,17 +33,31 @@ async function copy(button) {
 }
 
 export class Export {
-  // offer(): what can be done now is shown again; refused(why): it could not be made.
+  /**
+   * @param {Live} live
+   * @param {Routing} routing
+   * @param {() => void} offer show again which buttons can be pressed
+   * @param {(why: string) => void} refused it could not be made
+   */
   constructor(live, routing, offer, refused) {
-    Object.assign(this, {live, routing, offer, refused})
+    this.live = live
+    this.routing = routing
+    this.offer = offer
+    this.refused = refused
     byId("study").onclick = () => this.take("", "study", "study", byId("study"))
-    for (const button of document.querySelectorAll("[data-file]")) {
+    for (const button of every("[data-file]")) {
       const tab = button.closest("[role=tabpanel]").id.replace("panel-", "")
       button.onclick = () => this.take(tab, button.dataset.file, button.dataset.ending, button)
     }
-    for (const button of document.querySelectorAll("[data-copy]")) button.onclick = () => copy(button)
+    for (const button of every("[data-copy]")) button.onclick = () => copy(button)
   }
 
+  /**
+   * @param {string} tab
+   * @param {string} name
+   * @param {string} ending
+   * @param {HTMLButtonElement} button
+   */
   take(tab, name, ending, button) {
     button.disabled = true
     const n = this.live.ask("file", {link: this.routing.link, tab, name, ending}, (message, content) => {

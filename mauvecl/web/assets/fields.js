@@ -1,20 +1,35 @@
+// @ts-check
 // Fields of the page: entered text, valid or not, sliders, the list of stars, and files.
 
-const byId = id => document.getElementById(id)
+import {byId, every} from "./dom.js"
+
+/** @typedef {import("./protocol.js").Entered} Entered */
+/** @typedef {import("./protocol.js").Faults} Faults */
+/** @typedef {import("./protocol.js").Words} Words */
+
+/** Steps of the arrow keys.
+ * @type {Record<string, number>} */
+const steps = {ArrowUp: 1, ArrowDown: -1}
 
 // Conversion between a slider's position and the value, with as many digits as needed.
 class Scale {
+  /** @param {Words["sliders"][string]} slider */
   constructor({low, high, step, log}) {
-    Object.assign(this, {low, high, step, log})
+    this.low = low
+    this.high = high
+    this.step = step
+    this.log = log
     this.count = Math.round(log ? Math.log(high / low) / Math.log(step) : (high - low) / step)
   }
 
+  /** @param {number} place */
   value(place) {
     if (this.log) return String(Number((this.low * this.step ** place).toPrecision(2)))
     const digits = Math.max(0, -Math.floor(Math.log10(this.step) + 1e-9))
     return (this.low + place * this.step).toFixed(digits).replace(/\.?0+$/, digits ? "" : "$&")
   }
 
+  /** @param {number} value */
   place(value) {
     const found = this.log ? Math.log(value / this.low) / Math.log(this.step) : (value - this.low) / this.step
     return Math.min(Math.max(Math.round(found), 0), this.count)
@@ -22,16 +37,21 @@ class Scale {
 }
 
 export class Fields {
-  // changed(name, last, other): a field was used; last says whether it is done with, other whether its text is another.
-  // chosen(field, file): a file.
+  /**
+   * @param {Words} words
+   * @param {(name: string, last: boolean, other: boolean) => void} changed a field was used; last says whether it is done
+   *   with, other whether its text is another
+   * @param {(field: string, file: File) => void} chosen
+   */
   constructor(words, changed, chosen) {
     this.words = words
     this.changed = changed
     this.entered = {...words.fields}
+    /** @type {Record<string, Scale>} */
     this.scales = {}
     for (const name of Object.keys(words.fields)) this.wire(name)
-    for (const button of document.querySelectorAll("[data-choose]")) {
-      const file = document.querySelector(`[data-upload="${button.dataset.choose}"]`)
+    for (const button of every("[data-choose]")) {
+      const [file] = every(`[data-upload="${button.dataset.choose}"]`)
       button.addEventListener("click", () => file.click())
       file.addEventListener("change", () => {
         const [one] = file.files
@@ -44,23 +64,24 @@ export class Fields {
     this.show()
   }
 
+  /** @param {string} name */
   wire(name) {
     const field = byId(`f-${name}`)
     const isSelect = field.tagName === "SELECT"
     if (!isSelect) field.addEventListener("input", () => this.take(name, false))
     field.addEventListener("change", () => this.take(name, true))
-    const slider = document.querySelector(`[data-slider="${name}"]`)
+    const [slider] = every(`[data-slider="${name}"]`)
     if (!slider) return
     const scale = this.scales[name] = new Scale(this.words.sliders[name])
     slider.max = String(scale.count)
-    const move = last => {
+    const move = (/** @type {boolean} */ last) => {
       field.value = scale.value(Number(slider.value))
       this.take(name, last)
     }
     slider.addEventListener("input", () => move(false))
     slider.addEventListener("change", () => move(true))
-    field.addEventListener("keydown", event => {
-      const step = {ArrowUp: 1, ArrowDown: -1}[event.key]
+    field.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => {
+      const step = steps[event.key]
       const value = Number(field.value)
       if (!step || !(Math.abs(value) >= 0)) return
       event.preventDefault()
@@ -69,10 +90,16 @@ export class Fields {
     })
   }
 
+  /** @param {string} name
+   * @returns {string} */
   label(name) {
     return document.querySelector(`label[for="f-${name}"]`)?.textContent ?? name
   }
 
+  /**
+   * @param {string} name
+   * @param {boolean} last
+   */
   take(name, last) {
     const text = byId(`f-${name}`).value
     const other = text !== this.entered[name]
@@ -82,7 +109,8 @@ export class Fields {
     this.aside(name)
   }
 
-  // Enter several at once, as a preset, a link or a click on a picture does.
+  /** Enter several at once, as a preset, a link or a click on a picture does.
+   * @param {Entered} given */
   put(given) {
     Object.assign(this.entered, given)
     this.possible()
@@ -102,9 +130,10 @@ export class Fields {
     }
   }
 
-  // Elements that accompany a field: its slider, and fields that apply to one choice of sky only.
+  /** Elements that accompany a field: its slider, and fields that apply to one choice of sky only.
+   * @param {string} name */
   aside(name) {
-    const slider = document.querySelector(`[data-slider="${name}"]`)
+    const [slider] = every(`[data-slider="${name}"]`)
     if (slider) {
       const value = Number(this.entered[name])
       if (this.entered[name].trim() && Number.isFinite(value)) {
@@ -115,7 +144,7 @@ export class Fields {
     }
     if (name === "sky") {
       for (const [other, sky] of Object.entries(this.words.under)) {
-        document.querySelector(`[data-field="${other}"]`).hidden = this.entered.sky !== sky
+        every(`[data-field="${other}"]`)[0].hidden = this.entered.sky !== sky
       }
     }
   }
@@ -124,7 +153,7 @@ export class Fields {
   possible() {
     const fap = Number(this.entered.fap)
     const field = byId("f-realisations")
-    const settles = text => text.endsWith("sampled") || Number(text) * fap >= 100 * (1 - 1e-9)
+    const settles = (/** @type {string} */ text) => text.endsWith("sampled") || Number(text) * fap >= 100 * (1 - 1e-9)
     for (const option of field.options) option.disabled = fap > 0 && !settles(option.value)
     if (fap > 0 && !settles(this.entered.realisations)) {
       const wanted = [...field.options].find(option => !option.disabled)
@@ -132,7 +161,8 @@ export class Fields {
     }
   }
 
-  // Error messages at their fields; an invalid field is never hidden.
+  /** Error messages at their fields; an invalid field is never hidden.
+   * @param {Faults} faults */
   tell(faults) {
     for (const name of Object.keys(this.words.fields)) {
       const field = byId(`f-${name}`)
@@ -151,8 +181,18 @@ export class Fields {
 
 // List below the field of stars with the names that contain the typed text.
 class Stars {
+  /**
+   * @param {HTMLInputElement} field
+   * @param {HTMLElement} list
+   * @param {string[]} names
+   * @param {() => void} chosen
+   */
   constructor(field, list, names, chosen) {
-    Object.assign(this, {field, list, names, chosen, at: -1})
+    this.field = field
+    this.list = list
+    this.names = names
+    this.chosen = chosen
+    this.at = -1
     field.addEventListener("input", () => this.open(field.value))
     field.addEventListener("focus", () => field.select())
     field.addEventListener("click", () => { if (list.hidden) this.open("") })
@@ -161,10 +201,12 @@ class Stars {
     // Before the field loses the focus.
     list.addEventListener("mousedown", event => {
       event.preventDefault()
-      if (event.target.role === "option") this.choose(event.target)
+      const item = /** @type {HTMLElement} */ (event.target)
+      if (item.role === "option") this.choose(item)
     })
   }
 
+  /** @param {string} text */
   open(text) {
     const wanted = text.trim().toLowerCase()
     const found = this.names.filter(name => name.toLowerCase().includes(wanted))
@@ -181,6 +223,7 @@ class Stars {
     this.show(found.length > 0 && !(found.length === 1 && found[0].toLowerCase() === wanted))
   }
 
+  /** @param {boolean} open */
   show(open) {
     this.list.hidden = !open
     this.field.setAttribute("aria-expanded", String(open))
@@ -189,8 +232,9 @@ class Stars {
 
   close() { this.show(false) }
 
+  /** @param {KeyboardEvent} event */
   key(event) {
-    const step = {ArrowDown: 1, ArrowUp: -1}[event.key]
+    const step = -steps[event.key]
     if (step) {
       event.preventDefault()
       if (this.list.hidden) this.open("")
@@ -209,6 +253,7 @@ class Stars {
     } else if (event.key === "Escape") this.close()
   }
 
+  /** @param {Element} item */
   choose(item) {
     this.field.value = item.textContent
     this.close()

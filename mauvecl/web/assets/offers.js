@@ -1,8 +1,14 @@
+// @ts-check
 // Buttons: which of them can be pressed now.
 
-const byId = id => document.getElementById(id)
+import {byId, every} from "./dom.js"
 
-// Enable what the answer allows; null stands for no answer.
+/** Enable what the answer allows.
+ * @param {import("./protocol.js").Answer | null} answer
+ * @param {boolean} busy
+ * @param {import("./protocol.js").Entered} entered
+ * @param {import("./protocol.js").Words["tabs"]} tabs
+ */
 export function offer(answer, busy, entered, tabs) {
   const ready = answer !== null
   const simulated = new Set(answer?.simulated ?? [])
@@ -10,20 +16,20 @@ export function offer(answer, busy, entered, tabs) {
   byId("cancel").disabled = !busy
   byId("pin").disabled = !ready
   byId("study").disabled = !ready
-  for (const button of document.querySelectorAll("[data-simulate]")) {
+  for (const button of every("[data-simulate]")) {
     const lacks = ["visible", "plan"].includes(button.dataset.simulate) && !entered.see.trim()
     button.disabled = !ready || busy || lacks
   }
   for (const tab of Object.values(tabs)) {
     for (const [name, needs] of Object.entries(tab.files)) {
-      for (const button of document.querySelectorAll(`[data-file="${name}"]`)) {
+      for (const button of every(`[data-file="${name}"]`)) {
         button.disabled = !ready || (needs !== null && !simulated.has(needs))
       }
     }
   }
-  for (const hint of document.querySelectorAll("[data-needs]")) {
-    const lacking = hint.dataset.needs.split(" ").filter(kind => !simulated.has(kind))
-    const buttons = lacking.map(kind => document.querySelector(`[data-simulate="${kind}"]`) ?? byId("simulate"))
-    hint.textContent = lacking.length ? `after ${buttons.map(button => button.textContent).join(", ")}` : ""
+  for (const hint of every("[data-needs]")) {
+    const lacking = hint.dataset.needs.split(" ").filter((/** @type {string} */ kind) => !simulated.has(kind))
+    const buttons = lacking.map((/** @type {string} */ kind) => document.querySelector(`[data-simulate="${kind}"]`) ?? byId("simulate"))
+    hint.textContent = lacking.length ? `after ${buttons.map((/** @type {Element} */ button) => button.textContent).join(", ")}` : ""
   }
 }

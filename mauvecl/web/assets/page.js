@@ -1,7 +1,9 @@
+// @ts-check
 // The page sends the entered text to the server, and only shows the answer to it.
 
 import {Card} from "./card.js"
 import {Compare} from "./compare.js"
+import {byId, every} from "./dom.js"
 import {Export, give} from "./export.js"
 import {Fields} from "./fields.js"
 import {offer} from "./offers.js"
@@ -11,7 +13,13 @@ import {Routing} from "./routing.js"
 import {Simulations} from "./simulations.js"
 import {Uploads} from "./uploads.js"
 
-const byId = id => document.getElementById(id)
+/** @typedef {import("./protocol.js").Answer} Answer */
+/** @typedef {import("./protocol.js").Entered} Entered */
+/** @typedef {import("./protocol.js").Faults} Faults */
+/** @typedef {import("./protocol.js").Message} Message */
+/** @typedef {import("./protocol.js").Words} Words */
+
+/** @type {Words} */
 const words = JSON.parse(byId("words").textContent)
 //: Milliseconds without a change after which one exposure is drawn.
 const DRAW_MS = 500
@@ -20,6 +28,7 @@ const DRAWN = new Set(["detection", "spectrum"])
 
 class Page {
   constructor() {
+    /** @type {Answer | null} */
     this.answer = null
     this.asking = this.dirty = false
     this.card = new Card()
@@ -30,7 +39,7 @@ class Page {
     }, (field, file) => this.uploads.choose(field, file))
     this.routing = new Routing(words, this.fields.entered, () => this.moved(), () => this.ask())
     this.live = new Live(version => this.back(version), code => this.lost(code))
-    const refused = why => this.card.notices([[why, "danger"]])
+    const refused = (/** @type {string} */ why) => this.card.notices([[why, "danger"]])
     this.simulations = new Simulations(this.live, this.routing, this.card, {
       question: () => this.question, ready: () => this.answer !== null, offer: () => this.offer(),
       ended: () => this.simulated(), refused,
@@ -51,6 +60,7 @@ class Page {
     return JSON.stringify(this.fields.entered)
   }
 
+  /** @param {string} link */
   follow(link) {
     this.routing.follow(link)
     this.fields.show()
@@ -65,7 +75,9 @@ class Page {
     this.ask()
   }
 
-  // A field was changed: `last` is true at the end of a change, `other` if the question changes.
+  /** A field was changed.
+   * @param {boolean} last whether the change has ended
+   * @param {boolean} other whether the question is another */
   changed(last, other) {
     if (other) {
       this.routing.seen.simulated = ""
@@ -76,6 +88,7 @@ class Page {
     } else if (last) this.routing.editing = false
   }
 
+  /** @param {Entered} given */
   enter(given) {
     this.uploads.forget(Object.keys(given))
     this.fields.put(given)
@@ -92,7 +105,9 @@ class Page {
     this.offer()
   }
 
-  // The entered text has no answer.
+  /** The entered text has no answer.
+   * @param {Faults} faults
+   * @param {string} [refused] */
   none(faults, refused) {
     this.withdraw()
     document.title = "No answer: mauvecl"
@@ -100,6 +115,7 @@ class Page {
     this.card.none(refused ?? Object.entries(faults).map(([name, why]) => `${this.fields.label(name)}: ${why}`).join("; "))
   }
 
+  /** @param {Answer} answer */
   tell(answer) {
     this.answer = answer
     this.card.tell(answer)
@@ -143,15 +159,18 @@ class Page {
     })
   }
 
+  /** @param {Message} message */
   show(message) {
     this.fields.tell(message.faults)
     // Without an answer the notes of the last one keep their room, unseen: nothing jumps while a number is typed.
+    /** @type {[string, string][]} */
     const stray = message.stray ? [[message.stray, "stray"]] : []
     if (message.answer || message.stray) this.card.notices([...stray, ...(message.answer?.notes ?? [])])
     if (message.answer) this.tell(message.answer)
     else this.none(message.faults, message.refused)
   }
 
+  /** @param {Message} message */
   async draw(message) {
     this.card.rows(message.tab, message.rows)
     this.pinned()
@@ -167,7 +186,7 @@ class Page {
     const name = this.routing.seen.tab, tab = words.tabs[name]
     // A pinned upload is drawn as long as it is the one that is here.
     const pins = this.compare.drawn.map(pin => pin && pin.files === this.uploads.of(pin.entered) ? pin : undefined)
-    for (const box of document.querySelectorAll(".pins")) {
+    for (const box of every(".pins")) {
       box.hidden = !pins.some(Boolean)
       box.replaceChildren(box.firstElementChild, ...this.compare.key())
     }
@@ -214,13 +233,14 @@ class Page {
 
   // The connection
 
+  /** @param {string} version */
   back(version) {
     if (version !== words.version) {
       window.location.reload()
       return
     }
     byId("lost").hidden = true
-    for (const part of document.body.children) if (part.id !== "lost") part.inert = false
+    for (const part of every("body > :not(#lost)")) part.inert = false
     this.asking = false
     this.pins.clear()
     // What the server knew of this page is gone with the connection; the browser has it all.
@@ -228,6 +248,7 @@ class Page {
     if (!this.uploads.resend()) this.ask()
   }
 
+  /** @param {number} code */
   lost(code) {
     const unused = code === words.unused
     this.simulations.lost()
@@ -237,7 +258,7 @@ class Page {
       ? "This page was not used for a long time, and the server let it go."
       : "The connection to the server is lost. The page comes back by itself as soon as the server answers."
     byId("lost").hidden = false
-    for (const part of document.body.children) if (part.id !== "lost") part.inert = true
+    for (const part of every("body > :not(#lost)")) part.inert = true
     byId("go-on").hidden = !unused
     if (unused) byId("go-on").focus()
     else this.live.again()
@@ -249,24 +270,25 @@ class Page {
       this.card.ended("Pinned: see the tab Compare.")
     }
     byId("afresh").onclick = () => this.enter({...words.fields})
-    byId("preset").onchange = event => {
-      const given = words.presets[event.target.value]
+    byId("preset").onchange = () => {
+      const given = words.presets[byId("preset").value]
       if (given) this.enter({...words.fields, ...given})
-      event.target.value = ""
+      byId("preset").value = ""
     }
     byId("go-on").onclick = () => this.live.connect()
     byId("theme").onclick = () => {
+      /** @type {Record<string, string | null>} */
       const next = {system: "light", light: "dark", dark: null}
       window.chooseTheme(next[document.documentElement.dataset.chosen])
       const now = document.documentElement.dataset.chosen
       byId("theme").setAttribute("aria-label", `Colours: ${now === "system" ? "as the system has them" : now}`)
     }
     document.querySelector("form").onsubmit = event => event.preventDefault()
-    for (const button of document.querySelectorAll("[data-opens]")) {
+    for (const button of every("[data-opens]")) {
       const {opens} = button.dataset
       button.onclick = () => opens === "export" ? this.export.open() : byId(opens).showModal()
     }
-    for (const button of document.querySelectorAll("[data-closes]")) {
+    for (const button of every("[data-closes]")) {
       button.onclick = () => button.closest("dialog").close()
     }
     // On a phone the answer is first, and what can be changed is folded.

@@ -1,14 +1,55 @@
+// @ts-check
 // The connection to the server: numbered questions, their answers, and its end.
+
+/**
+ * Text of each field by name.
+ * @typedef {Record<string, string>} Entered
+ *
+ * Sentences on the text of fields, by name.
+ * @typedef {Record<string, string>} Faults
+ *
+ * Columns of numbers, as base64 of 32-bit floats, or of words, by name.
+ * @typedef {Record<string, string[] | {f4: string, shape: number[]}>} Columns
+ *
+ * Data of a picture: its words, columns by data source, and properties by model.
+ * @typedef {{text: string, sources: Record<string, Columns>, props: Record<string, Record<string, any>>}} Drawn
+ *
+ * The answer to a question, as the card shows it; notes are sentences with their kind.
+ * @typedef {{shown: string, interval: string, words: string, facts: [string, string][], notes: [string, string][],
+ *   simulated: string[]}} Answer
+ *
+ * A message of the server: which entries it has depends on what was asked.
+ * @typedef {{n: number, faults: Faults, stray: string, answer: Answer, refused: string, tab: string,
+ *   pictures: Record<string, Drawn>, rows: string[][], draws: boolean, ended: string, kind: string, progress: number,
+ *   message: string, lacks: string, entered: string, file: string, command: string, python: string,
+ *   pins: Record<string, Columns>, hello: string}} Message
+ *
+ * What the server says of a picture once.
+ * @typedef {{name: string, sets: string, logs: string[], pins: string, alike: string[]}} PictureWords
+ *
+ * Texts and limits that the page is served with.
+ * @typedef {{version: string, fields: Entered, seen: {tab: string, simulated: string}, stars: string[],
+ *   uploads: Record<string, string>, under: Record<string, string>, presets: Record<string, Entered>,
+ *   sliders: Record<string, {low: number, high: number, step: number, log: boolean}>,
+ *   tabs: Record<string, {pictures: PictureWords[], files: Record<string, string | null>}>,
+ *   pins: Record<string, [string, string][]>, most_uploaded: number, unused: number}} Words
+ */
 
 const AGAIN_MS = 1000
 
 export class Live {
-  // came: message what comes; back: called when there is a connection (again); lost: when there is none, with its code.
+  /**
+   * @param {(version: string) => void} back there is a connection, again or for the first time
+   * @param {(code: number) => void} lost there is none any more
+   */
   constructor(back, lost) {
     this.back = back
     this.lost = lost
     this.n = 0
+    /** @type {Map<number, (message: Message, content?: ArrayBuffer) => void>} */
     this.waiting = new Map()
+    /** @type {Message | null} */
+    this.head = null
     this.connect()
   }
 
@@ -34,7 +75,11 @@ export class Live {
     return this.socket.readyState === WebSocket.OPEN
   }
 
-  // Ask, and have `then` called with each message of the answer, and the bytes behind it.
+  /** Ask, and have `then` called with each message of the answer, and the bytes behind it.
+   * @param {string} what
+   * @param {Record<string, any>} more
+   * @param {(message: Message, content?: ArrayBuffer) => void} [then]
+   * @returns {number} */
   ask(what, more, then) {
     const n = ++this.n
     if (then) this.waiting.set(n, then)
@@ -42,10 +87,12 @@ export class Live {
     return n
   }
 
+  /** @param {ArrayBuffer} content */
   send(content) {
     if (this.open) this.socket.send(content)
   }
 
+  /** @param {string | ArrayBuffer} data */
   come(data) {
     if (typeof data !== "string") {
       const head = this.head
@@ -64,6 +111,7 @@ export class Live {
     }
   }
 
+  /** @param {number} n */
   done(n) {
     this.waiting.delete(n)
   }

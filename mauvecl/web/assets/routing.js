@@ -1,11 +1,22 @@
+// @ts-check
 // The address of the page: its question, the tab in front, and what was simulated, as the query of a link.
 
-const byId = id => document.getElementById(id)
+import {byId} from "./dom.js"
+
+/** @typedef {import("./protocol.js").Entered} Entered */
+/** @typedef {import("./protocol.js").Words} Words */
 
 export class Routing {
-  // entered: the text of the fields; moved(): the browser's history has led elsewhere; turned(): another tab is in front.
+  /**
+   * @param {Words} words
+   * @param {Entered} entered the text of the fields
+   * @param {() => void} moved the browser's history has led elsewhere
+   * @param {() => void} turned another tab is in front
+   */
   constructor(words, entered, moved, turned) {
-    Object.assign(this, {words, entered, turned})
+    this.words = words
+    this.entered = entered
+    this.turned = turned
     this.seen = {...words.seen}
     this.stray = ""
     this.editing = false
@@ -18,6 +29,7 @@ export class Routing {
 
   // The entered text as the query of a URL.
   get link() {
+    /** @type {Entered} */
     const first = {...this.words.fields, ...this.words.seen}
     const pairs = Object.entries({...this.entered, ...this.seen})
     return `?${new URLSearchParams(pairs.filter(([name, text]) => text !== "" || first[name] !== ""))}`
@@ -28,14 +40,15 @@ export class Routing {
     return this.seen.simulated.split(",").filter(Boolean)
   }
 
-  // Enter what a link holds; what is no field here is kept for the server, which says so.
+  /** Enter what a link holds; what is no field here is kept for the server, which says so.
+   * @param {string} link */
   follow(link) {
     const stray = new URLSearchParams()
     const entered = {...this.words.fields}
     this.seen = {...this.words.seen}
     for (const [name, text] of new URLSearchParams(link)) {
       if (name in entered) entered[name] = text
-      else if (name in this.seen) this.seen[name] = text
+      else if (name === "tab" || name === "simulated") this.seen[name] = text
       else stray.append(name, text)
     }
     if (!(this.seen.tab in this.words.tabs)) {
@@ -47,12 +60,14 @@ export class Routing {
     this.showTab()
   }
 
+  /** @param {boolean} push whether it is a step of the history */
   show(push) {
     if (this.link === window.location.search) return
     window.history[push ? "pushState" : "replaceState"]({}, "", window.location.pathname + this.link)
   }
 
-  // The question has changed. While something is being chosen the address follows; all of it is one step of the history.
+  /** The question has changed. While something is being chosen the address follows; all of it is one step of the history.
+   * @param {boolean} last */
   step(last) {
     this.show(!this.editing)
     this.editing = !last
@@ -70,6 +85,7 @@ export class Routing {
     }
   }
 
+  /** @param {string} name */
   toTab(name) {
     if (name === this.seen.tab) return
     this.seen.tab = name
@@ -83,12 +99,14 @@ export class Routing {
     const names = Object.keys(this.words.tabs)
     for (const name of names) {
       byId(`tab-${name}`).onclick = () => this.toTab(name)
-      byId(`tab-${name}`).onkeydown = event => {
+      byId(`tab-${name}`).onkeydown = (/** @type {KeyboardEvent} */ event) => {
         const at = names.indexOf(name)
-        const next = {
+        /** @type {Record<string, number>} */
+        const keys = {
           ArrowRight: (at + 1) % names.length, ArrowLeft: (at + names.length - 1) % names.length,
           Home: 0, End: names.length - 1,
-        }[event.key]
+        }
+        const next = keys[event.key]
         if (next === undefined) return
         event.preventDefault()
         byId(`tab-${names[next]}`).focus()

@@ -1,23 +1,40 @@
+// @ts-check
 // Simulations: one at a time, its progress, and those that are still wanted.
 
-const byId = id => document.getElementById(id)
+import {byId, every} from "./dom.js"
+
+/** @typedef {import("./card.js").Card} Card */
+/** @typedef {import("./protocol.js").Live} Live */
+/** @typedef {import("./routing.js").Routing} Routing */
 
 export class Simulations {
-  // ended(kind): its answer is here; refused(why): it is not.
-  constructor(live, routing, card, {question, ready, offer, ended, refused}) {
-    Object.assign(this, {live, routing, card, question, ready, offer, ended, refused})
+  /**
+   * @param {Live} live
+   * @param {Routing} routing
+   * @param {Card} card
+   * @param {{question(): string, ready(): boolean, offer(): void, ended(): void, refused(why: string): void}} page
+   *   the question; whether it has an answer; show which buttons can be pressed; a simulation's answer is there, or not
+   */
+  constructor(live, routing, card, page) {
+    this.live = live
+    this.routing = routing
+    this.card = card
+    this.page = page
+    /** @type {number | null} */
     this.running = null
+    /** @type {string[]} */
     this.wanted = []
     byId("simulate").onclick = () => this.start("detection")
     byId("cancel").onclick = () => this.drop()
-    for (const button of document.querySelectorAll("[data-simulate]")) {
+    for (const button of every("[data-simulate]")) {
       button.onclick = () => this.start(button.dataset.simulate)
     }
   }
 
+  /** @param {string} kind */
   start(kind) {
-    if (this.running !== null || !this.ready()) return
-    const question = this.question()
+    if (this.running !== null || !this.page.ready()) return
+    const question = this.page.question()
     this.card.progress(0, "waiting for its turn")
     const n = this.running = this.live.ask("simulate", {kind, link: this.routing.link}, message => {
       if (message.ended === undefined) {
@@ -27,15 +44,16 @@ export class Simulations {
       this.live.done(n)
       this.running = null
       this.card.ended(message.ended)
-      this.offer()
-      if (question !== this.question()) return
-      if (message.refused) this.refused(message.refused)
-      else if (message.kind) this.ended(message.kind)
+      this.page.offer()
+      if (question !== this.page.question()) return
+      if (message.refused) this.page.refused(message.refused)
+      else if (message.kind) this.page.ended()
     })
-    this.offer()
+    this.page.offer()
   }
 
-  // Start the next one that a link wants and that is not here.
+  /** Start the next one that a link wants and that is not here.
+   * @param {string[]} simulated */
   next(simulated) {
     this.wanted = this.wanted.filter(kind => !simulated.includes(kind))
     if (this.wanted.length && this.running === null) this.start(this.wanted.shift())

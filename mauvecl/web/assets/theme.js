@@ -1,3 +1,4 @@
+// @ts-check
 // Before anything is drawn: the colours that the visitor has chosen, or the system's.
 "use strict"
 {
@@ -9,7 +10,7 @@
     document.documentElement.dataset.chosen = chosen ?? "system"
     window.dispatchEvent(new Event("mauvecl-theme"))
   }
-  window.chooseTheme = name => {
+  window.chooseTheme = (/** @type {string | null} */ name) => {
     try {
       if (name === null) localStorage.removeItem("mauvecl-theme")
       else localStorage.setItem("mauvecl-theme", name)

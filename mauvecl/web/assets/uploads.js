@@ -1,23 +1,46 @@
+// @ts-check
 // Files of the visitor: they go to the server, and the browser keeps them for one that has lost them.
+
+/** @typedef {import("./protocol.js").Entered} Entered */
+/** @typedef {import("./protocol.js").Faults} Faults */
+/** @typedef {import("./protocol.js").Words} Words */
+/** @typedef {import("./protocol.js").Live} Live */
+/** @typedef {import("./fields.js").Fields} Fields */
 
 const MIB = 2 ** 20
 
 export class Uploads {
-  // changed(last): the question is another; none(): it has no answer now; again(): ask it again.
-  constructor(words, fields, live, {changed, none, again}) {
-    Object.assign(this, {words, fields, live, changed, none, again})
+  /**
+   * @param {Words} words
+   * @param {Fields} fields
+   * @param {Live} live
+   * @param {{changed(last: boolean): void, none(): void, again(): void}} then the question is another; it has no answer
+   *   now; ask it again
+   */
+  constructor(words, fields, live, then) {
+    this.words = words
+    this.fields = fields
+    this.live = live
+    this.then = then
+    /** @type {Record<string, {at: number, name: string, content: ArrayBuffer}>} */
     this.files = {}
-    // Fields whose file is not read, with the reason.
+    /** Fields whose file is not read, with the reason.
+     * @type {Faults} */
     this.lacks = {}
+    /** @type {Record<string, number>} */
     this.serials = {}
   }
 
+  /**
+   * @param {string} field
+   * @param {File} file
+   */
   async choose(field, file) {
     this.fields.put({[field]: ""})
     delete this.files[field]
     this.lacks[field] = `${file.name} is being read`
-    this.changed(false)
-    this.none()
+    this.then.changed(false)
+    this.then.none()
     if (file.size > this.words.most_uploaded) {
       this.lack(field, `upload of ${(file.size / MIB).toFixed(1)} MiB, expected at most ${this.words.most_uploaded / MIB} MiB`)
       return
@@ -25,6 +48,11 @@ export class Uploads {
     this.send(field, file.name, await file.arrayBuffer())
   }
 
+  /**
+   * @param {string} field
+   * @param {string} name
+   * @param {ArrayBuffer} content
+   */
   send(field, name, content) {
     const serial = this.serials[field] = (this.serials[field] ?? 0) + 1
     const n = this.live.ask("upload", {field, name}, message => {
@@ -40,11 +68,11 @@ export class Uploads {
       delete this.lacks[field]
       if (this.fields.entered[field] === message.entered) {
         // Sent again: the same question, and what was simulated for it.
-        this.again()
+        this.then.again()
         return
       }
       this.fields.put({[field]: message.entered})
-      this.changed(true)
+      this.then.changed(true)
     })
     this.live.send(content)
   }
@@ -59,17 +87,23 @@ export class Uploads {
     return kept.length > 0
   }
 
+  /**
+   * @param {string} field
+   * @param {string} why
+   */
   lack(field, why) {
     this.lacks[field] = why
-    this.none()
+    this.then.none()
   }
 
-  // These fields are changed: nobody waits for their files.
+  /** These fields are changed: nobody waits for their files.
+   * @param {string[]} names */
   forget(names) {
     for (const name of names) delete this.lacks[name]
   }
 
-  // Which files stand in fields, for the comparison of two questions.
+  /** Which files stand in fields, for the comparison of two questions.
+   * @param {Entered} entered */
   of(entered) {
     const uploads = Object.entries(this.words.uploads).filter(([field, text]) => entered[field] === text)
     return uploads.map(([field]) => this.files[field]?.at ?? "gone").join()

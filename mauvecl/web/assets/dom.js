@@ -1,0 +1,24 @@
+// @ts-check
+// Elements of the page: those that the template holds, and new ones.
+
+/** The element with this id; the template holds every one that is asked for.
+ * @param {string} id
+ * @returns {any} its kind is known where it is used */
+export const byId = id => document.getElementById(id)
+
+/** All elements that a selector finds, each of a kind that is known where they are used.
+ * @param {string} selector
+ * @param {ParentNode} [within]
+ * @returns {any[]} */
+export const every = (selector, within = document) => [...within.querySelectorAll(selector)]
+
+/** A new element.
+ * @param {string} tag
+ * @param {string | null} [text]
+ * @param {Record<string, any>} [more] properties
+ * @returns {any} */
+export function element(tag, text = null, more = {}) {
+  const made = document.createElement(tag)
+  if (text !== null) made.textContent = text
+  return Object.assign(made, more)
+}
