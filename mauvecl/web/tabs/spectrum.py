@@ -83,13 +83,14 @@ class Telescope(Picture):
 
     def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         star, flare = closed.light
-        shown = (star.wavelength_nm >= 190) & (star.wavelength_nm <= 710)
-        w = star.wavelength_nm[shown]
+        # A jump or line of the flare adds wavelengths.
+        nm = flare.wavelength_nm[(flare.wavelength_nm >= 190) & (flare.wavelength_nm <= 710)]
+        light = [np.interp(nm, source.wavelength_nm, source.flux_flam) for source in (star, flare)]
         # Logarithms show nothing of zero.
-        one, two = (np.where(s.flux_flam > 0, s.flux_flam, np.nan)[shown] for s in (star, flare))
+        one, two = (np.where(flux > 0, flux, np.nan) for flux in light)
         rise = np.nanmax(two / one)
         text = f"The flare multiplies the star's light by up to {short(rise)} between 190 and 710 nm."
-        return PictureData(text, {"star": {"x": w, "y": one}, "flare": {"x": w, "y": two}})
+        return PictureData(text, {"star": {"x": nm, "y": one}, "flare": {"x": nm, "y": two}})
 
 
 class Spectrum(Tab):

@@ -25,8 +25,9 @@ Row = tuple[str, float, float]
 @lru_cache(maxsize=4)
 def costs(closed: ClosedForms) -> tuple[float, list[Row]]:
     """Return the flare's matched S/N with everything known, and with unknowns alone and together."""
-    # Those without a default prior are projected out.
-    alone = [NuisanceChoice.model_validate({name: _spread(row.prior)}) for name, row in NUISANCES.items()]
+    # Without a sky its brightness is no unknown. Those without a default prior are projected out.
+    there = {name: row for name, row in NUISANCES.items() if np.any(row.spectrum(closed.quiet))}
+    alone = [NuisanceChoice.model_validate({name: _spread(row.prior)}) for name, row in there.items()]
     chosen = {spoken(choice).removeprefix("the "): choice for choice in alone}
     chosen["all the usual together"] = NuisanceChoice(usual=True)
     if closed.study.nuisances.own:
