@@ -66,6 +66,13 @@ def test_packages_form_layers_without_cycles() -> None:
     assert max(layers["mauvecl"].values()) <= 11
 
 
+def test_modules_form_no_circle() -> None:
+    """Check every import between modules at run time, including those inside functions."""
+    grimp = pytest.importorskip("grimp")
+    graph = grimp.build_graph("mauvecl", cache_dir=None, exclude_type_checking_imports=True)
+    TopologicalSorter({module: graph.find_modules_directly_imported_by(module) for module in graph.modules}).prepare()
+
+
 def packages_in(graph: Any, package: str) -> set[str]:
     return {inner for inner in graph.find_children(package) if graph.find_children(inner)}
 

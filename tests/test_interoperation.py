@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from mauvecl import Source
 from mauvecl.cli.app import app
-from mauvecl.host.stars.flare import blackbody
+from mauvecl.host.stars.blackbody import blackbody
 from mauvecl.host.stars.flare_table import flares_of, read_flares
 
 

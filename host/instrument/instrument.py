@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -21,6 +21,8 @@ from mauvecl.schema.records import input_error
 from mauvecl.schema.section import Section
 
 from .curve import Curve
+from .instrument_file import read_values
+from .paths import instrument_path, shipped_names
 from .pixel_map import MAX_PIXELS, PixelMap
 from .throughput_errors import ThroughputErrors
 
@@ -167,10 +169,8 @@ class Instrument(Section):
 
         Paths of curves are relative to the file. With `extends = "mauve"` the file gives only the values that differ.
         """
-        # Imported here because the reader imports this module.
-        from .instrument_file import read_instrument
-
-        return read_instrument(name)
+        # Embedded files do not change during a run; a user's file may.
+        return _embedded(name) if name in shipped_names() else _from_file(name)
 
     @classmethod
     def build(cls, values: dict[str, Any], where: str) -> Instrument:
@@ -473,8 +473,25 @@ def _counted(name: str, value: Any) -> Any:
     return count(name, value) if is_number and field is not None and field.annotation is int else value
 
 
+@cache
+def _embedded(name: str) -> Instrument:
+    return _from_file(name)
+
+
+def _from_file(name: str | Path) -> Instrument:
+    path = instrument_path(name, Path())
+    values, sources = read_values(path, FILES)
+    kept = {name: source for name, source in sources.items() if name not in LABELS}
+    return Instrument.build({**values, "sources": kept}, path.name)
+
+
 #: Fields that do not affect a measurement.
 LABELS = ("name", "notice", "sources")
 #: Names of the curves, and of those that are fractions.
 CURVES = tuple(name for name, field in Instrument.model_fields.items() if field.annotation is Curve)
 OPTICS = tuple(name for name in CURVES if name != "quantum_efficiency_a_per_w")
+#: Readers of the values that instrument files may give as paths.
+FILES: dict[str, type[Curve | PixelMap | ThroughputErrors]] = dict.fromkeys((*CURVES, "throughput_factor"), Curve) | {
+    "pixel_map": PixelMap,
+    "throughput_errors": ThroughputErrors,
+}

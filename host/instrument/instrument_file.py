@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,7 @@ from mauvecl.schema.text import shortened
 
 from ..files.parsing import read_text, toml
 from .curve import Curve
-from .instrument import CURVES, LABELS, Instrument
-from .paths import instrument_path, shipped_names
+from .paths import instrument_path
 from .pixel_map import PixelMap
 from .throughput_errors import ThroughputErrors
 
@@ -22,24 +21,19 @@ TAGS = ("P", "D", "C", "A", "U")
 MAX_EXTENDED = 16
 
 
-def read_instrument(name: str | Path) -> Instrument:
-    """Read an instrument by name or path; see `Instrument.load`."""
-    # Embedded files do not change during a run; a user's file may.
-    return _shipped(name) if name in shipped_names() else _built(instrument_path(name, Path()))
+def read_values(
+    path: Path, files: Mapping[str, type[Curve | PixelMap | ThroughputErrors]], seen: tuple[Path, ...] = ()
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return the values and sources of a file, merged over those of the file that it extends.
 
-
-@cache
-def _shipped(name: str) -> Instrument:
-    return _built(instrument_path(name, Path()))
-
-
-def _built(path: Path) -> Instrument:
-    values, sources = _read(path, ())
-    return Instrument.build({**values, "sources": sources}, path.name)
-
-
-def _read(path: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the values and sources of a file, merged over those of the file that it extends."""
+    Parameters
+    ----------
+    path : Path
+    files : mapping
+        Classes of the values that may be paths, relative to the file.
+    seen : tuple of Path
+        Files that extend this one.
+    """
     if path.resolve() in seen:
         raise InputError(f"{path.name} extends itself", "a chain of files that ends", key="extends", value=path.name)
     if len(seen) == MAX_EXTENDED:
@@ -53,20 +47,21 @@ def _read(path: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], dict[str,
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
     if "extends" in content:
-        values, sources = _read(instrument_path(content.pop("extends"), path.parent), (*seen, path.resolve()))
+        values, sources = read_values(
+            instrument_path(content.pop("extends"), path.parent), files, (*seen, path.resolve())
+        )
     for name, entry in content.items():
         if name == "sources":
             raise InputError(
                 f"{path.name}: unknown key 'sources'", "each value's source in the value's own table", key="sources"
             )
-        value, source = _entry(name, entry, path)
-        values[name] = value
-        if name not in LABELS:
-            sources[name] = source
+        values[name], sources[name] = _entry(name, entry, path, files.get(name))
     return values, sources
 
 
-def _entry(name: str, entry: Any, path: Path) -> tuple[Any, str]:
+def _entry(
+    name: str, entry: Any, path: Path, kind: type[Curve | PixelMap | ThroughputErrors] | None
+) -> tuple[Any, str]:
     """Return the value and source of an entry: a plain value, a table of value, tag and source, or a path."""
     source = f"A: assumed, no source in {path.name}"
     if isinstance(entry, dict):
@@ -81,15 +76,9 @@ def _entry(name: str, entry: Any, path: Path) -> tuple[Any, str]:
             raise InputError.of("tag", tag, f"one of {', '.join(TAGS)}", where=f"{path.name}, {name}")
         source = f"{tag}: {entry.get('source', f'no source in {path.name}')}"
         entry = entry["value"]
-    if name in (*CURVES, "throughput_factor") and isinstance(entry, str):
-        curve = Curve.read(path.parent / entry)
-        return curve, curve.source
-    if name in CURVES and isinstance(entry, int | float) and not isinstance(entry, bool):
+    if kind is not None and isinstance(entry, str):
+        read = kind.read(path.parent / entry)
+        return read, read.source
+    if kind is Curve and isinstance(entry, int | float) and not isinstance(entry, bool):
         return Curve.flat(float(entry), source), source
-    if name == "pixel_map" and isinstance(entry, str):
-        pixel_map = PixelMap.read(path.parent / entry)
-        return pixel_map, pixel_map.source
-    if name == "throughput_errors" and isinstance(entry, str):
-        errors = ThroughputErrors.read(path.parent / entry)
-        return errors, errors.source
     return entry, source

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from mauvecl.schema.tables import Column
 
 from ..files.ecsv import Numbers, parse_numbers
+from . import own_stars
 from .well_known import name_key
 
 if TYPE_CHECKING:
@@ -84,8 +85,6 @@ def library_table() -> Table:
         text; the last is "embedded" or "yours".
     """
     from astropy.table import Table
-
-    from . import own_stars
 
     table = Table.read(_LIBRARY.joinpath("index.ecsv").read_text(encoding="utf-8"), format="ascii.ecsv")
     # The reader masks empty text.

@@ -25,7 +25,7 @@ from ..content_equality import ContentEquality
 from ..spectra.coverage import check_points
 from ..spectra.formats import read_spectrum
 from ..spectra.wavelength_range import NEEDED_NM
-from .flare import blackbody
+from .blackbody import blackbody
 
 Float = NDArray[np.float64]
 Wavelengths = Annotated[Float, Unit("nm")]

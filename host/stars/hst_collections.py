@@ -20,7 +20,8 @@ from mauvecl.schema.text import shortened
 from ..files.parsing import parsing
 from ..files.size_limits import limit_bytes
 from ..version import VERSION
-from .own_stars import OwnStar, add
+from .add_star import add
+from .own_stars import OwnStar
 
 #: Timeout of a connection, s.
 TIMEOUT_S = 20.0

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mauvecl.host.files.json_text import json_text
 from mauvecl.host.files.parsing import read_text
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -83,8 +84,6 @@ def verify_answer(folder: str | Path) -> list[FileFault]:
     list of FileFault
         Empty if all files are unchanged.
     """
-    from mauvecl.answers.files import json_text
-
     folder = Path(folder)
     if not is_answer(folder):
         raise InputError(

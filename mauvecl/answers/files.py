@@ -6,15 +6,15 @@ import csv
 import datetime
 import io
 import json
-import math
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.checked import OWN_DIGEST, RECORD, digest_of, record_digest
 from mauvecl.host.files.atomic import write_whole
+from mauvecl.host.files.json_text import json_text
 from mauvecl.host.files.parsing import read_text
 from mauvecl.host.version import VERSION
 from mauvecl.schema.errors import InputError
@@ -166,14 +166,13 @@ def write_record(
         "packages": _versions("numpy", "scipy", "astropy", "synphot", "pyopencl"),
     }
     if pool is not None or opened is not None:
-        # Outcome of the self-test on these devices, if it was run.
-
         devices = pool.devices if pool is not None else [opened.record] if opened is not None else []
         record["devices"] = [asdict(device) for device in devices]
         record["kernels"] = (pool or opened).kernel_digest  # type: ignore[union-attr]
         if pool is not None:
             record["shards"] = asdict(pool.standing)
-        from mauvecl.device.selftest import read_outcome
+        # Outcome of the self-test on these devices, if it was run.
+        from mauvecl.device.selftest_outcome import read_outcome
 
         missing = "not run on this device and version: mauvecl selftest"
         record["selftest"] = [read_outcome(device) or missing for device in devices]
@@ -206,19 +205,6 @@ def write_json(content: Any, path: Path) -> Path:
     """Write plain data as JSON; errors as for `write_table`."""
     write_whole(path, (json_text(content) + "\n").encode())
     return path
-
-
-def json_text(content: Any) -> str:
-    """Return plain data as JSON text, with null for NaN and infinity."""
-    return json.dumps(_finite(content), indent=2, default=str, allow_nan=False)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {key: _finite(one) for key, one in value.items()}
-    return [_finite(one) for one in value] if isinstance(value, list | tuple) else value
 
 
 def _versions(*names: str) -> dict[str, str]:

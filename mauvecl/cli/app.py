@@ -21,6 +21,7 @@ from typer.main import get_command
 from mauvecl.answers.verbs import VERBS
 from mauvecl.cli import verbs
 from mauvecl.cli.boundary import EXIT_CODES, guarded
+from mauvecl.cli.naming import name_flags_of
 from mauvecl.cli.verb import COMMANDS, add_plain_commands
 from mauvecl.cli.verbs.about import devices, schema, selftest
 from mauvecl.cli.verbs.bulk import export, verify
@@ -113,6 +114,8 @@ app = typer.Typer(
     "Start with `mauvecl detect`, which answers the question of the MauveSim paper. The throughput is nominal, not a "
     f"flight calibration. {EXIT_CODES}",
 )
+
+name_flags_of(app)
 
 
 def _version(wanted: bool) -> None:

@@ -11,12 +11,22 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    import typer
+
     from mauvecl.schema.errors import InputError
 
 #: A remedy in a message: `extend`, `resume=True`, `wavelength_unit='Angstrom'`, `fap=0.001`.
 _REMEDY = re.compile(r"`(?P<name>[a-z][a-z0-9_.]*)(?:=(?P<value>[^`]+))?`")
 #: Parameters with flags of other names that are not keys of the study.
 _OTHERWISE = {"setting": "--set"}
+
+#: The command line whose flags messages name, alone in a list.
+_app: list[typer.Typer] = []
+
+
+def name_flags_of(app: typer.Typer) -> None:
+    """Set the command line whose flags messages name."""
+    _app[:] = [app]
 
 
 @cache
@@ -33,9 +43,7 @@ def _commands() -> Iterator[Any]:
     """Yield the called command, then all others."""
     from typer.main import get_command
 
-    from mauvecl.cli.app import app
-
-    called: Any = get_command(app)
+    called: Any = get_command(_app[0])
     others = [called]
     for word in sys.argv[1:]:
         called = getattr(called, "commands", {}).get(word, called)

@@ -278,7 +278,7 @@ class Session:
 
     def print_json(self, content: dict[str, Any]) -> None:
         """Print the answer as JSON."""
-        from mauvecl.answers.files import json_text
+        from mauvecl.host.files.json_text import json_text
 
         print(json_text(content))
 

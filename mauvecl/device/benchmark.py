@@ -8,7 +8,7 @@ from typing import Any
 
 from mauvecl.device.engine import Engine, devices
 from mauvecl.device.errors import DeviceError
-from mauvecl.device.selftest import toy
+from mauvecl.device.toy_exposure import toy
 from mauvecl.schema.tables import Column
 
 PIXELS = 1600

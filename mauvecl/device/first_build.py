@@ -13,7 +13,6 @@ import fcntl
 import hashlib
 import json
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -44,7 +43,7 @@ OUTCOME_LIFETIME_S = 7 * 86400.0
 #: Code of the child, which searches the same import path as its parent.
 CHILD = (
     "import json, sys; request = json.loads(sys.argv[1]); sys.path[:] = request['path']; "
-    "from mauvecl.device import first_build; first_build.child(request)"
+    "from mauvecl.device import first_build_child; first_build_child.child(request)"
 )
 #: CL_DEVICE_TYPE_CPU of the OpenCL specification.
 CPU = 2
@@ -52,7 +51,7 @@ CPU = 2
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 #: Processor name chosen for each device of this process.
-_settled: dict[int, str | None] = {}
+settled: dict[int, str | None] = {}
 _one_at_a_time = threading.Lock()
 
 
@@ -94,9 +93,9 @@ def choose_processor_level(device: Any, others: Callable[[], Sequence[Any]]) -> 
         If the driver works at no level.
     """
     place = int(device.int_ptr)
-    if place not in _settled:
+    if place not in settled:
         with _one_at_a_time:
-            if place not in _settled:
+            if place not in settled:
                 names = processor.names(device)
                 outcome = _outcome(device, names, others)
                 if not outcome.succeeded:
@@ -104,8 +103,8 @@ def choose_processor_level(device: Any, others: Callable[[], Sequence[Any]]) -> 
                 name = outcome.tried[-1][0]
                 if name is not None:
                     processor.set_processor_name(device, name)
-                _settled[place] = name
-    return _settled[place]
+                settled[place] = name
+    return settled[place]
 
 
 def _outcome(device: Any, names: tuple[str | None, ...], others: Callable[[], Sequence[Any]]) -> Outcome:
@@ -227,63 +226,3 @@ def _failure_message(device: Any, outcome: Outcome) -> str:
         f"devices` lists them) or driver: {driver_sources()}; {LIMIT} sets the limit, and mauvecl tries again after "
         "a week"
     )
-
-
-# Functions of the child process.
-
-
-def child(request: dict[str, Any]) -> None:
-    """Build and run kernels within the limits and exit with 0, or print the reason of a failure and exit with 1."""
-    limit(request)
-    try:
-        why = _build(request)
-    except Exception as error:
-        why = str(error).splitlines()[0] if str(error) else type(error).__name__
-    if why:
-        print(why)
-    sys.exit(1 if why else 0)
-
-
-def limit(request: dict[str, Any]) -> None:
-    """Set the limits of this process."""
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    seconds = max(1, round(request["limit_s"]))
-    # The hard limit ends the process even if the compiler handles the signal of the soft one.
-    _lower(resource.RLIMIT_CPU, seconds, seconds + 5)
-    # The alarm ends this process if the parent is killed.
-    signal.alarm(max(1, round(CLOCK * request["limit_s"])))
-    if request["memory"] is not None:
-        _lower(resource.RLIMIT_DATA, request["memory"], request["memory"])
-
-
-def _lower(what: int, soft: int, hard: int) -> None:
-    """Lower a resource limit, unless it is lower already."""
-    now = resource.getrlimit(what)[1]
-    most = hard if now == resource.RLIM_INFINITY else min(hard, now)
-    # macOS defines some limits without enforcing them.
-    with contextlib.suppress(OSError, ValueError):
-        resource.setrlimit(what, (min(soft, most), most))
-
-
-def _build(request: dict[str, Any]) -> str:
-    """Draw a small scene and return what is wrong with it, or an empty string."""
-    import numpy as np
-
-    from mauvecl.device.engine import Engine
-    from mauvecl.device.program import SAME_BITS, choose_device
-    from mauvecl.device.selftest import toy
-    from mauvecl.noise import reference
-    from mauvecl.noise.scene import prepare
-
-    handle, record = choose_device(str(request["number"]))
-    if record.label != request["label"]:
-        return f"device {request['number']} is {record.label} in a new process, expected {request['label']}"
-    name = request["name"]
-    if name is not None and not processor.set_processor_name(handle, name):
-        return "PoCL's record of the device is not understood"
-    _settled[int(handle.int_ptr)] = name
-    engine, quiet, flare = Engine(str(request["number"])), toy(), toy(flare=0.3)
-    raw = engine.realise(quiet, count=64, seed=1)
-    engine.detect(quiet, [flare], realisations=64, seed=1)
-    same = np.array_equal(raw, reference.realise(prepare([quiet]), np.arange(64, dtype=np.uint64), 1))
-    return "" if same or record.promise != SAME_BITS else "draws other counts than NumPy"

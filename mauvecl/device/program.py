@@ -20,7 +20,7 @@ from mauvecl.device.errors import BuildError, DeviceError
 from mauvecl.device.first_build import choose_processor_level
 from mauvecl.device.kernel_cache import kernel_cache
 from mauvecl.host.version import VERSION
-from mauvecl.noise import layout
+from mauvecl.noise import layout, random_numbers
 
 if TYPE_CHECKING:
     import pyopencl
@@ -219,8 +219,8 @@ def render(kernel_files: tuple[str, ...], variant: Variant) -> str:
     values = asdict(variant) | {
         "attributes": local,
         "streams": layout.STREAMS,
-        "polynomials": {k: [f"{c}f" for c in v] for k, v in layout.POLYNOMIALS.items()},
-        "two_ln2": f"{layout.TWO_LN2}f",
+        "polynomials": {k: [f"{c}f" for c in v] for k, v in random_numbers.POLYNOMIALS.items()},
+        "two_ln2": f"{random_numbers.TWO_LN2}f",
         "magic": f"{layout.MAGIC}f",
         "reference": layout.REFERENCE,
         "fixed": len(layout.FIXED_STATISTICS),

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import json
-import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,11 +11,12 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.device.engine import Engine
-from mauvecl.device.kernel_cache import kernel_cache
 from mauvecl.device.probes import Probes
 from mauvecl.device.program import SAME_BITS
+from mauvecl.device.selftest_outcome import Check
+from mauvecl.device.selftest_stares import stares
+from mauvecl.device.toy_exposure import toy
 from mauvecl.host.expectation import Expectation
-from mauvecl.host.version import VERSION
 from mauvecl.noise import layout, reference
 from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.processes import CosmicRays, Processes, Uniform
@@ -28,12 +26,11 @@ from mauvecl.results.counts.tally import Tally
 from mauvecl.results.requests.channels import ChannelPlan, plan_channels
 from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.results.snr import Counts, elements, observers
-from mauvecl.schema.tables import Column
 from mauvecl.statistics.nuisances import as_nuisances
 from mauvecl.statistics.registry import STATISTICS
 
 if TYPE_CHECKING:
-    from mauvecl.device.program import DeviceRecord
+    pass
 
 #: Probability that a statistical check fails on a correct device.
 FALSE_FAILURE_PROBABILITY = 1e-6
@@ -48,61 +45,6 @@ PHILOX_VECTORS = (
         (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1),
     ),
 )
-
-
-@dataclass(frozen=True)
-class Check:
-    """Outcome of one check, a line of the table."""
-
-    name: str
-    passed: bool
-    result: str
-
-
-#: Columns of the table of checks.
-COLUMNS = (
-    Column("passed", heading="result", format=lambda passed: "PASS" if passed else "FAIL"),
-    Column("name", heading="check"),
-    Column("result", heading="found"),
-)
-
-
-def toy(
-    pixels: int = 64,
-    frames: int = 10,
-    *,
-    flare: float = 0.0,
-    dark: float = 2225.0,
-    read: float = 12.0,
-    light: float = 40.0,
-    unit: Any = "DN",
-    photon_noise: Any = "gaussian",
-) -> Expectation:
-    """Return a small exposure of a smooth spectrum on a uniform detector; dark in DN, light in electrons per frame."""
-    shape = light * (1.0 + 0.5 * np.sin(np.arange(pixels) / 9.0))
-    ones = np.ones(pixels)
-    element = np.arange(pixels, dtype=np.int32) // 10
-    return Expectation(
-        wavelength_nm=np.arange(200.0, 200.0 + pixels),
-        source_electrons=shape * (1.0 + flare * np.linspace(1.0, 0.2, pixels)),
-        sky_electrons=0.4 * ones,
-        dark_dn=dark * ones,
-        dark_unit=unit,
-        bias_dn=600.0 * ones,
-        read_noise_dn=read * ones,
-        gain_dn_per_electron=0.6 * ones,
-        n_frames=frames,
-        frame_s=5.0,
-        element=element,
-        element_wavelength_nm=205.0 + 10.0 * np.arange(element[-1] + 1),
-        adc_max_dn=65_535,
-        saturation_dn=59_578.0,
-        name="toy",
-        instrument="toy",
-        provenance={},
-        photon_noise=photon_noise,
-        conditions={"temperature_c": 21.0, "dark_slope_per_c": 0.0684, "light_loss": 0.34, "pointing_loss": 0.0},
-    )
 
 
 _RAYS = CosmicRays(rate_per_cm2_s=300.0)
@@ -369,8 +311,6 @@ def tiles(engine: Engine) -> Check:
 
 def run(engine: Engine, report: Callable[[Check], None] = lambda check: None) -> list[Check]:
     """Run all checks and call `report` with each outcome."""
-    from mauvecl.device.selftest_stares import stares
-
     checks: list[Check] = []
 
     def note(check: Check) -> None:
@@ -378,32 +318,13 @@ def run(engine: Engine, report: Callable[[Check], None] = lambda check: None) ->
         report(check)
 
     note(known_answers(engine))
-    for group in (check_against_reference, stares, chance, closed_forms):
-        for check in group(engine):
+    for group in (
+        check_against_reference(engine),
+        stares(engine, START, COUNT, SEED),
+        chance(engine),
+        closed_forms(engine),
+    ):
+        for check in group:
             note(check)
     note(tiles(engine))
     return checks
-
-
-def write_outcome(engine: Engine, checks: list[Check], seconds: float) -> None:
-    """Write the outcome to the kernel cache, for run records of the same device, driver and version."""
-    record = {
-        "mauvecl": VERSION,
-        "device": asdict(engine.device),
-        "date_utc": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "seconds": round(seconds, 1),
-        "passed": all(check.passed for check in checks),
-        "checks": [asdict(check) for check in checks],
-    }
-    kernel_cache().write_text(_key(engine.device), json.dumps(record))
-
-
-def read_outcome(device: DeviceRecord) -> dict[str, Any] | None:
-    """Return the latest outcome for a device, or None."""
-    text = kernel_cache().read_text(_key(device))
-    return None if text is None else dict(json.loads(text))
-
-
-def _key(device: DeviceRecord) -> str:
-    said = f"selftest {VERSION} {device.label} {device.driver}"
-    return hashlib.sha256(said.encode()).hexdigest()[:32]

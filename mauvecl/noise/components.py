@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.noise import reference
+from mauvecl.noise import random_numbers, reference
 from mauvecl.noise.drawing import DrawingOptions
 from mauvecl.noise.scene import prepare
 from mauvecl.noise.unknowns import ADDITIVE
@@ -72,7 +72,7 @@ def components(
         for group in range(len(scene.pixels) // 4):
             drawn = reference.draws(scene, index, frame, group, seed)
             chance = reference.words_at(index, frame, "split_dark", group, seed)
-            apart = reference.four_normals(reference.words_at(index, frame, "split", group, seed))
+            apart = random_numbers.four_normals(reference.words_at(index, frame, "split", group, seed))
             for i, p in enumerate(range(4 * group, 4 * group + 4)):
                 v = reference.analogue(scene, drawn, i, p, 0, *factors)
                 analogue[p] = v[0]
@@ -84,7 +84,7 @@ def components(
                 if not scene.joint:
                     dark_dn[p] = scene.dark_counts[p]["gain"] * drawn.dark[i][0]
                 if drawn.photon is not None:
-                    pairs = reference.four_normals(drawn.photon)
+                    pairs = random_numbers.four_normals(drawn.photon)
                     source = scene.photon_counts[0, p]
                     electrons = reference.poisson_draw(drawn.photon, i, source, scene.tables, pairs)[0]
                     photon_dn[p] = source["gain"] * electrons

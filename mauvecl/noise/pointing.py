@@ -69,7 +69,7 @@ class PointingDrifts(Section):
         """
         import numpy as np
 
-        from mauvecl.noise.reference import four_normals, words_at
+        from mauvecl.noise.random_numbers import four_normals, words
 
         parts: list[tuple[Float, Float, Float]] = []
         begin = np.zeros((len(numbers), 1))
@@ -77,9 +77,9 @@ class PointingDrifts(Section):
         while not parts or not (parts[-1][0][:, -1] >= end_s).all():
             which = np.arange(n, n + BATCH)[None]
             # Half the sum of two squared normals is exponential, and has the same bits on every machine.
-            a, b, c, d = (z.astype(np.float64) for z in four_normals(words_at(index, which, "stare_pointing", 0, seed)))
+            a, b, c, d = (z.astype(np.float64) for z in four_normals(words(index, which, self.stream, 0, seed)))
             wait, lasts = (a * a + b * b) / 2 * (3600.0 / self.rate_per_h), (c * c + d * d) / 2 * self.duration_s
-            share = (words_at(index, which, "stare_pointing", 1, seed)[0].astype(np.float64) + 0.5) / 2**32
+            share = (words(index, which, self.stream, 1, seed)[0].astype(np.float64) + 0.5) / 2**32
             ends = begin + np.cumsum(wait + lasts, axis=1)
             parts.append((ends - lasts, lasts, share * self.depth))
             begin, n = ends[:, -1:], n + BATCH

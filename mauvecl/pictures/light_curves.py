@@ -12,7 +12,8 @@ from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import COLOURS, NULL, headline, styled_picture
 
 if TYPE_CHECKING:
-    from mauvecl.answers.stares.stare import StareAnswer, StarStare
+    from mauvecl.answers.stares.star_stare import StarStare
+    from mauvecl.answers.stares.stare import StareAnswer
     from mauvecl.lightcurve.stares.stare import Stare
 
 Float = NDArray[np.float64]
@@ -29,7 +30,7 @@ def light_curves(plt: Any, one: StarStare) -> Any:
 
     Dotted lines are injected flares, triangles detections. Shaded frames lose light in pointing drifts.
     """
-    from mauvecl.answers.stares.stare import SearchResult
+    from mauvecl.answers.stares.star_stare import SearchResult
 
     stare, light = one.staring.stare, one.light
     scale, unit = time_unit(stare.duration_s)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
-from mauvecl.answers.campaigns.plan_text import LEGEND, heading, target_lines
+from mauvecl.answers.campaigns.plan_lines import LEGEND, target_lines
 from mauvecl.host.version import VERSION
 from mauvecl.pictures.plan_report import overview_png, target_png
 from mauvecl.pictures.registry import document_of
@@ -29,9 +29,9 @@ STYLE = (
 def report_html(answer: PlanAnswer) -> bytes:
     """Return the report: summary, a section per target (with pictures if matplotlib is installed), assumptions."""
     parts = [
-        f"<!doctype html><html lang=en><meta charset=utf-8><title>Mauve: {escape(heading(answer))}</title>",
+        f"<!doctype html><html lang=en><meta charset=utf-8><title>Mauve: {escape(answer.heading)}</title>",
         f"<style>{STYLE}</style><h1>Mauve: yields of a campaign</h1>",
-        f"<p>{escape(heading(answer))}; mauvecl {VERSION}.</p>",
+        f"<p>{escape(answer.heading)}; mauvecl {VERSION}.</p>",
         html_table(*answer.views[0].texts(), "numbers", link=True),
         f"<p class=from>{escape(LEGEND)}</p>",
         html_image(overview_png, answer, text="flares expected and energies of all targets"),

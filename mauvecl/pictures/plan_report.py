@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.campaigns.plan_text import LEGEND, heading, target_lines
+from mauvecl.answers.campaigns.plan_lines import LEGEND, target_lines
 from mauvecl.host.version import VERSION
 from mauvecl.pictures.registry import document_of, picture_of
 from mauvecl.pictures.style import COLOURS, NULL, STYLE, canvas, save_or_return
@@ -89,7 +89,7 @@ def pdf_bytes(answer: PlanAnswer) -> bytes:
 
     plt, made = canvas(), io.BytesIO()
     # Without a date, equal plans give equal files.
-    about = {"Title": f"Mauve: {heading(answer)}", "Creator": f"mauvecl {VERSION}", "CreationDate": None}
+    about = {"Title": f"Mauve: {answer.heading}", "Creator": f"mauvecl {VERSION}", "CreationDate": None}
     with plt.rc_context(STYLE | {"pdf.fonttype": 42}), PdfPages(made, metadata=about) as pages:
         targets = [_target(plt, answer, k) for k in range(len(answer.planned))]
         for figure in [*_summary(plt, answer), *targets, *_assumptions(plt, answer)]:
@@ -165,7 +165,7 @@ class Sheets:
 def _summary(plt: Any, answer: PlanAnswer) -> list[Any]:
     sheets = Sheets(plt)
     sheets.line([(0.0, "Mauve: yields of a campaign")], 15)
-    sheets.line([(0.0, f"{heading(answer)}; mauvecl {VERSION}")], 9)
+    sheets.line([(0.0, f"{answer.heading}; mauvecl {VERSION}")], 9)
     sheets.take(0.1)
     headings, cells = answer.views[0].texts()
     for number, row in enumerate([headings, *cells]):
@@ -204,7 +204,7 @@ def _target(plt: Any, answer: PlanAnswer, k: int) -> Any:
     margin = MARGIN / PAGE[0]
     pictures = figure.subfigures(2, 3, height_ratios=[0.43, 0.57], width_ratios=[margin, 1 - 2 * margin, margin])[1, 1]
     figure.text(margin, 0.96, answer.planned[k].name, fontsize=14, va="top", parse_math=False)
-    figure.text(1 - margin, 0.96, heading(answer), fontsize=8, va="top", ha="right", color=NULL)
+    figure.text(1 - margin, 0.96, answer.heading, fontsize=8, va="top", ha="right", color=NULL)
     y = 0.925
     for name, value, where in target_lines(answer, k):
         lines = textwrap.wrap(value, 48) or [""]

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.noise import layout
-from mauvecl.noise.reference import MAGIC, Floats, clipped, fma, nearest, observed
+from mauvecl.noise.random_numbers import Floats, fma
+from mauvecl.noise.reference import MAGIC, clipped, nearest, observed
 from mauvecl.noise.scene import Scene
 from mauvecl.results.snr import Counts
 from mauvecl.statistics.paper import Paper

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mauvecl.drawable import Drawable
 from mauvecl.host.content_equality import ContentEquality
 from mauvecl.noise import layout
-from mauvecl.noise.reference import Floats, fma
+from mauvecl.noise.random_numbers import Floats, fma
 from mauvecl.noise.scene import Scene
 from mauvecl.results.counts.sparse_counts import SparseCounts
 from mauvecl.schema.errors import InputError

@@ -22,7 +22,8 @@ from mauvecl.schema.physical import FirstRealisation, Realisations
 from mauvecl.schema.tables import Column
 from mauvecl.store.description import without_later_attributes
 from mauvecl.store.export import Selection, export
-from mauvecl.store.layout import CRC_BYTES, Chunk, Store, StoredScene, crc, digest
+from mauvecl.store.layout import CRC_BYTES, Chunk, Store, crc, digest
+from mauvecl.store.stored_scenes import StoredScene
 from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 

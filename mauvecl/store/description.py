@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,8 @@ from mauvecl.study.messages import collect_messages as messages_of
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
-    from mauvecl.store.layout import Store
+    from mauvecl.store.stored_scenes import StoredScene
+    from mauvecl.study.study import Study
 
 #: Units of the calibration per pixel and frame, which each star's group contains.
 CALIBRATION = {
@@ -44,19 +46,19 @@ def without_later_attributes(described: dict[str, Any]) -> dict[str, Any]:
     return described | {"attributes": {k: v for k, v in attributes.items() if k not in LATER_ATTRIBUTES}}
 
 
-def describe(store: Store, folder: Path) -> None:
+def describe(study: Study, scenes: Sequence[StoredScene], folder: Path) -> None:
     """Write groups, descriptions of arrays and calibration of a store to a folder."""
     import zarr
     from zarr.codecs import Crc32cCodec
 
-    study = store.study.toml()
+    text, rows = study.toml(), study.run.realisations
     with warnings.catch_warnings():
         # Zarr warns of an empty folder.
         warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
         root = zarr.open_group(folder, mode="w", zarr_format=3)
-        run: dict[str, Any] = signed(study) | {"seed": store.study.run.seed, "realisations": store.rows}
+        run: dict[str, Any] = signed(text) | {"seed": study.run.seed, "realisations": rows}
         root.attrs.update(run | {"mauvecl": VERSION, "draws": COMMON_DRAWS, "throughput": NOMINAL})
-        for scene in store.scenes:
+        for scene in scenes:
             x, group = scene.expectation, root.require_group(scene.group)
             if scene.name == "quiescent":
                 group.attrs.update({"star": scene.star, **scene.at})
@@ -65,7 +67,7 @@ def describe(store: Store, folder: Path) -> None:
                     _values(group, name, np.asarray(getattr(x, name)), unit, ["pixel"])
                 if scene.frames is not None:
                     _values(group, "frame", np.array(scene.frames), "", ["frame"])
-            if store.study.bulk.components:
+            if study.bulk.components:
                 n = x.n_frames if scene.frames is None else 1
                 gain = n * x.gain_dn_per_electron
                 for name, values in (
@@ -78,14 +80,14 @@ def describe(store: Store, folder: Path) -> None:
             dimensions = ["realisation", *(["frame"] if scene.frames is not None else []), "pixel"]
             array = group.create_array(
                 scene.name,
-                shape=(store.rows, *scene.row),
-                chunks=(scene.chunk_rows(store.rows), *scene.row),
+                shape=(rows, *scene.row),
+                chunks=(scene.chunk_rows(rows), *scene.row),
                 dtype=scene.dtype,
                 compressors=[Crc32cCodec()],
                 fill_value=0,
                 dimension_names=dimensions,
             )
-            origin: dict[str, Any] = {"star": scene.star, "provenance": dict(x.provenance)} | signed(study)
+            origin: dict[str, Any] = {"star": scene.star, "provenance": dict(x.provenance)} | signed(text)
             array.attrs.update(origin | {"units": "DN", "amplitude": scene.amplitude})
 
 

@@ -18,7 +18,8 @@ from mauvecl.host.files.atomic import UNFINISHED, write_whole
 from mauvecl.host.version import VERSION
 from mauvecl.schema.errors import InputError
 from mauvecl.store.description import CALIBRATION, COMMON_DRAWS, NOMINAL, exposure_attributes
-from mauvecl.store.layout import Store, StoredScene
+from mauvecl.store.layout import Store
+from mauvecl.store.stored_scenes import StoredScene
 
 if TYPE_CHECKING:
     from astropy.io.fits import BinTableHDU, HDUList, ImageHDU

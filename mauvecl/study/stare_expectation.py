@@ -109,6 +109,7 @@ def stare_of(case: Case) -> Stare:
 
 def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare:
     """Return the stare at the target of the study's ``orbit``, with gaps and temperatures along the orbit."""
+    from mauvecl.lightcurve.stares.orbit_stare import stare_along
     from mauvecl.study.orbits import targets_of
 
     q, o = study.stare, study.orbit
@@ -127,7 +128,7 @@ def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare
             key="stare.along_orbit",
             value=True,
         )
-    return Stare.along(o.orbit(), targets[0], o.start, q.duration_s, frame_s=frame_s, limits=o.limits, **changes)
+    return stare_along(o.orbit(), targets[0], o.start, q.duration_s, frame_s=frame_s, limits=o.limits, **changes).stare
 
 
 def expect_stare(case: Case) -> StareExpectation:

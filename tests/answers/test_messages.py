@@ -6,8 +6,8 @@ import json
 
 import pytest
 
-from mauvecl.answers.files import json_text
 from mauvecl.answers.signal.simulate import simulate
+from mauvecl.host.files.json_text import json_text
 from mauvecl.schema.messages import of_kind
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study

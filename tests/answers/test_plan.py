@@ -11,7 +11,7 @@ from scipy import stats
 
 from mauvecl import Study, plan
 from mauvecl.answers.campaigns.plan import PlanAnswer
-from mauvecl.answers.campaigns.plan_text import target_lines
+from mauvecl.answers.campaigns.plan_lines import target_lines
 from mauvecl.answers.campaigns.planned import TargetObservation
 from mauvecl.answers.campaigns.planned_injections import injection_case
 from mauvecl.answers.files import write_study, write_table

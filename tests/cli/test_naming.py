@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import mauvecl
+import mauvecl.cli.app
 from mauvecl import Engine, Instrument, Sky, Source, Study
 from mauvecl.answers.verbs import VERBS
 from mauvecl.cli.naming import with_flags
@@ -58,8 +59,6 @@ def test_no_module_below_the_command_line_names_a_flag() -> None:
 
 
 def test_dir_shows_public_names_only() -> None:
-    import mauvecl.cli.app  # its submodules become attributes
-
     shown = [name for name in dir(mauvecl) if not name.startswith("__")]
     assert sorted(shown) == sorted(mauvecl.__all__)
     assert all(getattr(mauvecl, name) is not None for name in shown)

@@ -18,7 +18,7 @@ from scenes import instrument, star
 from scipy import stats
 
 from mauvecl.device.engine import Engine
-from mauvecl.device.selftest import toy
+from mauvecl.device.toy_exposure import toy
 from mauvecl.device.variants import scene_launches
 from mauvecl.host.instrument.pixel_map import PixelMap
 from mauvecl.noise import reference

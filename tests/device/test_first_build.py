@@ -19,22 +19,23 @@ pytestmark = pytest.mark.long
 #: Script that draws on the default device and prints the level and the counts' digest, or the error.
 RUN = """
 import hashlib, sys
-from mauvecl.device import first_build, kernel_cache, processor, selftest
+from mauvecl.device import first_build, kernel_cache, processor
 from mauvecl.device.engine import DeviceError, Engine
+from mauvecl.device.toy_exposure import toy
 from mauvecl.schema.errors import InputError
 {before}
 try:
     engine = Engine()
-    print("digest", hashlib.sha256(engine.realise(selftest.toy(), count=64, seed=1).tobytes()).hexdigest())
-    print("level", *first_build._settled.values())
+    print("digest", hashlib.sha256(engine.realise(toy(), count=64, seed=1).tobytes()).hexdigest())
+    print("level", *first_build.settled.values())
 except (DeviceError, InputError) as error:
     print("sentence", str(error).count(chr(10)), error)
 """
 #: Child that fails when it compiles for the first name, and does nothing otherwise.
 CHILD = """
 import json, sys, os, ctypes, time; asked = json.loads(sys.argv[1]); sys.path[:] = asked["path"]
-from mauvecl.device import first_build
-first_build.limit(asked)
+from mauvecl.device import first_build_child
+first_build_child.limit(asked)
 if asked["name"] == "bad" or asked["name"] is None:
     {act}
 """

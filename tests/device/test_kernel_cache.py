@@ -23,9 +23,10 @@ from mauvecl.device.program import build
 #: Script that runs two kernels on the toy scene and prints whether they came from the store.
 RUN = """
 import hashlib, sys
-from mauvecl.device import kernel_cache, selftest
+from mauvecl.device import kernel_cache
+from mauvecl.device.toy_exposure import toy
 def digest(engine):
-    x = selftest.toy(frames=1)
+    x = toy(frames=1)
     raw, seen = engine.realise(x, count=64, seed=1), engine.snr(x, realisations=64, seed=1)
     return hashlib.sha256(raw.tobytes() + seen.counts.pixel.tobytes()).hexdigest()
 {before}

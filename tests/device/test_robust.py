@@ -16,7 +16,7 @@ from refusals import refused
 
 from mauvecl.device.engine import DeviceError, Engine, devices
 from mauvecl.device.kernel_cache import kernel_cache
-from mauvecl.device.selftest import toy
+from mauvecl.device.toy_exposure import toy
 
 
 def test_device_is_chosen_by_name_or_number() -> None:
@@ -45,9 +45,8 @@ def test_error_names_missing_linker(tmp_path) -> None:
 
 def test_kernels_are_linked_without_a_compiler(tmp_path) -> None:
     """Link with a linker that knows none of the folders where compilers install their libraries."""
-    code = (
-        "from mauvecl.device.selftest import toy; from mauvecl import Engine; Engine().realise(toy(), count=64, seed=1)"
-    )
+    imports = "from mauvecl import Engine; from mauvecl.device.toy_exposure import toy"
+    code = f"{imports}; Engine().realise(toy(), count=64, seed=1)"
     (tmp_path / "bin").mkdir()
     linker = tmp_path / "bin" / "ld"
     linker.write_text(

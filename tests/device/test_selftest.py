@@ -12,9 +12,10 @@ from typer.testing import CliRunner
 
 from mauvecl.answers import files
 from mauvecl.cli.app import app
-from mauvecl.device import program, selftest
+from mauvecl.device import program, selftest, selftest_outcome
 from mauvecl.device.engine import Engine
 from mauvecl.device.kernel_cache import KernelCache
+from mauvecl.device.selftest_outcome import Check
 from mauvecl.runs.pool import LocalWorkers, Pool
 from mauvecl.study.study import Study
 
@@ -51,7 +52,7 @@ def another_key_schedule(source: str) -> str:
 @pytest.mark.long
 def test_self_test_passes(engine: Engine) -> None:
     """Pass on a correct device; limits of p = 1e-6 and 5 standard errors fail for one in 1e5 seeds."""
-    reported: list[selftest.Check] = []
+    reported: list[Check] = []
     checks = selftest.run(engine, reported.append)
     assert reported == checks
     assert len(checks) > 20
@@ -109,8 +110,8 @@ def test_selftest_command_reports_and_records_outcome(
 ) -> None:
     """Check table, file, exit codes 0 and 1 (failed check), and the outcome in later run records."""
     # A separate store keeps these invented outcomes out of the user's.
-    monkeypatch.setattr(selftest, "kernel_cache", lambda: KernelCache(tmp_path, tmp_path))
-    checks = [selftest.Check("one thing", True, "as it should be")]
+    monkeypatch.setattr(selftest_outcome, "kernel_cache", lambda: KernelCache(tmp_path, tmp_path))
+    checks = [Check("one thing", True, "as it should be")]
     monkeypatch.setattr(selftest, "run", lambda engine: checks)
     good = CliRunner().invoke(app, ["selftest", "--quiet", "--output", str(tmp_path)])
     assert good.exit_code == 0
@@ -119,11 +120,11 @@ def test_selftest_command_reports_and_records_outcome(
     kept = json.loads((tmp_path / "selftest.json").read_text())
     assert kept["passed"] is True
     assert kept["checks"][0]["name"] == "one thing"
-    assert selftest.read_outcome(engine.device) == kept
+    assert selftest_outcome.read_outcome(engine.device) == kept
     pool = Pool(LocalWorkers([None], make=lambda device, progress: engine))
     record = files.write_record("detect", Study(), [], tmp_path, pool=pool, seconds=0.0, messages=[])
     assert json.loads(record.read_text())["selftest"] == [kept]
-    checks.append(selftest.Check("another", False, "wrong"))
+    checks.append(Check("another", False, "wrong"))
     bad = CliRunner().invoke(app, ["selftest", "--quiet"])
     assert bad.exit_code == 1
     assert "FAIL" in bad.output

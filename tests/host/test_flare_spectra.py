@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from refusals import refused
 
-from mauvecl.host.stars.flare import blackbody
+from mauvecl.host.stars.blackbody import blackbody
 from mauvecl.host.stars.flare_spectra import (
     BALMER_EDGE_NM,
     LINES_NM,

@@ -22,6 +22,7 @@ from mauvecl.cli.app import app
 from mauvecl.host.expectation import expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.stars import hst_collections, own_stars
+from mauvecl.host.stars.add_star import add
 from mauvecl.host.stars.catalogue import library_table
 from mauvecl.host.stars.source import Source
 from mauvecl.study.study import Study
@@ -59,7 +60,7 @@ def archive_file(units: tuple[str, str], **header: Any) -> bytes:
 
 def test_kept_star_is_part_of_the_library(tmp_path: Path, own_folder: Path) -> None:
     file = text_file(tmp_path / "mine.txt")
-    kept = own_stars.add(file, "HD 1234")
+    kept = add(file, "HD 1234")
     assert kept.path.parent == own_folder
     star = Source.from_library("hd 1234")
     np.testing.assert_array_equal(star.wavelength_nm, Source.read(file).wavelength_nm)
@@ -79,21 +80,21 @@ def test_kept_star_is_part_of_the_library(tmp_path: Path, own_folder: Path) -> N
 def test_invalid_star_names_raise(tmp_path: Path) -> None:
     file = text_file(tmp_path / "mine.txt")
     with refused("name", "'g2v'"):
-        own_stars.add(file, "g2v")
+        add(file, "g2v")
     with refused("name", "64"):
-        own_stars.add(file, "../escape")
-    own_stars.add(file, "twin")
+        add(file, "../escape")
+    add(file, "twin")
     with refused("name", "'twin'", "`replace=True`"):
-        own_stars.add(file, "twin")
-    own_stars.add(text_file(tmp_path / "other.txt", 2.0), "Twin", replace=True)
+        add(file, "twin")
+    add(text_file(tmp_path / "other.txt", 2.0), "Twin", replace=True)
     assert len(own_stars.kept()) == 1
     np.testing.assert_allclose(Source.from_library("twin").flux_flam, 2 * Source.read(file).flux_flam, rtol=1e-15)
     with refused("name"):
-        own_stars.add(file, "a b") and own_stars.add(file, "a_b")
+        add(file, "a b") and add(file, "a_b")
 
 
 def test_changed_file_raises(tmp_path: Path) -> None:
-    kept = own_stars.add(text_file(tmp_path / "mine.txt"), "mine")
+    kept = add(text_file(tmp_path / "mine.txt"), "mine")
     text = kept.path.read_text()
     kept.path.write_text(text.replace("e-13", "e-12", 1))
     with refused("name", "'mine'"):
@@ -198,7 +199,7 @@ def test_short_spectrum_is_kept_with_its_extension(archive: str, tmp_path: Path)
     assert any("113 of its 1349 points" in message for message in messages)
     assert any("continued by M3V" in message for message in messages)
     models = WHOLE.parent / "ckp00_5750.fits"
-    surface = own_stars.add(f"{models}[g45]", "model")
+    surface = add(f"{models}[g45]", "model")
     assert "at the star's surface" in surface.unscaled
     with refused("magnitude"):
         expect(Source.from_library("model"), Instrument.load("mauve"), exposure=5.0)

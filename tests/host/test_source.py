@@ -16,7 +16,7 @@ from mauvecl.host.expectation import expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.stars import bands, catalogue
 from mauvecl.host.stars.band_names import ALIASES
-from mauvecl.host.stars.flare import blackbody
+from mauvecl.host.stars.blackbody import blackbody
 from mauvecl.host.stars.source import Source
 
 DATA = Path(__file__).parents[1] / "data"

@@ -11,7 +11,7 @@ from refusals import refused
 from scenes import instrument, star
 from scipy import optimize
 
-from mauvecl.device.selftest import toy
+from mauvecl.device.toy_exposure import toy
 from mauvecl.noise import reference
 from mauvecl.noise.cumulants import (
     DRAWS_TO_NOTICE,

@@ -9,7 +9,8 @@ from scipy import stats
 from mauvecl.device import selftest
 from mauvecl.device.engine import Engine
 from mauvecl.device.probes import Probes
-from mauvecl.noise import reference
+from mauvecl.device.toy_exposure import toy
+from mauvecl.noise import random_numbers, reference
 from mauvecl.noise.poisson import SMALLEST_EXPANDED, alias_table, table_set
 from mauvecl.noise.scene import prepare
 
@@ -110,7 +111,7 @@ def draws_to_tell(mean: float, offset: float, slope: float, cubic: float) -> flo
 @pytest.mark.parametrize("mean", [SMALLEST_EXPANDED, 2225.0, 22250.0, 1e6])
 def test_expansion_cannot_be_distinguished_from_exact_draws(mean: float) -> None:
     """By what the scene gives the device; without its last term 2e10 draws of a mean of 1000 would."""
-    scene = prepare([selftest.toy(4, 1, dark=mean)], recipe="apart")
+    scene = prepare([toy(4, 1, dark=mean)], recipe="apart")
     (source,) = scene.dark_counts[:1]
     assert source["bits"] == 0
     given = (float(source["offset"]), float(source["slope"]), float(source["cubic"]))
@@ -131,7 +132,7 @@ def test_rounded_normal_fails(mean: float) -> None:
 def test_expansion_equals_the_reference(probes: Probes) -> None:
     mean = 2225.0
     w = np.array(reference.words_at(np.arange(4096), 0, "dark", 1, 5))
-    z = reference.normal_pair(w[0], w[1])
+    z = random_numbers.normal_pair(w[0], w[1])
     root = np.sqrt(mean)
     coefficients = [np.float32(c) for c in (-1 / 6, root - 1 / (36 * root), -1 / (72 * root))]
     twin = [reference.expansion_draw(row, *coefficients) for row in z]

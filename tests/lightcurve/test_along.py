@@ -11,7 +11,6 @@ from mauvecl.host.orbit.targets import Target
 from mauvecl.host.orbit.time_grid import TimeGrid
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.lightcurve.stares.orbit_stare import OrbitStare, stare_along
-from mauvecl.lightcurve.stares.stare import Stare
 
 START, HOURS = "2026-09-20T03:00:00", 8.0
 
@@ -65,8 +64,8 @@ def test_thermal_curve_and_hits_can_be_given(orbit: Orbit) -> None:
     assert through.mean_hits_per_cm2_s > outside.mean_hits_per_cm2_s >= 1.0
 
 
-def test_stare_constructor_follows_the_orbit(orbit: Orbit, night: OrbitStare) -> None:
-    found = Stare.along(orbit, Target.of("eps Eri"), START, HOURS * 3600)
+def test_target_is_given_by_name_or_position(orbit: Orbit, night: OrbitStare) -> None:
+    found = stare_along(orbit, Target.of("eps Eri"), START, HOURS * 3600).stare
     assert found.start_s == pytest.approx(night.stare.start_s)
     assert night.messages == ()
     assert "along its track" in stare_along(orbit, "eps Eri", "2026-10-20", 7200.0).messages[0]

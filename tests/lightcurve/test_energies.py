@@ -72,7 +72,7 @@ def test_energies_agree_with_direct_integration():
 
 
 def test_blackbody_star_agrees_with_the_blackbody_scale():
-    from mauvecl.host.stars.flare import blackbody
+    from mauvecl.host.stars.blackbody import blackbody
 
     nm = np.linspace(160, 1200, 20_801)
     # Of one solar radius seen from 10 pc.

@@ -113,7 +113,7 @@ def test_drawn_light_carries_the_stated_energy(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(10))
 def test_replacing_flare_carries_the_energy_it_adds(seed: int) -> None:
     """The light of the hot patch less that of the photosphere, for stars that are blackbodies."""
-    from mauvecl.host.stars.flare import blackbody
+    from mauvecl.host.stars.blackbody import blackbody
 
     rng = np.random.default_rng(100 + seed)
     name, star_k, flare_k = str(rng.choice(BANDS)), float(rng.uniform(3000, 9000)), float(rng.uniform(9500, 30_000))

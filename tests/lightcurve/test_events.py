@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from refusals import refused
 
-from mauvecl.host.stars.flare import blackbody
+from mauvecl.host.stars.blackbody import blackbody
 from mauvecl.lightcurve.flares.events import Cooling, Event, check_contributions, coefficients, temperatures_of
 from mauvecl.lightcurve.flares.shapes import SHAPES
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mauvecl.device.engine import Engine
-from mauvecl.device.selftest import toy
+from mauvecl.device.toy_exposure import toy
 from mauvecl.noise import layout, reference
 from mauvecl.noise.additive import NEGLIGIBLE
 from mauvecl.noise.components import components
@@ -81,7 +81,7 @@ class Bursts(additive.AdditiveProcess):
 from mauvecl.noise import unknowns
 unknowns.ADDITIVE["bursts"] = Bursts
 from mauvecl import Engine, Study
-from mauvecl.device.selftest import toy
+from mauvecl.device.toy_exposure import toy
 from mauvecl.device.stare_engine import Stares
 from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.stare_scene import Flares, StareScene

@@ -9,7 +9,7 @@ import pytest
 from scenes import instrument, star
 
 from mauvecl.device.engine import Engine
-from mauvecl.device.selftest import toy
+from mauvecl.device.toy_exposure import toy
 from mauvecl.device.variants import scene_launches
 from mauvecl.host.expectation import Expectation
 from mauvecl.host.instrument.pixel_map import PixelMap

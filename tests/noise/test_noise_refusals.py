@@ -10,7 +10,7 @@ import pytest
 from refusals import Row, check
 from scenes import instrument, star
 
-from mauvecl.device.selftest import toy
+from mauvecl.device.toy_exposure import toy
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare

@@ -12,7 +12,7 @@ from scenes import instrument, star
 from scipy import optimize
 
 from mauvecl.device.engine import Engine
-from mauvecl.device.selftest import toy
+from mauvecl.device.toy_exposure import toy
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.cumulants import Cumulants, stack_is_exact
 from mauvecl.noise.processes import Processes, Uniform

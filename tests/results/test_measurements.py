@@ -129,7 +129,7 @@ def test_forecasts_agree_with_brute_force(
     grid = np.union1d(grid, np.add.outer(corners, [-0.1, 0.0, 0.1]).ravel())
     base = np.interp(grid, s.wavelength_nm, s.flux_flam)
     from mauvecl.host.stars.bands import photons
-    from mauvecl.host.stars.flare import blackbody
+    from mauvecl.host.stars.blackbody import blackbody
 
     def counts(amplitude: float, temperature: float, ratio: float, flux: float) -> np.ndarray:
         light, body = photons(s.wavelength_nm, s.flux_flam, "Kepler"), blackbody(s.wavelength_nm, temperature)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from mauvecl.store import layout as store
+from mauvecl.store import stored_scenes
 
 
 @pytest.fixture(autouse=True)
 def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Chunks of some 64 rows, so that a small store has several."""
-    monkeypatch.setattr(store, "CHUNK_BYTES", 64 * 197 * 2)
+    monkeypatch.setattr(stored_scenes, "CHUNK_BYTES", 64 * 197 * 2)

@@ -25,8 +25,7 @@ from mauvecl.cli.app import app
 from mauvecl.device.engine import Engine
 from mauvecl.host.files import atomic
 from mauvecl.runs.locks import locked
-from mauvecl.store import bulk
-from mauvecl.store import layout as store
+from mauvecl.store import bulk, layout, stored_scenes
 from mauvecl.store.export import Selection, _study, export
 from mauvecl.store.layout import Store
 from mauvecl.study.cases import cases
@@ -36,7 +35,7 @@ from mauvecl.study.study import Study
 def written(path: Path, asked: Study, engine: Any) -> Path:
     """Write a store of small chunks outside of a test, whose fixture sets their size."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(store, "CHUNK_BYTES", 64 * 197 * 2)
+        patch.setattr(stored_scenes, "CHUNK_BYTES", 64 * 197 * 2)
         bulk.realise(asked, path, engine)
     return path
 
@@ -249,9 +248,9 @@ def test_random_kills_lose_nothing(tmp_path: Path, painted: dict[str, bytes]) ->
 @pytest.mark.long
 def test_kill_at_every_step_of_writing_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Before each fsync, each rename and each line of digests, one by one."""
-    described, seen, step = Store(tmp_path, study(200)).description(), store.scenes(study(200)), 0
+    described, seen, step = Store(tmp_path, study(200)).description(), stored_scenes.scenes(study(200)), 0
     monkeypatch.setattr(Store, "description", lambda self: described)
-    monkeypatch.setattr(store, "scenes", lambda asked: seen)
+    monkeypatch.setattr(layout, "scenes", lambda asked: seen)
     while True:
         path, counted = tmp_path / f"{step}.zarr", iter(range(step + 1))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.campaigns.conditions import OrbitConditions
-from mauvecl.answers.campaigns.plan_text import energy, heading, months, two_digits
+from mauvecl.answers.campaigns.plan_text import energy, months, two_digits
 from mauvecl.answers.campaigns.planned import (
     NOTHING,
     CompletenessOf,
@@ -154,8 +154,15 @@ class PlanAnswer(Answer):
         return table_of(self.columns, self.planned, **about, study=self.study.text())
 
     @property
+    def heading(self) -> str:
+        """Number of targets and time of the plan."""
+        times = self.seen.times
+        targets = "1 target" if len(self.planned) == 1 else f"{len(self.planned)} targets"
+        return f"{targets}, {times.days:g} days from {times.iso(0.0)[:10]} (UTC)"
+
+    @property
     def views(self) -> list[View]:
-        return [View(heading(self), self.columns, self.table)]
+        return [View(self.heading, self.columns, self.table)]
 
     @property
     def stars(self) -> QTable:

@@ -335,7 +335,11 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
     measured = []
     for k, one in enumerate(expected):
         own = [{key.removeprefix(f"{k} "): x for key, x in part.items() if key.startswith(f"{k} ")} for part in parts]
-        found = Measurement.joined([Measurement.of_arrays(one.fitted, LEVELS, arrays) for arrays in own])
+        model = one.fitted
+        of_batch = partial(
+            Measurement.of_arrays, levels=LEVELS, names=model.names, units=model.units, bounds=model.bounds
+        )
+        found = Measurement.joined(list(map(of_batch, own)))
         measured.append(MeasuredFlare(**vars(one), found=found, selected=selected, frame=parts[0]["first"]))
     return measured
 

@@ -420,7 +420,7 @@ class AnalyseAnswer(Answer):
     @cached_property
     def neighbour_flares(self) -> QTable:
         """One row per event and star in the fibre: the flare of that star which would look like the event."""
-        return neighbour_flares(self.study, self.rows)
+        return neighbour_flares(self.study, [(row.date, row.event) for row in self.rows])
 
     @property
     def views(self) -> list[View]:

@@ -14,8 +14,8 @@ from mauvecl.study.cases import cases
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from mauvecl.answers.observations.analyse import EventRow
     from mauvecl.host.stars.source import Source
+    from mauvecl.observations.events import ObservedEvent
     from mauvecl.study.cases import Case
     from mauvecl.study.study import Study
 
@@ -28,9 +28,9 @@ class BlendedStar:
     separation_arcsec: float
     rise: float  # rise of all stars' light by a flare of unit amplitude on this star, relative to their light
 
-    def amplitude(self, event: EventRow) -> float:
+    def amplitude(self, event: ObservedEvent) -> float:
         """Return the amplitude of a flare on this star that raises the light as much as an event."""
-        return event.event.amplitude / self.rise if self.rise else float("inf")
+        return event.amplitude / self.rise if self.rise else float("inf")
 
 
 def blended_stars(study: Study) -> list[BlendedStar]:
@@ -65,23 +65,41 @@ def _electrons(case: Case, source: Source) -> float:
     return float((with_it.source_electrons - without.source_electrons).sum())
 
 
-#: Columns of the table, for pairs of an event and a star.
+@dataclass(frozen=True, eq=False)
+class NeighbourFlare:
+    """A flare on a star in the fibre that would look like an observed event."""
+
+    date: str  # of the brightest frame of the event
+    event: ObservedEvent
+    star: BlendedStar
+
+    @property
+    def amplitude(self) -> float:
+        """Rise of this star alone."""
+        return self.star.amplitude(self.event)
+
+    @property
+    def equivalent_duration_s(self) -> float:
+        """Equivalent duration of the flare."""
+        return self.event.equivalent_duration_s / self.event.amplitude * self.amplitude
+
+
+#: Columns of the table.
 COLUMNS = (
-    Column("date", lambda pair: pair[0].date, "", "of the brightest frame of the event", "event at",
-           lambda text: text[:22], kind=str),
-    Column("ampl_rec", lambda pair: pair[0].event.amplitude, "", "largest rise of the light of all stars",
-           "rise of all light", percent(".3g")),
-    Column("star", lambda pair: pair[1].name, "", "star on which the flare would be", "star", kind=str),
-    Column("separation", lambda pair: pair[1].separation_arcsec, "arcsec", "from the observed star", "arcsec", ".4g"),
-    Column("amplitude", lambda pair: pair[1].amplitude(pair[0]), "", "rise of this star alone, in the flare's band, at "
-           "the brightest frame, for a flare that looks like the event", "flare of the star", percent(".4g")),
-    Column("equivalent_duration",
-           lambda pair: pair[0].event.equivalent_duration_s / pair[0].event.amplitude * pair[1].amplitude(pair[0]), "s",
-           "of that flare, in the flare's band", "ED (s)", number(".4g")),
+    Column("date", "date", "", "of the brightest frame of the event", "event at", lambda text: text[:22], kind=str),
+    Column("ampl_rec", "event.amplitude", "", "largest rise of the light of all stars", "rise of all light",
+           percent(".3g")),
+    Column("star", "star.name", "", "star on which the flare would be", "star", kind=str),
+    Column("separation", "star.separation_arcsec", "arcsec", "from the observed star", "arcsec", ".4g"),
+    Column("amplitude", "amplitude", "", "rise of this star alone, in the flare's band, at the brightest frame, for a "
+           "flare that looks like the event", "flare of the star", percent(".4g")),
+    Column("equivalent_duration", "equivalent_duration_s", "s", "of that flare, in the flare's band", "ED (s)",
+           number(".4g")),
 )  # fmt: skip
 
 
-def neighbour_flares(study: Study, events: Iterable[EventRow]) -> QTable:
-    """Return the flares of each star in the fibre that would look like each event."""
+def neighbour_flares(study: Study, events: Iterable[tuple[str, ObservedEvent]]) -> QTable:
+    """Return the flares of each star in the fibre that would look like each event, given with its date."""
     stars = blended_stars(study)
-    return table_of(COLUMNS, [(event, star) for event in events for star in stars], study=study.text())
+    rows = [NeighbourFlare(date, event, star) for date, event in events for star in stars]
+    return table_of(COLUMNS, rows, study=study.text())

@@ -18,18 +18,18 @@ from mauvecl.schema.physical import DAY_S
 if TYPE_CHECKING:
     from astropy.io import fits
 
-    from mauvecl.answers.stares.stare import StareAnswer, StarStare
+    from mauvecl.answers.stares.star_stare import StarStare
+    from mauvecl.study.study import Study
 
 #: Start of a stare whose study names no time: 2026-01-01, MJD. Any would do.
 NO_TIME_MJD = 61_041
 
 
-def light_curve_file(answer: StareAnswer, number: int = 0) -> bytes:
-    """Return the FITS file of a star in a cell of the sweep."""
+def light_curve_file(study: Study, one: StarStare) -> bytes:
+    """Return the FITS file of a star in a cell of a study's sweep."""
     from astropy.io import fits
 
-    one = answer.stares[number]
-    when = answer.study.sky.time
+    when = study.sky.time
     first, comment = (NO_TIME_MJD, "arbitrary: no time was named") if when is None else (_mjd(when), "start of stare")
     primary = fits.PrimaryHDU()
     named: tuple[tuple[str, str | float, str], ...] = (
@@ -38,14 +38,14 @@ def light_curve_file(answer: StareAnswer, number: int = 0) -> bytes:
         ("INSTRUME", one.staring.quiet.instrument, ""),
         ("CCD-TEMP", one.staring.quiet.conditions["temperature_c"], "[Celsius] detector, where nothing heats it"),
         ("CREATOR", f"mauvecl {VERSION}", ""),
-        ("SEED", str(answer.study.run.seed), "of the draws"),
-        ("STARENO", answer.study.stare.number, "number of the stare"),
+        ("SEED", str(study.run.seed), "of the draws"),
+        ("STARENO", study.stare.number, "number of the stare"),
     )
     for key, value, text in named:
         primary.header[key] = (value, text)
-    if answer.study.sky.target is not None:
+    if study.sky.target is not None:
         with offline():
-            place = parse_position(answer.study.sky.target).icrs
+            place = parse_position(study.sky.target).icrs
         primary.header["RADESYS"] = "ICRS"
         primary.header["RA_OBJ"], primary.header["DEC_OBJ"] = (place.ra.deg, "[deg]"), (place.dec.deg, "[deg]")
     hdus = fits.HDUList([primary, _table(one), _intervals(one), *_spectra(one)])

@@ -14,11 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from mauvecl.answers.answer import Answer, InCell
+from mauvecl.answers.answer import Answer
+from mauvecl.answers.stares.light_curve_file import light_curve_file
+from mauvecl.answers.stares.star_stare import SearchResult, StareFlare, StarStare
 from mauvecl.lightcurve.flares.energies import Kind
 from mauvecl.lightcurve.flares.events import Event, coefficients, temperatures_of
-from mauvecl.lightcurve.search.alarms import Alarm, alarms
-from mauvecl.lightcurve.stares.light_curves import Draw, LightCurves, StareExpectation, draw_light_curves
+from mauvecl.lightcurve.search.alarms import alarms
+from mauvecl.lightcurve.stares.light_curves import Draw, draw_light_curves
 from mauvecl.runs.checkpoint import kept
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -48,57 +50,6 @@ KINDS: tuple[Kind, ...] = ("band", "bolometric")
 MOST_ROWS = 100_000
 #: Largest number of frames: 115 days, with spectra of 1.2 GB.
 MOST_SHOWN = 2_000_000
-
-
-@dataclass(frozen=True, eq=False)
-class StareFlare:
-    """A flare of a stare, with its energies and S/N."""
-
-    event: Event
-    band_erg: float  # NaN if the star's size is unknown
-    bolometric_erg: float  # likewise
-    snr: float  # of the matched filter for this flare
-
-
-@dataclass(frozen=True, eq=False)
-class SearchResult:
-    """Result of the search of a stare."""
-
-    threshold: float  # from importance sampling of normal noise
-    alarms: list[Alarm]  # in descending order of value
-    bolometric_erg: tuple[float, ...]  # of each alarm's fit; NaN if the star's size is unknown
-    # Number of the nearest flare of the stare within a half-width and two frames, from 1 on; 0 if there is none.
-    events: tuple[int, ...]
-    shifted: bool = False  # whether the threshold is raised for trends that the search does not remove
-
-
-@dataclass(frozen=True, eq=False)
-class FoundFlare:
-    """A flare that a search found: its bolometric energy, erg, and the number of the nearest flare of the stare."""
-
-    alarm: Alarm
-    bolometric_erg: float
-    event: int
-
-
-@dataclass(frozen=True, eq=False)
-class StarStare(InCell):
-    """A stare at one star in one cell of the sweep; `search` is a message if no search is possible."""
-
-    staring: StareExpectation
-    flares: tuple[StareFlare, ...]
-    light: LightCurves
-    search: SearchResult | str | None = None
-    # Share of all light that each frame lost in pointing drifts, shape (n_frame,); None unless drifts are drawn.
-    pointing_loss: Float | None = None
-
-    @property
-    def found(self) -> list[FoundFlare]:
-        """Flares that the search found."""
-        one = self.search
-        if not isinstance(one, SearchResult):
-            return []
-        return [FoundFlare(*parts) for parts in zip(one.alarms, one.bolometric_erg, one.events, strict=True)]
 
 
 def _with_error(value: float, error: float) -> str:
@@ -331,9 +282,8 @@ class StareAnswer(Answer):
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:
         """A FITS file of each star and cell: light curve, good time intervals, dynamic spectrum."""
-        from mauvecl.answers.stares.light_curve_file import light_curve_file
-
-        return {f"light-curve-{n}.fits": partial(light_curve_file, self, n - 1) for n in range(1, len(self.stares) + 1)}
+        stares = enumerate(self.stares, 1)
+        return {f"light-curve-{n}.fits": partial(light_curve_file, self.study, one) for n, one in stares}
 
     @property
     def inputs(self) -> list[Expectation]:

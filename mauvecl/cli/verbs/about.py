@@ -56,7 +56,7 @@ def selftest(
 
     from mauvecl.answers import files
     from mauvecl.cli.console import Meter, show, show_view
-    from mauvecl.device import selftest
+    from mauvecl.device import selftest, selftest_outcome
     from mauvecl.device.engine import Engine
     from mauvecl.schema.tables import View
 
@@ -66,17 +66,17 @@ def selftest(
         engine = Engine(device, progress=meter)
         checks = selftest.run(engine)
     seconds = time.perf_counter() - started
-    selftest.write_outcome(engine, checks, seconds)
+    selftest_outcome.write_outcome(engine.device, checks, seconds)
     failed = sum(not check.passed for check in checks)
     if as_json:
-        print(json.dumps(selftest.read_outcome(engine.device) or [asdict(check) for check in checks], indent=2))
+        print(json.dumps(selftest_outcome.read_outcome(engine.device) or [asdict(check) for check in checks], indent=2))
     else:
         title = f"Self-test of {engine.device_name}, driver {engine.driver}"
-        show_view(View(title, selftest.COLUMNS, [asdict(check) for check in checks]))
+        show_view(View(title, selftest_outcome.COLUMNS, [asdict(check) for check in checks]))
         outcome = f"{failed} of {len(checks)} checks FAILED" if failed else f"All {len(checks)} checks passed"
         show([f"{outcome} in {seconds:.0f} s. Promise: {engine.device.promise}."])
     if folder is not None:
-        files.write_json(selftest.read_outcome(engine.device), folder / "selftest.json")
+        files.write_json(selftest_outcome.read_outcome(engine.device), folder / "selftest.json")
     if failed:
         raise typer.Exit(1)
 

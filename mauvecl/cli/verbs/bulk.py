@@ -77,7 +77,7 @@ def realise(study: Study, session: Session) -> None:
 def _tell(store: Store, place: Path, session: Session) -> None:
     from mauvecl.cli.console import show_view
     from mauvecl.schema.tables import View
-    from mauvecl.store.layout import ARRAY_COLUMNS
+    from mauvecl.store.stored_scenes import ARRAY_COLUMNS
     from mauvecl.study.assumptions import assumption_line
     from mauvecl.study.messages import collect_messages
 

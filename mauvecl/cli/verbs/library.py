@@ -65,7 +65,7 @@ def add(
 
     Example: mauvecl library add my-star.txt --name "HD 1234"
     """
-    from mauvecl.host.stars.own_stars import add
+    from mauvecl.host.stars.add_star import add
     from mauvecl.schema.errors import InputError
 
     if name is not None and len(files) > 1:

@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 
 from mauvecl.host.stars.bands import band as find_band
 from mauvecl.host.stars.bands import photons
-from mauvecl.host.stars.flare import Geometry, added_light, blackbody
+from mauvecl.host.stars.blackbody import blackbody
+from mauvecl.host.stars.flare import Geometry, added_light
 from mauvecl.host.stars.flare_spectra import PARSEC_CM, STEFAN_BOLTZMANN, SUN_CM, Blackbody, FlareSpectrum
 from mauvecl.lightcurve.flares.shapes import Shape, shape_of
 from mauvecl.schema.calls import validated

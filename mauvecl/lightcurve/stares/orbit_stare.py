@@ -16,8 +16,9 @@ from mauvecl.host.orbit.targets import Target
 from mauvecl.host.orbit.time_grid import TimeGrid
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.lightcurve.stares.stare import MOST_FRAMES, Stare
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.physical import DAY_S
+from mauvecl.schema.physical import DAY_S, Duration
 
 Float = NDArray[np.float64]
 
@@ -43,13 +44,14 @@ class OrbitStare:
         return float(self.hits_per_cm2_s.mean())
 
 
+@validated
 def stare_along(
     orbit: Orbit,
     target: Target | str,
     start: str,
-    duration_s: float,
+    duration_s: Duration,
     *,
-    frame_s: float = 5.0,
+    frame_s: Duration = 5.0,
     limits: Limits | None = None,
     thermal: Thermal | None = None,
     particles: Particles | None = None,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,6 @@ from mauvecl.schema.physical import Duration, Moment
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
-    from mauvecl.host.orbit.orbit import Orbit
-    from mauvecl.host.orbit.targets import Target
 
 Float = NDArray[np.float64]
 #: Largest number of frames of a stare, twenty years of 5 s.
@@ -220,13 +218,6 @@ class Stare:
             _unknowns(start, float(frame_s), orbit_s, offsets or {}, drifts or {}, cycles or {}),
             pointing,
         )
-
-    @classmethod
-    def along(cls, orbit: Orbit, target: Target | str, start: str, duration_s: Duration, **how: Any) -> Stare:
-        """Return the stare along an orbit; see `orbit_stare.stare_along`, which also returns the particle rate."""
-        from mauvecl.lightcurve.stares.orbit_stare import stare_along
-
-        return stare_along(orbit, target, start, duration_s, **how).stare
 
     @property
     def jitters(self) -> dict[Changing, float]:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from mauvecl.lightcurve.stares.stare_scene import Flares, StareScene, unique
 from mauvecl.lightcurve.stares.sum_cumulants import SumTable
 from mauvecl.noise import layout, reference
-from mauvecl.noise.reference import MAGIC, combine_factors, fma, four_normals
+from mauvecl.noise.random_numbers import fma, four_normals
+from mauvecl.noise.reference import MAGIC, combine_factors
 
 Floats = NDArray[np.float32]
 Numbers = NDArray[np.uint64]

@@ -14,6 +14,7 @@ from mauvecl.drawable import Drawable
 from mauvecl.host.content_equality import ContentEquality
 from mauvecl.results.counts.tally import Distribution, TailSamples, Tally
 from mauvecl.results.detection.roc import Roc
+from mauvecl.results.detection.tails import Tail, tail
 from mauvecl.results.requests.channels import ChannelPlan, Key
 from mauvecl.results.requests.fap_checks import NoThresholdError, Tails, check_atom, check_fap, countable
 from mauvecl.results.requests.hypotheses import Hypotheses
@@ -27,8 +28,6 @@ from mauvecl.statistics.statistic import LinearStatistic
 
 if TYPE_CHECKING:
     from astropy.table import QTable
-
-    from mauvecl.results.detection.tails import Tail
 
 
 @validated
@@ -140,8 +139,6 @@ class Detection(Drawable, ContentEquality, Hypotheses):
             return None
         key = (statistic, self._null(statistic, template), fap)
         if key not in self._tails:
-            from mauvecl.results.detection.tails import tail
-
             self._tails[key] = tail(self, fap, statistic, template=template, seed=self.seed)
         return self._tails[key]
 

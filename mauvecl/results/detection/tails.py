@@ -27,7 +27,7 @@ from mauvecl.statistics.statistic import Differences
 
 if TYPE_CHECKING:
     from mauvecl.noise.scene import Scene
-    from mauvecl.results.detection.detection import Detection
+    from mauvecl.results.requests.hypotheses import Hypotheses
 
 Float = NDArray[np.float64]
 
@@ -55,13 +55,13 @@ class Tail:
     realisations: int  # number of tilted draws
 
 
-def tail(detection: Detection, fap: float, statistic: str, *, template: int = 0, seed: int) -> Tail:
+def tail(hypotheses: Hypotheses, fap: float, statistic: str, *, template: int = 0, seed: int) -> Tail:
     """Find the threshold of a small false-alarm probability by importance sampling.
 
     Parameters
     ----------
-    detection : Detection
-        Detection of which only the scene and the quiescent star are used.
+    hypotheses : Hypotheses
+        Only the scene and the quiescent star are used.
     fap : float
         1e-10 to 0.1.
     statistic : str
@@ -79,16 +79,16 @@ def tail(detection: Detection, fap: float, statistic: str, *, template: int = 0,
     """
     if not SMALLEST_FAP <= fap <= 0.1:
         raise InputError.of("fap", fap, f"{SMALLEST_FAP:g} to 0.1 for importance sampling")
-    _check(detection)
-    how = _Tilt.for_alarms(fap, detection, statistic, template)
+    _check(hypotheses)
+    how = _Tilt.for_alarms(fap, hypotheses, statistic, template)
     values, logs = np.empty(0), np.empty(0)
     goal = FIRST_REALISATIONS
     while True:
-        more = _tilted(detection, statistic, template, how, seed, values.size, goal)
+        more = _tilted(hypotheses, statistic, template, how, seed, values.size, goal)
         values, logs = (np.concatenate(pair) for pair in zip((values, logs), more, strict=True))
         cut, low, high, error = _threshold(values, logs, fap)
         beyond, at = _probabilities_at(values, logs, cut)
-        check_atom(f"{statistic} of {detection.quiet.name}", fap, beyond, at)
+        check_atom(f"{statistic} of {hypotheses.quiet.name}", fap, beyond, at)
         if error <= WANTED_ERROR:
             return Tail(Interval(cut, low, high), fap, error, values.size)
         if goal >= MAX_REALISATIONS:
@@ -102,8 +102,8 @@ def tail(detection: Detection, fap: float, statistic: str, *, template: int = 0,
         goal *= 2
 
 
-def _check(detection: Detection) -> None:
-    scene, setting = detection.scene, detection.setting
+def _check(hypotheses: Hypotheses) -> None:
+    scene, setting = hypotheses.scene, hypotheses.setting
     reasons = {
         "noise drawn apart": not scene.joint,
         "frames drawn one by one": scene.frames,
@@ -161,13 +161,13 @@ class _Tilt:
     scores: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @classmethod
-    def for_alarms(cls, fap: float, detection: Detection, statistic: str, template: int) -> _Tilt:
+    def for_alarms(cls, fap: float, hypotheses: Hypotheses, statistic: str, template: int) -> _Tilt:
         """Choose a tilt that makes alarms of a given probability common."""
-        one, setting, flare = detection.statistic(statistic), detection.setting, detection.shape(statistic, template)
+        one, setting, flare = hypotheses.statistic(statistic), hypotheses.setting, hypotheses.shape(statistic, template)
         tilt = one.tilt(setting, flare)
         nothing = Differences(np.zeros(setting.used.size), one.variance(setting), setting.comparison.estimated)
         # Nuisance parameters that are not drawn do not scatter.
-        null = one.integrate_drawn(setting, detection.quiet, nothing, flare, priors=False)
+        null = one.integrate_drawn(setting, hypotheses.quiet, nothing, flare, priors=False)
         goal = null.isf(fap)
         parts, chance, scores = null.parts if isinstance(null, Mixture) else (null,), np.ones(1), {}
         if isinstance(null, Mixture):
@@ -175,7 +175,7 @@ class _Tilt:
             # Posterior probability of the factors given an alarm.
             chance = null.weights * [part.sf(goal) for part in parts]
             chance = chance / chance.sum()
-            nodes = setting.drawn.nodes(detection.quiet, weighted=tilt.square is None)[0]
+            nodes = setting.drawn.nodes(hypotheses.quiet, weighted=tilt.square is None)[0]
             for name in nodes[0].scores:
                 score = np.array([node.scores[name] for node in nodes])
                 mean = float(chance @ score)
@@ -227,22 +227,22 @@ def _stretch(square: Float, goal: float) -> Float:
 
 
 def _tilted(
-    detection: Detection, statistic: str, template: int, tilt: _Tilt, seed: int, start: int, stop: int
+    hypotheses: Hypotheses, statistic: str, template: int, tilt: _Tilt, seed: int, start: int, stop: int
 ) -> tuple[Float, Float]:
     """Return the values of tilted draws `start` to `stop - 1`, whole blocks, and the logarithms of their weights."""
-    parts = [_block(detection, statistic, template, tilt, seed, b) for b in range(start // BLOCK, stop // BLOCK)]
+    parts = [_block(hypotheses, statistic, template, tilt, seed, b) for b in range(start // BLOCK, stop // BLOCK)]
     values, logs = (np.concatenate(part) for part in zip(*parts, strict=True))
     return values, logs
 
 
 def _block(
-    detection: Detection, statistic: str, template: int, tilt: _Tilt, seed: int, block: int
+    hypotheses: Hypotheses, statistic: str, template: int, tilt: _Tilt, seed: int, block: int
 ) -> tuple[Float, Float]:
-    scene = detection.scene
-    one = detection.statistic(statistic)
+    scene = hypotheses.scene
+    one = hypotheses.statistic(statistic)
     exposures = 1 if one.paired else scene.comparison.exposures
     z, *others = (_normals(scene.n_pixel, seed, block, exposure) for exposure in range(1 + exposures))
-    added = one.added_variance(detection.setting)
+    added = one.added_variance(hypotheses.setting)
     # Only the difference is tilted; orthogonal combinations remain as drawn.
     root = np.sqrt(1.0 + added)
     difference = (z - added * sum(others)) / root
@@ -254,17 +254,17 @@ def _block(
         excess = _excess(scene, z + move / root)
     subtracted = [_excess(scene, other - added * move / root) for other in others]
     mean = added * np.sum(subtracted, axis=0) if subtracted else np.zeros_like(excess)
-    return _value(detection, statistic, template, excess, mean), logs
+    return _value(hypotheses, statistic, template, excess, mean), logs
 
 
-def _value(detection: Detection, statistic: str, template: int, excess: Float, mean: Float) -> Float:
+def _value(hypotheses: Hypotheses, statistic: str, template: int, excess: Float, mean: Float) -> Float:
     """Return the statistic of draws from observed and subtracted counts, DN above the reference, shape (n, n_pixel)."""
-    scene, one = detection.scene, detection.statistic(statistic)
-    x, added = excess - mean, one.added_variance(detection.setting)
-    variance = np.broadcast_to(one.variance(detection.setting), x.shape)
+    scene, one = hypotheses.scene, hypotheses.statistic(statistic)
+    x, added = excess - mean, one.added_variance(hypotheses.setting)
+    variance = np.broadcast_to(one.variance(hypotheses.setting), x.shape)
     if scene.comparison.estimated:
         variance = _estimated(scene, excess) + added * _estimated(scene, mean)
-    return one.values(detection.setting, x, variance, detection.shape(statistic, template))
+    return one.values(hypotheses.setting, x, variance, hypotheses.shape(statistic, template))
 
 
 def _estimated(scene: Scene, excess: Float) -> Float:

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
     from mauvecl.host.expectation import Expectation
-    from mauvecl.results.measurements.two_temperatures import TwoTemperatures
 
 Float = NDArray[np.float64]
 
@@ -109,11 +108,17 @@ class Measurement:
 
     @classmethod
     def of_arrays(
-        cls, model: FlareModel | TwoTemperatures, levels: Sequence[float], arrays: Mapping[str, NDArray[Any]]
+        cls,
+        arrays: Mapping[str, NDArray[Any]],
+        levels: Sequence[float],
+        *,
+        names: tuple[str, ...],
+        units: tuple[str, ...],
+        bounds: tuple[float, ...],
     ) -> Self:
-        """Return the measurement of a model's flares from its `arrays`."""
+        """Return a measurement from its `arrays`, levels of intervals, and the quantities that were measured."""
         given: dict[str, Any] = {**arrays, "dof": int(arrays["dof"])}
-        return cls(model.names, model.units, model.bounds, levels=tuple(levels), **given)
+        return cls(names, units, bounds, levels=tuple(levels), **given)
 
     def rows(self, which: NDArray[Any]) -> Self:
         """Return the measurements of some frames, by number or mask."""

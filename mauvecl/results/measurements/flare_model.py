@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mauvecl.host.response import Order, response_matrix
 from mauvecl.host.stars.bands import photons
-from mauvecl.host.stars.flare import blackbody
+from mauvecl.host.stars.blackbody import blackbody
 from mauvecl.host.stars.flare_spectra import (
     BALMER_EDGE_NM,
     ELECTRON_TEMPERATURE_K,
