@@ -20,7 +20,7 @@ from mauvecl.lightcurve.search.alarms import Alarm, alarms
 from mauvecl.lightcurve.search.blends import Factor
 from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
-from mauvecl.study.surveys import StarSurvey
+from mauvecl.study.surveys import StarSurvey, survey_star
 
 THRESHOLD = 4.92
 SQUARE = 0.72148
@@ -36,12 +36,12 @@ class Known:
     @property
     def surveyed(self) -> StarSurvey:
         """The star's search."""
-        return self.case.survey
+        return survey_star(self.case)
 
     @cached_property
     def log_energy(self) -> Factor | None:
         """As `stare` has it."""
-        return _log_energy(self.case)
+        return _log_energy(self.case, self.surveyed.templates.temperatures_k)
 
 
 def found(known: Known, events: list[Event], seed: int) -> list[Alarm]:

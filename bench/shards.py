@@ -30,6 +30,7 @@ from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.runs.cluster import DaskWorkers
 from mauvecl.runs.pool import LocalWorkers, Pool
 from mauvecl.runs.shards import fingerprint, shards
+from mauvecl.study.cases import Case
 from mauvecl.study.sections import Run
 from mauvecl.study.study import Study
 
@@ -55,7 +56,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results" / "shards.ecsv")
     given = parser.parse_args()
     study = Study().model_copy(update={"star": Study().star[1:], "run": Run()})
-    quiet, *flares = study.expectations(study.star[0])
+    quiet, *flares = Case(study).expectations
     how = (study.run.statistics,)
     one = DetectRequest(quiet, tuple(flares), 1 << 40, 1, *how)
     size = shards(DetectRequest(quiet, tuple(flares), 1 << 30, 1, *how))[0].count

@@ -26,6 +26,7 @@ from tables import write
 
 from mauvecl.device.engine import Engine
 from mauvecl.store import bulk
+from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 
 CHILD = """
@@ -56,7 +57,7 @@ def main() -> None:
     given = parser.parse_args()
     asked, engine = study(given.realisations), Engine()
     place = Path(tempfile.mkdtemp(dir=given.folder))
-    quiet = asked.expectations(asked.star[0])[0]
+    quiet = Case(asked).expectations[0]
     rows = np.empty((20_000, quiet.wavelength_nm.size), np.uint16)
     engine.realise(quiet, count=len(rows), seed=1, out=rows)
     total = 2 * given.realisations * rows.shape[1] * 2

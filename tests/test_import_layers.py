@@ -67,9 +67,9 @@ def test_packages_form_layers_without_cycles() -> None:
 
 
 def test_modules_form_no_circle() -> None:
-    """Check every import between modules at run time, including those inside functions."""
+    """Check every import between modules, including those inside functions and those for types."""
     grimp = pytest.importorskip("grimp")
-    graph = grimp.build_graph("mauvecl", cache_dir=None, exclude_type_checking_imports=True)
+    graph = grimp.build_graph("mauvecl", cache_dir=None)
     TopologicalSorter({module: graph.find_modules_directly_imported_by(module) for module in graph.modules}).prepare()
 
 

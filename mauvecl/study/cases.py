@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Self
 
+from mauvecl.study.labels import label
 from mauvecl.study.questions import Sweep
 
 if TYPE_CHECKING:
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from mauvecl.statistics.statistic import Setting
     from mauvecl.study.sections import Observation, SkyLight, Star
     from mauvecl.study.study import Study
-    from mauvecl.study.surveys import StarSurvey
 
 
 #: Number of stars whose spectra a study's cases keep, since a sweep may have any number of them.
@@ -89,8 +89,6 @@ class Case:
     @cached_property
     def label(self) -> str:
         """Name and magnitude of the star, for tables and plots."""
-        from mauvecl.study.labels import label
-
         return label(self.star, self.quiet)
 
     @property
@@ -219,28 +217,22 @@ class Case:
         """The study's stare."""
         from mauvecl.study.stare_expectation import stare_of
 
-        return stare_of(self)
+        return stare_of(self.study, self.instrument)
 
     @cached_property
     def stare_expectation(self) -> StareExpectation:
         """Expectation of the stare at the star, with its flares."""
         from mauvecl.study.stare_expectation import expect_stare
 
-        return expect_stare(self)
+        frame = self.one_frame
+        return expect_stare(self.stare, self.events, frame.quiet, frame.flare_electrons)
 
     @cached_property
     def events(self) -> list[Event]:
         """Flares in the stare."""
         from mauvecl.study.stare_expectation import events_of
 
-        return events_of(self)
-
-    @cached_property
-    def survey(self) -> StarSurvey:
-        """Search of the stare for flares."""
-        from mauvecl.study.surveys import survey_star
-
-        return survey_star(self)
+        return events_of(self.study, self.source)
 
 
 def cases(study: Study, *, swept: bool = True) -> list[Case]:

@@ -12,7 +12,7 @@ from mauvecl.study.sections import Star
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
-    from mauvecl.study.study import Study
+    from mauvecl.study.questions import Sweep
 
 
 def label(star: Star, x: Expectation) -> str:
@@ -22,14 +22,14 @@ def label(star: Star, x: Expectation) -> str:
     return name if star.magnitude is None else f"{name} {star.band} = {star.magnitude:g}{system}"
 
 
-def place_columns(study: Study, *own: str, star: str = "label") -> tuple[Column, ...]:
-    """Return the columns of the star and of what a study sweeps, for rows with the values `at` a cell of the sweep.
+def place_columns(sweep: Sweep, *own: str, star: str = "label") -> tuple[Column, ...]:
+    """Return the columns of the star and of the swept quantities, for rows with the values `at` a cell of the sweep.
 
     `own` names quantities for which a table has columns of its own, and `star` the attribute with the star's label.
     """
     return (
         star_column(star),
-        *(quantity_column(axis.quantity) for axis in study.sweep.axes if axis.quantity not in own),
+        *(quantity_column(axis.quantity) for axis in sweep.axes if axis.quantity not in own),
     )
 
 

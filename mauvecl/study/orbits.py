@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from mauvecl.host.orbit.time_grid import TimeGrid
     from mauvecl.lightcurve.flares.rates import Rates
     from mauvecl.lightcurve.search.completeness import DurationLaw
-    from mauvecl.study.study import Study
 
 #: Largest number of rows of a table of targets; a plan has a page for each.
 MAX_TARGETS = 500
@@ -233,13 +232,12 @@ class PlanQuestion(Section):
         return DurationLaw(self.half_width_s, self.at_erg, self.exponent, self.scatter_dex)
 
 
-def targets_of(study: Study) -> list[Target]:
-    """Look up the targets of a study: those of `orbit`, or else those of `plan`."""
+def targets_of(orbit: OrbitQuestion, plan: PlanQuestion) -> list[Target]:
+    """Look up the targets of `orbit`, or else those of `plan`."""
     from mauvecl.host.orbit.targets import Target
 
-    o = study.orbit
-    targets = [Target.of(text, simbad=o.simbad) for text in o.targets] or [
-        t.target(o.simbad) for t in study.plan.targets
+    targets = [Target.of(text, simbad=orbit.simbad) for text in orbit.targets] or [
+        target.target(orbit.simbad) for target in plan.targets
     ]
     if not targets:
         raise InputError(

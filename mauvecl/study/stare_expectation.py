@@ -18,13 +18,15 @@ from mauvecl.noise.priors import Normal, Prior
 from mauvecl.noise.unknowns import CHANGING, COURSES, PROCESSES, STARE_PROCESSES, Changing, Course, default_spreads
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.messages import Message
-from mauvecl.study.stare_section import EventChoice
+from mauvecl.study.stare_section import EventChoice, StareQuestion
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
+    from mauvecl.host.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
-    from mauvecl.study.cases import Case
+    from mauvecl.host.stars.source import Source
+    from mauvecl.study.orbits import OrbitQuestion
     from mauvecl.study.study import Study
 
 Float = NDArray[np.float64]
@@ -74,9 +76,9 @@ class StarePrior:
         return replace(stare, **{self.changes: getattr(stare, self.changes) * self.mean})
 
 
-def stare_of(case: Case) -> Stare:
-    """Return the stare of a case. Raises InputError if the stare cannot draw one of the study's processes."""
-    study, q, instrument = case.study, case.study.stare, case.instrument
+def stare_of(study: Study, instrument: Instrument) -> Stare:
+    """Return the stare of a study. Raises InputError if the stare cannot draw one of the study's processes."""
+    q = study.stare
     priors = [
         StarePrior.of(name, getattr(study.processes, name), instrument) for name, _ in study.processes.modulations
     ]
@@ -120,7 +122,7 @@ def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare
             key="stare.along_orbit",
             value=True,
         )
-    targets = targets_of(study)
+    targets = targets_of(study.orbit, study.plan)
     if len(targets) != 1:
         raise InputError(
             f"stare.along_orbit is true with {len(targets)} targets",
@@ -131,43 +133,54 @@ def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare
     return stare_along(o.orbit(), targets[0], o.start, q.duration_s, frame_s=frame_s, limits=o.limits, **changes).stare
 
 
-def expect_stare(case: Case) -> StareExpectation:
-    """Compute the expectation of a case's stare with its flares."""
-    stare, events = case.stare, case.events
+def expect_stare(
+    stare: Stare, events: Sequence[Event], quiet: Expectation, flare_electrons: Callable[[Float], Float]
+) -> StareExpectation:
+    """Compute the expectation of a stare with its flares.
+
+    Parameters
+    ----------
+    stare : Stare
+    events : sequence of Event
+    quiet : Expectation
+        One frame without a flare.
+    flare_electrons : callable
+        Electrons that flares of unit amplitude and some temperatures, K, add to a frame, shape
+        (n_temperature, n_pixel).
+    """
     check_contributions(events, stare.start_s, stare.frame_s)
     kelvin = temperatures_of(events)
     amplitudes = coefficients(events, stare.start_s, stare.frame_s, kelvin)
-    return StareExpectation(case.one_frame.quiet, stare, case.one_frame.flare_electrons(kelvin), amplitudes)
+    return StareExpectation(quiet, stare, flare_electrons(kelvin), amplitudes)
 
 
-def unused_lines(case: Case) -> list[str]:
+def unused_lines(exposure_s: float, stare: Stare, events: Sequence[Event]) -> list[str]:
     """Return messages about settings without effect on the stare: the exposure, and flares that peak outside it."""
-    exposure_s, frame_s = case.study.observation.exposure_s, case.stare.frame_s
-    lines = check_contributions(case.events, case.stare.start_s, frame_s)
-    if exposure_s != frame_s:
+    lines = check_contributions(events, stare.start_s, stare.frame_s)
+    if exposure_s != stare.frame_s:
         lines.insert(
             0,
             Message(
-                f"A stare is made of frames of {frame_s:g} s: observation.exposure_s = {exposure_s:g} s is not used.",
+                f"A stare is made of frames of {stare.frame_s:g} s: observation.exposure_s = {exposure_s:g} s is not "
+                "used.",
                 "not used",
             ),
         )
     return lines
 
 
-def orbit_lines(case: Case) -> list[str]:
+def orbit_lines(stare: StareQuestion, orbit: OrbitQuestion, frame_s: float) -> list[str]:
     """Return messages about the orbit of a stare with `along_orbit`."""
     from mauvecl.host.orbit.time_grid import TimeGrid
     from mauvecl.schema.physical import DAY_S
 
-    if not case.study.stare.along_orbit:
+    if not stare.along_orbit:
         return []
-    o = case.study.orbit
-    times = TimeGrid(o.start, case.study.stare.duration_s / DAY_S, case.instrument.frame_s)
+    times = TimeGrid(orbit.start, stare.duration_s / DAY_S, frame_s)
     assumed = (
         "Limits, temperatures and windows of a stare along the orbit are assumptions; stray light is not modelled."
     )
-    return [*o.orbit().messages(times), assumed]
+    return [*orbit.orbit().messages(times), assumed]
 
 
 def threshold_line(title: str, threshold: float) -> str:
@@ -180,49 +193,51 @@ def threshold_line(title: str, threshold: float) -> str:
     )
 
 
-def energy_scale(case: Case, kind: Kind, flare_k: float) -> EnergyScale | None:
-    """Return the energy of flares of a temperature per second of equivalent duration.
+def energy_scale(study: Study, source: Source, kind: Kind, flare_k: float) -> EnergyScale | None:
+    """Return the energy of flares of a temperature on the study's star per second of equivalent duration.
 
     It follows from the star's distance or else from its radius and temperature; None if neither is known.
     """
-    flare, star = case.study.flare, case.star
+    flare, star = study.flare, study.star[0]
     how: dict[str, Any] = {
         "band": flare.band, "flare": flare.light(flare_k), "kind": kind, "geometry": flare.geometry,
         "photosphere_k": flare.photosphere_temperature_k,
     }  # fmt: skip
     if star.distance_pc is not None:
-        return EnergyScale.of_star(case.source, star.distance_pc, **how)
+        return EnergyScale.of_star(source, star.distance_pc, **how)
     if star.radius_rsun is not None and star.effective_temperature_k is not None:
         return EnergyScale.of_blackbody(star.radius_rsun, star.effective_temperature_k, **how)
     return None
 
 
-def energy_of(case: Case, event: Event, kind: Kind, temperatures_k: Float | None = None) -> float | None:
+def energy_of(
+    study: Study, source: Source, event: Event, kind: Kind, temperatures_k: Float | None = None
+) -> float | None:
     """Return the energy of a flare, erg, or None if the star's distance and radius are unknown.
 
     `temperatures_k` are the temperatures between which flare spectra are interpolated; see `Event.total_energy`.
     """
-    if energy_scale(case, kind, event.hottest_k) is None:
+    if energy_scale(study, source, kind, event.hottest_k) is None:
         return None
 
     def scale_of(kelvin: float) -> EnergyScale:
-        scale = energy_scale(case, kind, kelvin)
+        scale = energy_scale(study, source, kind, kelvin)
         assert scale is not None
         return scale
 
     return event.total_energy(scale_of, temperatures_k)
 
 
-def events_of(case: Case) -> list[Event]:
-    """Return the flares of a case: `events`, or one per energy or amplitude, evenly spaced over the stare.
+def events_of(study: Study, source: Source) -> list[Event]:
+    """Return the flares of a study's star: `events`, or one per energy or amplitude, evenly spaced over the stare.
 
     Raises InputError if an energy is given for a star of unknown distance and radius.
     """
-    choices = case.study.events or _evenly_spaced(case.study)
-    events = [_event(case.study, choice) for choice in choices]
+    choices = study.events or _evenly_spaced(study)
+    events = [_event(study, choice) for choice in choices]
     # The spectrum of a cooling flare is interpolated between the temperatures of all flares.
     kelvin = temperatures_of(events)
-    return [_of_energy(case, choice, event, kelvin) for choice, event in zip(choices, events, strict=True)]
+    return [_of_energy(study, source, choice, event, kelvin) for choice, event in zip(choices, events, strict=True)]
 
 
 def _evenly_spaced(study: Study) -> Sequence[EventChoice]:
@@ -256,15 +271,15 @@ def _event(study: Study, choice: EventChoice) -> Event:
     return Event(choice.peak_s, half, amplitude, temperature, shape)
 
 
-def _of_energy(case: Case, choice: EventChoice, event: Event, temperatures_k: Float) -> Event:
+def _of_energy(study: Study, source: Source, choice: EventChoice, event: Event, temperatures_k: Float) -> Event:
     """Return the flare with the amplitude that follows from its energy, if one is given."""
     if choice.energy_erg is None:
         return event
     # The energy is linear in the amplitude.
-    one = energy_of(case, event, choice.energy, temperatures_k)
+    one = energy_of(study, source, event, choice.energy, temperatures_k)
     if one is None:
         raise InputError(
-            f"the amplitude of a flare of {choice.energy_erg:g} erg on {case.source.name} is unknown",
+            f"the amplitude of a flare of {choice.energy_erg:g} erg on {source.name} is unknown",
             "the star's distance_pc, or radius_rsun and effective_temperature_k",
             key="events.energy_erg",
             value=choice.energy_erg,

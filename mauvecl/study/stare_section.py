@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -21,7 +22,7 @@ from mauvecl.study.sections import Section
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.flares.shapes import Shape
-    from mauvecl.study.study import Study
+    from mauvecl.study.questions import Sweep
 
 #: Orbital period rounded down to a multiple of the frame time, s.
 ORBIT_FRAMES_S = 5680.0
@@ -166,18 +167,17 @@ class EventChoice(Section):
         return TableShape(columns[:, 0], columns[:, 1], self.shape_file.stem, shortened(self.shape_file.name))
 
 
-def check_sweep(study: Study) -> None:
+def check_sweep(sweep: Sweep, stare: StareQuestion, events: Sequence[EventChoice]) -> None:
     """Raise InputError if a swept quantity has no effect on the stare."""
     sizes = ("amplitude", "peak", "equivalent_duration_s", "energy_erg")
-    events = study.events
     fixed = {
         "exposure": True,
-        "amplitude": bool(study.stare.energies_erg)
+        "amplitude": bool(stare.energies_erg)
         if not events
         else all(any(getattr(event, size) is not None for size in sizes) for event in events),
         "flare_temperature": bool(events) and all(event.temperature_k is not None for event in events),
     }
-    for axis in study.sweep.axes:
+    for axis in sweep.axes:
         if fixed.get(axis.quantity):
             raise InputError(
                 f"a sweep over {axis.quantity.replace('_', ' ')} changes no flare of this stare",

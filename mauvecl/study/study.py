@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import Annotated, Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -38,9 +38,6 @@ from mauvecl.study.searches import InjectionQuestion, SearchChoice
 from mauvecl.study.sections import Flare, Observation, Run, Section, SkyLight, Star, Unknowns
 from mauvecl.study.stare_section import EventChoice, StareQuestion, resolve_stare_paths
 from mauvecl.study.study_text import locate_files, parse_toml_value, read_embedded_study, set_key, with_file_digests
-
-if TYPE_CHECKING:
-    from mauvecl.host.expectation import Expectation
 
 #: Sections that a study's text leaves out if they have their default values.
 OMITTED = (
@@ -274,12 +271,6 @@ class Study(Section):
         """True if a star or a target of a plan has a table of neighbours."""
         targets = any(target.neighbours is not None for target in self.plan.targets)
         return targets or any(star.neighbours is not None for star in self.star)
-
-    def expectations(self, star: Star) -> list[Expectation]:
-        """Return the expectations of a star without a flare and with each flare."""
-        from mauvecl.study.cases import Case
-
-        return Case(self.model_copy(update={"star": (star,)})).expectations
 
 
 def _has_values(data: Any) -> bool:

@@ -89,7 +89,7 @@ class Sizes:
     def chosen(cls, case: Case) -> Sizes:
         """Return the measure that a case's study chooses; raises InputError for energies of a star of unknown size."""
         asked, flare_k = case.study.injections.of, case.study.flare.temperature_k
-        bolometric = energy_scale(case, "bolometric", flare_k)
+        bolometric = energy_scale(case.study, case.source, "bolometric", flare_k)
         if asked is None:
             asked = "amplitude" if bolometric is None else "energy"
         if asked == "amplitude":
@@ -98,7 +98,7 @@ class Sizes:
         if asked == "duration":
             return cls("duration", 1, area)
         kind: Any = "bolometric" if asked == "energy" else "band"
-        scale = energy_scale(case, kind, flare_k)
+        scale = energy_scale(case.study, case.source, kind, flare_k)
         if scale is None:
             raise InputError(
                 f"injections.of = {asked!r}, but the size of {case.source.name} is unknown",
@@ -117,13 +117,16 @@ class Sizes:
         return size / (half_width_s**self.power * self.per_unit)
 
 
-def injected_sizes(case: Case, sizes: Sizes, threshold: float) -> NDArray[np.float64]:
-    """Return the sizes of injected flares, ascending; by default around a completeness of one half."""
+def injected_sizes(case: Case, sizes: Sizes, unit_snr: float, threshold: float) -> NDArray[np.float64]:
+    """Return the sizes of injected flares, ascending; by default around a completeness of one half.
+
+    `unit_snr` and `threshold` are those of the star's `StarSurvey` and its search.
+    """
     asked = case.study.injections
     widths = np.array([asked.half_width_low_s, asked.half_width_high_s])
     frames = widths / case.instrument.frame_s
     # S/N of a known flare on a known baseline: (A / sigma) sqrt(square integral x half-width in frames).
-    amplitude = threshold / case.survey.unit_snr / np.sqrt(shape_of(case.study.search.shape).square_integral * frames)
+    amplitude = threshold / unit_snr / np.sqrt(shape_of(case.study.search.shape).square_integral * frames)
     half = sizes.of_amplitude(amplitude, widths)
     low = DEFAULT_RANGE[0] * half.min() if asked.low is None else asked.low
     high = DEFAULT_RANGE[1] * half.max() if asked.high is None else asked.high

@@ -207,6 +207,6 @@ def test_sizes_can_be_energies():
 def test_impossible_size_raises_before_any_search(monkeypatch, stares):
     near = SMALL["star"][0]
     asked = study(star=[near, {**near, "distance_pc": None}], injections={"of": "energy"})
-    monkeypatch.setattr("mauvecl.study.surveys.survey_star", lambda *_: pytest.fail("searched"))
+    monkeypatch.setattr("mauvecl.answers.stares.inject.survey_star", lambda *_: pytest.fail("searched"))
     with refused("injections.of", value="energy"):
         inject(asked, stares)

@@ -11,6 +11,7 @@ from astropy.table import QTable
 from mauvecl.answers.detection.maps import detection_map
 from mauvecl.device.engine import Engine
 from mauvecl.schema.messages import of_kind
+from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 
 N = 20_000
@@ -34,7 +35,7 @@ AMPLITUDE = {"quantity": "amplitude", "start": 0.02, "stop": 0.5, "steps": 4, "l
 
 def alone(asked: Study, engine: Engine, x: float | str, y: float | str) -> list[float]:
     one = asked.at(asked.map.x.quantity, x).at(asked.map.y.quantity, y)
-    quiet, flare = one.expectations(one.star[0])
+    quiet, flare = Case(one).expectations
     found = engine.detect(quiet, [flare], realisations=N, seed=9, statistics=("chi2", "matched"))
     return [found.detection_probability(1e-2, s)[0].value for s in ("chi2", "matched")]
 

@@ -9,6 +9,7 @@ import pytest
 from mauvecl.answers.signal.simulate import simulate
 from mauvecl.host.files.json_text import json_text
 from mauvecl.schema.messages import of_kind
+from mauvecl.study.cases import Case
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study
 
@@ -17,7 +18,7 @@ def test_rounding_that_invalidates_closed_forms_is_reported() -> None:
     quiet = {"observation.changes={read_noise_dn=0.1}", "observation.temperature_c=-40"}
     asked = Study().with_changes({}, [{"library": "G2V", "magnitude": 12.0}])
     for settings, is_told in ((quiet, True), ((), False)):
-        x, *_ = asked.with_settings(sorted(settings)).expectations(asked.star[0])
+        x, *_ = Case(asked.with_settings(sorted(settings))).expectations
         assert bool(of_kind(collect_messages([x]), "rounding")) == is_told
 
 

@@ -24,6 +24,7 @@ from mauvecl.device.stare_engine import Stares
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.messages import of_kind
 from mauvecl.store.bulk import realise_file
+from mauvecl.study.cases import Case
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study
 
@@ -97,7 +98,7 @@ def test_flare_that_saturates_alone_is_reported(engine: Engine, tmp_path: Path, 
     ask, needs = VERBS[verb]
     range_nm = {"output_min_nm": 300.0, "output_max_nm": 340.0}
     study = question(3.3, range_nm, **(needs | {"flare": FLARING}))
-    quiet, flare = study.expectations(study.star[0])
+    quiet, flare = Case(study).expectations
     assert not of_kind(quiet.messages, "saturated")
     assert flare.saturated.any()
     said = ask(study, engine, tmp_path)

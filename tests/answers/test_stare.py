@@ -51,7 +51,7 @@ def test_spectra_summed_over_frames_equal_exposures_of_the_engine(stares):
     study = SHORT.with_settings(["stare.gaps=[]", "stare.duration_s=50", "flare.amplitudes=[0]"])
     study = study.model_copy(update={"stare": study.stare.model_copy(update={"thermal": None, "number": 3})})
     one = stare(study, stares).stares[0]
-    exposure, *_ = study.with_settings(["observation.exposure_s=50"]).expectations(study.star[0])
+    exposure, *_ = Case(study.with_settings(["observation.exposure_s=50"])).expectations
     raw = Engine().realise(exposure, start=3, count=1, seed=study.run.seed, mode="frames")[0]
     net = raw - 10 * (exposure.bias_dn + exposure.dark_dn)
     elements = np.bincount(exposure.element, net)

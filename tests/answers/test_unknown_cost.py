@@ -31,7 +31,7 @@ from mauvecl.results.requests.requests import DetectRequest
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.messages import of_kind
 from mauvecl.statistics.nuisances import Nuisances
-from mauvecl.study.cases import Case
+from mauvecl.study.cases import Case, cases
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.study import Study
 from mauvecl.web.fields import points
@@ -59,7 +59,7 @@ def test_cost_equals_that_of_the_methods(
     nuisances: dict[str, Any], known: float, plain: float, marginal: float
 ) -> None:
     asked = study(**nuisances)
-    found = unknown_cost("it", *asked.expectations(asked.star[0]), asked.nuisances, asked.run.comparison())
+    found = unknown_cost("it", *Case(asked).expectations, asked.nuisances, asked.run.comparison())
     assert found.known == pytest.approx(known, rel=0.01)
     assert found.plain == pytest.approx(plain, rel=0.022)
     assert found.marginal == pytest.approx(marginal, rel=0.01)
@@ -67,7 +67,7 @@ def test_cost_equals_that_of_the_methods(
     assert f"{found.marginal:.3g} marginalised" in line
     # Where the study names none, the documented ones, and it says so.
     none = NuisanceChoice()
-    found = unknown_cost("it", *asked.expectations(asked.star[0]), none, asked.run.comparison())
+    found = unknown_cost("it", *Case(asked).expectations, none, asked.run.comparison())
     (line,) = cost_lines([found], none)
     assert all(row.name in line for row in DOCUMENTED_NUISANCES)
     assert not marginal_lines(none)
@@ -99,7 +99,7 @@ def test_study_is_read_back_with_its_files(tmp_path: Path, engine: Engine) -> No
     again = tmp_path / "elsewhere" / "again.toml"
     again.write_text(asked.toml())
     assert Study.read(again).nuisances == asked.nuisances
-    quiet, flare = asked.expectations(asked.star[1])[:2]
+    quiet, flare = cases(asked, swept=False)[1].expectations[:2]
     found = asked.nuisances.marginalised(quiet)
     assert found is not None
     own = np.interp(quiet.wavelength_nm, [200, 450, 700], [1, 3, 1])
@@ -123,7 +123,7 @@ def test_points_in_a_study_equal_those_of_files() -> None:
     asked = study(own={"x": {"points": [[200, 1], [450, 3], [700, 1]], "sd": 2.0}})
     again = Study.build(tomllib.loads(asked.toml()), "text")
     assert again == asked
-    quiet, _ = asked.expectations(asked.star[0])
+    quiet, _ = Case(asked).expectations
     found = asked.nuisances.marginalised(quiet)
     assert found is not None
     np.testing.assert_allclose(found.spectra[0], np.interp(quiet.wavelength_nm, [200, 450, 700], [1, 3, 1]))
@@ -170,12 +170,12 @@ def test_usual_unknowns_follow_the_observation() -> None:
     processes = Case(asked).processes
     assert processes.detector_temperature.mean == 13
     assert processes.jitter.high == 0.01
-    quiet, _ = asked.expectations(asked.star[0])
+    quiet, _ = Case(asked).expectations
     found = asked.nuisances.marginalised(quiet)
     assert found is not None
     assert dict(zip(found.names, found.sd, strict=True)) == {"dark": 0.3, "light": np.inf, "sky": 0.1}
     dark_sky = asked.with_changes({"sky": {"none": True}}, None)
-    found = dark_sky.nuisances.marginalised(dark_sky.expectations(asked.star[0])[0])
+    found = dark_sky.nuisances.marginalised(Case(dark_sky).expectations[0])
     assert found is not None
     assert found.names == ("dark", "light")
     assert Case(study()).processes.detector_temperature is None

@@ -197,7 +197,7 @@ def test_study_has_processes(tmp_path: Path, engine: Engine) -> None:
     (tmp_path / "again.toml").write_text(study.toml())
     assert Study.read(tmp_path / "again.toml") == study
     found = detect(study, engine).stars[0].detection
-    quiet, *flares = study.expectations(study.star[0])
+    quiet, *flares = Case(study).expectations
     wanted = engine.detect(quiet, flares, realisations=2000, seed=1, processes=processes)
     np.testing.assert_array_equal(found.distribution("chi2", 0).counts, wanted.distribution("chi2", 0).counts)
     plain = engine.detect(quiet, flares, realisations=2000, seed=1)

@@ -25,6 +25,7 @@ from mauvecl.host.stars import hst_collections, own_stars
 from mauvecl.host.stars.add_star import add
 from mauvecl.host.stars.catalogue import library_table
 from mauvecl.host.stars.source import Source
+from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 
 
@@ -69,7 +70,7 @@ def test_kept_star_is_part_of_the_library(tmp_path: Path, own_folder: Path) -> N
     row = library_table()[-1]
     assert (row["name"], row["kept"]) == ("HD 1234", "yours")
     asked = Study.build({"star": [{"library": "HD 1234", "magnitude": 7.0}]}, "test")
-    assert asked.expectations(asked.star[0])[0].name == "HD 1234"
+    assert Case(asked).expectations[0].name == "HD 1234"
     own_stars.remove("hd 1234")
     with refused("name", "'HD 1234'"):
         Source.from_library("HD 1234")
@@ -218,7 +219,7 @@ def test_dereddened_star_is_marked_and_can_be_reddened(archive: str) -> None:
     plain = expect(star, mauve, exposure=5.0)
     assert any("dereddened by its archive" in m for m in plain.messages)
     dusty = Study.build({"star": [{"library": "HD146233", "magnitude": 7.0, "ebv": 0.1}]}, "test")
-    reddened = dusty.expectations(dusty.star[0])[0]
+    reddened = Case(dusty).expectations[0]
     assert not any("dereddened by its archive" in m for m in reddened.messages)
     ratio = (reddened.source_electrons / plain.source_electrons)[[100, -100]]
     assert ratio[0] < 0.8 < ratio[1]

@@ -9,7 +9,7 @@ from mauvecl.lightcurve.flares.events import Event, coefficients
 from mauvecl.lightcurve.search.alarms import LEFT_BEHIND, alarms
 from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
-from mauvecl.study.surveys import StarSurvey
+from mauvecl.study.surveys import StarSurvey, survey_star
 
 #: One false alarm in a star-month at 4.91, by importance sampling, and so 5e-6 in an orbit at 6.
 THRESHOLD = 6.0
@@ -18,7 +18,7 @@ THRESHOLD = 6.0
 @pytest.fixture(scope="module")
 def known() -> StarSurvey:
     study = Study().with_settings(['star=[{library="G2V", magnitude=7.4}]', "search.half_widths_s=[22, 42, 77, 144]"])
-    return Case(study).survey
+    return survey_star(Case(study))
 
 
 def drawn(known: StarSurvey, events: list[Event], seed: int) -> np.ndarray:

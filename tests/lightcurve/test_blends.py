@@ -10,7 +10,7 @@ from mauvecl.lightcurve.flares.events import Event, coefficients
 from mauvecl.lightcurve.search.alarms import Alarm, alarms
 from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
-from mauvecl.study.surveys import StarSurvey
+from mauvecl.study.surveys import StarSurvey, survey_star
 
 #: One false alarm in a star-month.
 THRESHOLD = 4.92
@@ -18,7 +18,7 @@ THRESHOLD = 4.92
 
 def survey_of(*settings: str) -> StarSurvey:
     study = Study().with_settings(['star=[{library="M3V", magnitude=9}]', *settings])
-    return Case(study).survey
+    return survey_star(Case(study))
 
 
 @pytest.fixture(scope="module")

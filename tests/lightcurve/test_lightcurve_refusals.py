@@ -31,6 +31,7 @@ from mauvecl.lightcurve.stares.curves import Curve, Sinusoid
 from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.orbit_stare import stare_along
 from mauvecl.lightcurve.stares.stare import Stare, StareUnknown
+from mauvecl.study.cases import cases
 
 BANK = Bank((20.0,), ONE, DAVENPORT, 5.0, KNOWN)
 START = np.arange(20) * 5.0
@@ -103,7 +104,7 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "energies of a completeness": (lambda: step(0.0, 1.0, energy=(1e33, 1e31)), "energy_erg"),
     "two flares": (lambda: fit_power_law(np.array([1e33, 1e34]), step(0.0, 1.0), 10.0), "energy_erg"),
     "no days": (lambda: fit_power_law(np.array([1e33, 1e34, 1e35]), step(0.0, 1.0), 0.0), "days"),
-    "frames of a signal": (lambda: frame_signal(*Study().expectations(Study().star[1])[:2]), "n_frames"),
+    "frames of a signal": (lambda: frame_signal(*cases(Study(), swept=False)[1].expectations[:2]), "n_frames"),
     "duration": (lambda: Stare.of(-5), "duration_s"),
     "many frames": (lambda: Stare.of(1e12), "duration_s"),
     "gaps without frames": (lambda: Stare.of(100, gaps=[(0, 100)]), "gaps"),

@@ -13,8 +13,8 @@ from mauvecl.lightcurve.defaults import DAYS, per_day
 from mauvecl.lightcurve.search.bank import Bank, Baseline
 from mauvecl.lightcurve.search.counted_rate import CountedRate, consecutive_alarm_rate
 from mauvecl.lightcurve.search.importance_sampling import LADDER, sample_rate
+from mauvecl.lightcurve.search.sampled_rate import draw_shifts
 from mauvecl.lightcurve.search.search import Search
-from mauvecl.lightcurve.search.unknown_shifts import UnknownShifts
 from mauvecl.lightcurve.stares.curves import Sinusoid
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.study.searches import SearchChoice
@@ -170,7 +170,7 @@ def test_false_alarms_in_random_stares_are_as_requested(stares):
         stare, level, free = random_stare(rng)
         one, _ = survey(stare, level, (25.0, 120.0), more=free)
         days = stare.observed_s / 86_400
-        tail = sample_rate(one.search, seed=number, draws=25).under(UnknownShifts.of(one, number))
+        tail = sample_rate(one.search, seed=number, draws=25).under(draw_shifts(one, number))
         cut = tail.threshold(-np.log1p(-asked) / days).value
         sums = stares.frames(one.components, stare, count=draws, seed=100 + number, method="cumulants")
         alarms += int(np.sum(one.search.largest(one.net(sums)).maximum > cut))
@@ -202,7 +202,7 @@ def test_false_alarms_with_unknown_noise_are_as_requested(stares):
     )  # fmt: skip
     one, _ = survey(stare, Baseline(window_s=1200.0), (25.0, 80.0), magnitude=9.5, part=True)
     known = sample_rate(one.search, seed=3, draws=60)
-    tail, n = known.under(UnknownShifts.of(one, 3)), 500
+    tail, n = known.under(draw_shifts(one, 3)), 500
     maxima = stares.reduced(one.largest_value_request(n, 8))["maximum"]
     for u in (4.0, 4.5, 5.0):
         k = int(np.flatnonzero(tail.thresholds == u)[0])
@@ -211,4 +211,4 @@ def test_false_alarms_with_unknown_noise_are_as_requested(stares):
         assert abs(p - tail.probability[k]) < 4 * spread
         assert np.exp(tail.log_rate(u)[0]) == pytest.approx(-np.log1p(-tail.probability[k]) / tail.days, rel=0.1)
     assert known.probability[k] < p / 10
-    assert known.under(UnknownShifts.of(survey(Stare.of(7000.0), KNOWN, (25.0,), part=True)[0], 3)) is known
+    assert known.under(draw_shifts(survey(Stare.of(7000.0), KNOWN, (25.0,), part=True)[0], 3)) is known

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from mauvecl.device.stare_engine import Stares
+from mauvecl.lightcurve.search.sampled_rate import sampled_rate
 from mauvecl.lightcurve.search.survey import Survey
 from mauvecl.noise.pointing import PointingDrifts
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.study import Study
+from mauvecl.study.surveys import survey_star
 
 #: Heavy drifts: a quarter of the time, all of the light at worst.
 HEAVY = "stare.pointing={rate_per_h=6.0, depth=1.0, duration_s=200.0}"
@@ -34,8 +36,8 @@ def test_false_alarms_stay_as_promised_with_drifts(star: str) -> None:
 
     Thresholds are bounds from above, and frames in drifts have less noise, so that there may be somewhat fewer alarms.
     """
-    survey = case(star, HEAVY).survey.survey
-    threshold = survey.sampled_rate(5).threshold(PER_DAY).value
+    survey = survey_star(case(star, HEAVY)).survey
+    threshold = sampled_rate(survey, 5).threshold(PER_DAY).value
     p = -np.expm1(-PER_DAY * survey.stare.observed_s / 86_400.0)
     alarmed = np.count_nonzero(maxima(survey, N_STARES) >= threshold)
     assert alarmed < N_STARES * p + 4.5 * np.sqrt(N_STARES * p * (1 - p))
@@ -43,7 +45,7 @@ def test_false_alarms_stay_as_promised_with_drifts(star: str) -> None:
 
 
 def test_search_that_does_not_marginalise_alarms_in_nearly_every_stare() -> None:
-    plain = case('{library="M3V", magnitude=9.0}').survey.survey
+    plain = survey_star(case('{library="M3V", magnitude=9.0}')).survey
     drifting = replace(plain, stare=replace(plain.stare, pointing=PointingDrifts(rate_per_h=6.0, depth=1.0)))
     assert np.mean(maxima(drifting, 40) > 6.0) > 0.8
     assert np.mean(maxima(plain, 40) > 6.0) < 0.1
@@ -51,7 +53,7 @@ def test_search_that_does_not_marginalise_alarms_in_nearly_every_stare() -> None
 
 def test_drifts_move_marginalised_sums_by_less_than_their_noise() -> None:
     """The same noise with and without drifts: sums of frames differ by far less than a standard deviation."""
-    survey = case('{library="M3V", magnitude=9.0}', HEAVY).survey.survey
+    survey = survey_star(case('{library="M3V", magnitude=9.0}', HEAVY)).survey
     steady = replace(survey, stare=replace(survey.stare, pointing=None))
     found = [
         Stares().frames(one.components, one.stare, count=4, seed=SEED, method="cumulants") for one in (survey, steady)
@@ -65,7 +67,7 @@ def test_drifts_move_marginalised_sums_by_less_than_their_noise() -> None:
 
 def test_flares_lose_light_in_drifts() -> None:
     """The mean excess of a flare at constant amplitude in a frame is its share of the light that is left."""
-    survey = case('{library="M3V", magnitude=9.0}', HEAVY).survey.survey
+    survey = survey_star(case('{library="M3V", magnitude=9.0}', HEAVY)).survey
     n = survey.stare.n_frames
     amplitudes = np.array([[0.0], [50.0]])
     how = {"count": 4, "seed": SEED, "method": "cumulants", "amplitudes": amplitudes}

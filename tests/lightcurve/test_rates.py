@@ -27,6 +27,7 @@ from mauvecl.lightcurve.search.completeness import (
     search_threshold,
 )
 from mauvecl.lightcurve.search.yields import Yield, fit_power_law, recovered_per_day
+from mauvecl.study.cases import cases
 
 
 def test_davenport2019_rates_equal_published_values() -> None:
@@ -159,7 +160,7 @@ def test_frame_signal_equals_the_sum_over_pixels() -> None:
     from mauvecl import Study
 
     study = Study().with_settings(["observation.exposure_s=5", "flare.amplitudes=[0.01]"])
-    quiet, flare = study.expectations(study.star[1])
+    quiet, flare = cases(study, swept=False)[1].expectations
     light = (flare.source_electrons - quiet.source_electrons) * quiet.gain_dn_per_electron
     expected = np.sqrt(np.sum(light**2 / quiet.variance_dn2))
     assert frame_signal(quiet, flare, 0.01) * 0.01 == pytest.approx(expected)

@@ -11,6 +11,7 @@ from mauvecl.lightcurve.defaults import per_day
 from mauvecl.lightcurve.search.bank import Baseline
 from mauvecl.lightcurve.search.flare_fit import SingleFlareFit
 from mauvecl.lightcurve.search.importance_sampling import sample_rate
+from mauvecl.lightcurve.search.sampled_rate import sampled_rate
 from mauvecl.lightcurve.stares.curves import Sinusoid
 from mauvecl.lightcurve.stares.stare import Stare
 
@@ -72,7 +73,7 @@ def test_false_alarms_with_random_drifts_and_cycles():
     for number in range(12):
         stare, level = random_stare(rng)
         one, _ = survey(stare, level, (25.0, 120.0, 600.0), star="K2.5V", magnitude=5.0)
-        tail = one.sampled_rate(number)
+        tail = sampled_rate(one, number)
         cut = tail.threshold(-np.log1p(-asked) / (stare.observed_s / 86_400)).value
         alarms += int(np.sum(one.search.largest(one.net(drawn(one, rng, count)[0])).maximum > cut))
         cut = tail.threshold(per_day(1.0, "month")).value
@@ -97,7 +98,7 @@ def test_thresholds_allow_for_residual_variability():
         level = Baseline(slope=kind == "cycles", window_s=12_000.0)
         one, _ = survey(stare, level, (25.0, 120.0, 600.0), star="K2.5V", magnitude=5.0)
         rate = -np.log1p(-asked) / (stare.observed_s / 86_400)
-        tail = one.sampled_rate(number)
+        tail = sampled_rate(one, number)
         assert tail.shifted
         maxima = one.search.largest(one.net(drawn(one, rng, count)[0])).maximum
         alarms += int(np.sum(maxima > tail.threshold(rate).value))
@@ -107,7 +108,7 @@ def test_thresholds_allow_for_residual_variability():
     assert plain > 1.5 * alarms
     one, _ = survey(Stare.of(6000.0, drifts={"temperature": 0.1}), Baseline(slope=False), (25.0,), part=True)
     with refused("false_alarms"):
-        one.sampled_rate(1).threshold(per_day(1.0, "month"))
+        sampled_rate(one, 1).threshold(per_day(1.0, "month"))
 
 
 @pytest.fixture(scope="module")

@@ -122,7 +122,7 @@ def at_the_rail() -> float:
 
     def faintest(magnitude: float) -> float:
         one = study(magnitude)
-        (x, *_) = one.expectations(one.star[0])
+        (x, *_) = Case(one).expectations
         return float((x.mean_raw_dn - x.ceiling_dn).min())
 
     low, high = -5.0, 10.0

@@ -37,6 +37,7 @@ from mauvecl.runs.pool import LocalWorkers, Pool, Stopped, map_in_order
 from mauvecl.runs.shards import fingerprint
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.linear import Linear
+from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 
 pytestmark = pytest.mark.usefixtures("small_shards")
@@ -242,7 +243,7 @@ def at_work(
     folder: Path, engine: Engine, progress: Any = None, study: Study | None = None, **how: Any
 ) -> tuple[Detection, Pool, Checkpoint]:
     study = study or small()
-    quiet, *flares = study.expectations(study.star[0])
+    quiet, *flares = Case(study).expectations
     with Checkpoint(folder, "detect", study, patience_s=0.0, **how) as checkpoint:
         pool = Pool(LocalWorkers([None], make=lambda d, progress: engine), checkpoint=checkpoint, progress=progress)
         return pool.detect(quiet, flares, realisations=N, seed=5), pool, checkpoint
@@ -253,7 +254,7 @@ def test_interrupted_run_is_resumed(tmp_path: Path, engine: Engine) -> None:
         at_work(tmp_path, engine, interrupting(20_000))
     found, pool, checkpoint = at_work(tmp_path, engine, resume=True)
     assert 16_000 < pool.standing.resumed < N
-    quiet, *flares = small().expectations(small().star[0])
+    quiet, *flares = Case(small()).expectations
     same(found, engine.detect(quiet, flares, realisations=N, seed=5))
     checkpoint.forget()
     assert list(tmp_path.iterdir()) == []
@@ -281,7 +282,7 @@ def test_counts_of_another_form_raise(tmp_path: Path, engine: Engine) -> None:
     path.write_text(json.dumps(old | {"digest": _digest_of(old)}))
     with refused("restart", "1", "2", "`restart=True`"):
         at_work(tmp_path, engine, resume=True)
-    quiet, *flares = small().expectations(small().star[0])
+    quiet, *flares = Case(small()).expectations
     request = DetectRequest(quiet, tuple(flares), N, 5)
     ours = fingerprint(request)
     with pytest.MonkeyPatch.context() as patch:
@@ -308,7 +309,7 @@ def test_flipped_byte_in_a_shard_is_found(tmp_path: Path, engine: Engine, place:
     found, pool, checkpoint = at_work(tmp_path, engine, resume=True)
     assert checkpoint.damaged == 1
     assert pool.standing.resumed >= 8192
-    quiet, *flares = small().expectations(small().star[0])
+    quiet, *flares = Case(small()).expectations
     same(found, engine.detect(quiet, flares, realisations=N, seed=5))
 
 
@@ -319,7 +320,7 @@ def test_misplaced_shard_is_found(tmp_path: Path, engine: Engine) -> None:
     first.write_bytes(second.read_bytes())
     found, _, checkpoint = at_work(tmp_path, engine, resume=True)
     assert checkpoint.damaged == 1
-    quiet, *flares = small().expectations(small().star[0])
+    quiet, *flares = Case(small()).expectations
     same(found, engine.detect(quiet, flares, realisations=N, seed=5))
 
 
@@ -334,13 +335,13 @@ def test_damaged_manifest_is_replaced(tmp_path: Path, engine: Engine, spoil: str
     assert "was damaged or missing and is written anew" in checkpoint.messages[0]
     assert pool.standing.resumed > 16_000
     assert manifest.read_text() == text
-    quiet, *flares = small().expectations(small().star[0])
+    quiet, *flares = Case(small()).expectations
     same(found, engine.detect(quiet, flares, realisations=N, seed=5))
 
 
 def test_short_runs_leave_no_files(tmp_path: Path, engine: Engine) -> None:
     study = small()
-    quiet, *flares = study.expectations(study.star[0])
+    quiet, *flares = Case(study).expectations
     with Checkpoint(tmp_path, "detect", study) as checkpoint:
         pool = Pool(LocalWorkers([None], make=lambda d, progress: engine), checkpoint=checkpoint)
         pool.detect(quiet, flares, realisations=N, seed=5)
@@ -359,7 +360,7 @@ def test_jumps_of_the_clock_have_no_effect(tmp_path: Path, engine: Engine, monke
     with Meter(quiet=True) as meter:
         found, pool, _ = at_work(tmp_path, engine, meter, resume=True)
     assert pool.standing.resumed > 16_000
-    quiet, *flares = small().expectations(small().star[0])
+    quiet, *flares = Case(small()).expectations
     same(found, engine.detect(quiet, flares, realisations=N, seed=5))
 
 
@@ -374,12 +375,12 @@ def test_full_disk_raises_and_is_resumed(tmp_path: Path, engine: Engine, monkeyp
     assert kept >= 1
     found, pool, _ = at_work(tmp_path, engine, resume=True)
     assert pool.standing.resumed == kept * 4096
-    quiet, *flares = small().expectations(small().star[0])
+    quiet, *flares = Case(small()).expectations
     same(found, engine.detect(quiet, flares, realisations=N, seed=5))
 
 
 def test_background_work_begins_once_after_the_devices() -> None:
-    quiet, *flares = small().expectations(small().star[0])
+    quiet, *flares = Case(small()).expectations
     begun: list[int] = []
     pool = Pool(LocalWorkers(), meanwhile=lambda: begun.append(pool.standing.of))
     assert begun == []
@@ -418,6 +419,6 @@ def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> Non
 
     with refused("number", "2"):
         list(map_in_order(pool, bad, range(6)))
-    quiet, *flares = small().expectations(small().star[0])
+    quiet, *flares = Case(small()).expectations
     with pytest.raises(Stopped):
         pool.detect(quiet, flares, realisations=N, seed=5)

@@ -28,7 +28,7 @@ from mauvecl.runs.locks import locked
 from mauvecl.store import bulk, layout, stored_scenes
 from mauvecl.store.export import Selection, _study, export
 from mauvecl.store.layout import Store
-from mauvecl.study.cases import cases
+from mauvecl.study.cases import Case, cases
 from mauvecl.study.study import Study
 
 
@@ -62,7 +62,7 @@ def test_rows_equal_those_of_the_engine(tmp_path: Path, engine: Engine) -> None:
     asked = study()
     made = bulk.realise(asked, tmp_path / "frames.zarr", engine)
     assert len(list(made.chunks())) > 4
-    quiet, flare = asked.expectations(asked.star[0])
+    quiet, flare = Case(asked).expectations
     for name, x in (("star-1/quiescent", quiet), ("star-1/flare-1", flare)):
         found = bulk.read(tmp_path / "frames.zarr", name)
         assert found.dims == ("realisation", "pixel")
@@ -80,7 +80,7 @@ def test_rows_equal_those_of_the_engine(tmp_path: Path, engine: Engine) -> None:
 def test_sums_have_32_bits_and_components_are_kept(tmp_path: Path, engine: Engine) -> None:
     asked = study(40, observation={"exposure_s": 50.0}, bulk={"components": True})
     bulk.realise(asked, tmp_path / "s.zarr", engine)
-    quiet, flare = asked.expectations(asked.star[0])
+    quiet, flare = Case(asked).expectations
     found = bulk.read(tmp_path / "s.zarr", "star-1/flare-1")
     assert found.dtype == np.int32
     np.testing.assert_array_equal(found.values, engine.realise(flare, count=40, seed=11))

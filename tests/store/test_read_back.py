@@ -16,6 +16,7 @@ from mauvecl.observations.reading import reduce_frames
 from mauvecl.store import bulk
 from mauvecl.store.export import Selection, export
 from mauvecl.store.layout import Store
+from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 
 #: Stacks of two frames, and single frames of which the second is stored.
@@ -29,7 +30,7 @@ def test_stores_are_read_back_with_their_metadata(tmp_path: Path, engine: Engine
     asked = study(40, **(STACKED if which == "stacked" else SINGLE))
     path = _written(tmp_path, asked, engine, ending)
     frames = read_frames(f"{path}[star-1/flare-1]")
-    _, x = asked.expectations(asked.star[0])
+    _, x = Case(asked).expectations
     raw = bulk.read(tmp_path / "frames.zarr", "star-1/flare-1").values.reshape(-1, x.wavelength_nm.size)
     n = 2 if which == "stacked" else 1
     np.testing.assert_allclose(frames.flux, raw - n * (x.bias_dn + x.dark_dn), rtol=1e-12, atol=1e-9)

@@ -26,6 +26,7 @@ from mauvecl.host.stars.flare_spectra import (
 from mauvecl.lightcurve.flares.rates import band_factor
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.stare_expectation import energy_of
+from mauvecl.study.surveys import survey_star
 
 DATA = Path(__file__).parent.parent / "data"
 FILE, QUIET = DATA / "spectra" / "ADLeo_912s.dat", DATA / "flares" / "adleo_quiescent2.dat"
@@ -112,13 +113,13 @@ def test_answers_take_any_spectrum(name: str) -> None:
     star, mauve = Source.from_library("M3V").at_magnitude(9), Instrument.load("mauve")
     quiet, lit = (expect(s, mauve, exposure=50.0) for s in (star, star.flaring(0.05, spectrum=TEXTS[name][1])))
     wanted = np.sqrt(np.sum((lit.signal_dn - quiet.signal_dn) ** 2 / quiet.variance_dn2))
-    seen, flare = study.expectations(study.star[0])
+    seen, flare = Case(study).expectations
     got = np.sqrt(np.sum((flare.signal_dn - seen.signal_dn) ** 2 / seen.variance_dn2))
     assert got == pytest.approx(wanted, rel=1e-9)
     one = study.with_settings(["stare.duration_s=600", "observation.exposure_s=5"])
     case = Case(one)
     staring, (event,) = case.stare_expectation, case.events
-    frames = [x.source_electrons for x in one.expectations(one.star[0])]
+    frames = [x.source_electrons for x in Case(one).expectations]
     np.testing.assert_allclose(0.05 * staring.flare_electrons[0], frames[1] - frames[0], rtol=1e-6, atol=1e-9)
     scale = EnergyScale.of_star(star, 5.0, flare=TEXTS[name][1])
     energy = energy_of(case, event, "bolometric")
@@ -126,7 +127,7 @@ def test_answers_take_any_spectrum(name: str) -> None:
 
 
 def test_search_injects_the_flare_of_the_file() -> None:
-    found = {name: Case(study_of(name)).survey for name in ("blackbody", "file", "jump")}
+    found = {name: survey_star(Case(study_of(name))) for name in ("blackbody", "file", "jump")}
     np.testing.assert_array_equal(found["file"].templates.directions, found["blackbody"].templates.directions)
     assert not np.array_equal(found["jump"].templates.directions, found["blackbody"].templates.directions)
     assert found["file"].unit_snr > found["blackbody"].unit_snr
@@ -196,6 +197,6 @@ def test_flare_file_is_located_from_an_answers_table(tmp_path: Path) -> None:
 
 def test_replacing_photosphere_needs_a_surface() -> None:
     for name in ("jump", "two", "lines"):
-        assert study_of(name, geometry="replaces").expectations(study_of(name).star[0])
+        assert Case(study_of(name, geometry="replaces")).expectations
     with refused("flare_geometry"):
-        study_of("file", geometry="replaces").expectations(study_of("file").star[0])
+        _ = Case(study_of("file", geometry="replaces")).expectations

@@ -67,7 +67,7 @@ class TargetObservation:
     @cached_property
     def scale(self) -> EnergyScale:
         """Bolometric energy of flares."""
-        scale = energy_scale(self.case, "bolometric", self.case.study.flare.temperature_k)
+        scale = energy_scale(self.case.study, self.case.source, "bolometric", self.case.study.flare.temperature_k)
         assert scale is not None
         return scale
 
@@ -155,7 +155,7 @@ def rates_of(text: PlanTarget, observation: TargetObservation) -> tuple[Rates | 
         return rates.in_band(BOLOMETRIC, flare=flare.light()), ""
     band, distance_pc = rates.amplitude_band, case.star.distance_pc
     measured = case.with_sections(flare=flare.model_copy(update={"band": band}))
-    scale = energy_scale(measured, "bolometric", flare.temperature_k)
+    scale = energy_scale(measured.study, measured.source, "bolometric", flare.temperature_k)
     assert scale is not None
     assert distance_pc is not None
     return rates.of_light(scale.erg_per_s, quiescent_luminosity(case.source, distance_pc, band)), ""

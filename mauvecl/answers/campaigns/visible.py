@@ -338,7 +338,7 @@ def visible(
     >>> seen.months["month"].tolist()
     ['2027-01']
     """
-    targets = tuple(targets_of(study))
+    targets = tuple(targets_of(study.orbit, study.plan))
     o = study.orbit
     track = o.orbit().track(o.times())
     directions = np.array([one.direction for one in targets])

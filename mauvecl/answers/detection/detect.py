@@ -94,7 +94,7 @@ class DetectAnswer(Answer):
             f"relative rise of the photons in the band {self.study.flare.band}",
         )
         share = share_columns(self.study.has_neighbours, "detection.quiet.target_share")
-        return (*place_columns(self.study, "amplitude"), *share, amplitude, *FOUND)
+        return (*place_columns(self.study.sweep, "amplitude"), *share, amplitude, *FOUND)
 
     @cached_property
     def table(self) -> QTable:
@@ -111,7 +111,7 @@ class DetectAnswer(Answer):
         """
         fap = self.study.run.fap
         parts = [(star, departure_table(star.detection, star.amplitudes, fap)) for star in self.stars]
-        return stacked(place_columns(self.study, "amplitude"), parts, study=self.study.text())
+        return stacked(place_columns(self.study.sweep, "amplitude"), parts, study=self.study.text())
 
     @property
     def views(self) -> list[View]:
@@ -136,7 +136,7 @@ class DetectAnswer(Answer):
             "Where the simulation differs from the closed form: false-alarm probability at the threshold that should "
             f"give {run.fap:g}"
         )
-        return [found, View(title, (*place_columns(self.study, "amplitude"), *departures.COLUMNS), differing)]
+        return [found, View(title, (*place_columns(self.study.sweep, "amplitude"), *departures.COLUMNS), differing)]
 
     @property
     def roc(self) -> QTable:
@@ -182,7 +182,7 @@ class DetectAnswer(Answer):
 
     def _of_statistics(self, parts: list[tuple[dict[str, Any], QTable]], *more: Column, **meta: object) -> QTable:
         """Stack tables of one star, statistic and amplitude each."""
-        place = [column.of(itemgetter("star")) for column in place_columns(self.study, "amplitude")]
+        place = [column.of(itemgetter("star")) for column in place_columns(self.study.sweep, "amplitude")]
         statistic = Column("statistic", description="detection statistic")
         return stacked((*place, statistic, amplitude_column(), *more), parts, **meta, study=self.study.text())
 

@@ -213,7 +213,7 @@ class GaussianAnswer(Answer):
 
     @property
     def _columns(self) -> tuple[Column, ...]:
-        return (*(column.of(itemgetter("star")) for column in place_columns(self.study)), *WORST_COLUMNS)
+        return (*(column.of(itemgetter("star")) for column in place_columns(self.study.sweep)), *WORST_COLUMNS)
 
     @property
     def views(self) -> list[View]:

@@ -169,7 +169,7 @@ class LimitAnswer(Answer):
         """Columns of star, sweep, flare and statistic."""
         amplitude = () if self.study.limit.of == "amplitude" else (amplitude_column(),)
         statistic = Column("statistic", description="detection statistic", heading="statistic")
-        return (*place_columns(self.study, "amplitude", star="star"), *amplitude, statistic)
+        return (*place_columns(self.study.sweep, "amplitude", star="star"), *amplitude, statistic)
 
     @property
     def table(self) -> QTable:

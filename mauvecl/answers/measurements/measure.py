@@ -208,7 +208,7 @@ class MeasureAnswer(Answer):
 
     @property
     def _first(self) -> tuple[Column, ...]:
-        return (*place_columns(self.study, "amplitude"), amplitude_column(), MODEL_COLUMN)
+        return (*place_columns(self.study.sweep, "amplitude"), amplitude_column(), MODEL_COLUMN)
 
     @property
     def tables(self) -> dict[str, Table]:
@@ -226,12 +226,12 @@ class MeasureAnswer(Answer):
     def joint(self) -> QTable:
         """Joint fits of shape and spectrum; one row per star, cell and quantity."""
         parts = [(one, table_of(JOINT_COLUMNS, [one.joint])) for one in self.stares if one.joint is not None]
-        return stacked(place_columns(self.study), parts, study=self.study.text())
+        return stacked(place_columns(self.study.sweep), parts, study=self.study.text())
 
     @cached_property
     def temperatures(self) -> QTable:
         """Measurements against time; one row per star, cell and bin of its stare."""
-        first = (*place_columns(self.study), MODEL_COLUMN)
+        first = (*place_columns(self.study.sweep), MODEL_COLUMN)
         parts = [
             (one, table_of(_bin_columns(one.drawn), [one]))
             for one in self.stares
@@ -246,13 +246,13 @@ class MeasureAnswer(Answer):
         views = [View(title, (*self._first, *columns_of(self.flares)), measured)]
         drawn = [one.drawn for one in self.stares if isinstance(one.drawn, MeasuredBins)]
         if drawn:
-            columns = (*place_columns(self.study), *_bin_columns(drawn[0]))
+            columns = (*place_columns(self.study.sweep), *_bin_columns(drawn[0]))
             title = f"Measured along the stare, in bins of S/N {self.study.measure.snr_per_bin:g}"
             views.append(View(title, columns, self.temperatures))
         if self.study.measure.joint_fit:
             title = "One stare: shape and spectrum of the flare, fitted to all frames together"
             shown = self.joint[self.joint["unit"] != "erg / cm2"]
-            views.append(View(title, (*place_columns(self.study), *JOINT_COLUMNS), shown))
+            views.append(View(title, (*place_columns(self.study.sweep), *JOINT_COLUMNS), shown))
         return [*views, View("Goodness of fit", (*self._first, *FIT_COLUMNS), self.fits)]
 
     @property
@@ -289,7 +289,7 @@ def measure(
     if study.flare.geometry != "added":
         raise InputError.of("flare.geometry", "replaces", "'added': fits take light for added")
     if study.measure.along_stare:
-        check_sweep(study)
+        check_sweep(study.sweep, study.stare, study.events)
     prepared = cases(study)
     if any(not amplitude > 0.0 for case in prepared for amplitude in case.amplitudes):
         raise InputError("flare amplitude = 0 in a measurement", "one above 0", key="flare.amplitudes", value=0)

@@ -187,7 +187,7 @@ class ChangeAnswer(Answer):
 
     @property
     def _place(self) -> tuple[Column, ...]:
-        return place_columns(self.study)
+        return place_columns(self.study.sweep)
 
     @cached_property
     def table(self) -> QTable:
@@ -356,6 +356,6 @@ def _visits(study: Study) -> NDArray[np.float64]:
     """Draw the times of visits to the first target of a study's orbit."""
     if not study.orbit.targets:
         raise InputError("periods need a target", "`orbit.targets`", key="orbit.targets")
-    o, target = study.orbit, targets_of(study)[0]
+    o, target = study.orbit, targets_of(study.orbit, study.plan)[0]
     seen = Visibility.of(o.orbit().track(o.times()), np.array([target.direction]), o.limits)
     return visit_times_d(seen.windows(0), study.change.visits, study.observation.exposure_s, study.run.seed)

@@ -94,7 +94,7 @@ class SnrAnswer(Answer):
     @property
     def views(self) -> list[View]:
         """S/N and noise at some wavelengths; all of them are in the files."""
-        place = place_columns(self.study)
+        place = place_columns(self.study.sweep)
 
         def at(star: StarSnr, per: Per) -> list[int]:
             return [place_of(star.result.expectation, nm, per) for nm in star.shown_nm]
@@ -112,7 +112,7 @@ class SnrAnswer(Answer):
         """Return a table of each star and cell as one, with the star and what is swept in front."""
         parts = ((star, table_of(star.result)) for star in self.stars)
         run = self.study.run
-        return stacked(place_columns(self.study), parts, realisations=run.realisations, study=self.study.text())
+        return stacked(place_columns(self.study.sweep), parts, realisations=run.realisations, study=self.study.text())
 
 
 @validated

@@ -17,6 +17,7 @@ from mauvecl.lightcurve.search.counted_rate import CountedRate, consecutive_alar
 from mauvecl.lightcurve.search.fit_accuracy import FitAccuracy, Refit
 from mauvecl.lightcurve.search.injected_completeness import InjectedCompleteness
 from mauvecl.lightcurve.search.injections import Injections
+from mauvecl.lightcurve.search.sampled_rate import sampled_rate
 from mauvecl.lightcurve.stares.stare_requests import Arrays
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
@@ -30,7 +31,7 @@ from mauvecl.study.labels import place_columns
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.stare_expectation import orbit_lines, threshold_line
 from mauvecl.study.study import Study
-from mauvecl.study.surveys import Sizes, StarSurvey, injected_sizes
+from mauvecl.study.surveys import Sizes, StarSurvey, injected_sizes, survey_star
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
@@ -228,7 +229,7 @@ class InjectAnswer(Answer):
     def _place(self) -> tuple[Column, ...]:
         """Columns of the star, the sweep and the dilution."""
         share = share_columns(self.study.has_neighbours, "surveyed.quiet.target_share")
-        return (*place_columns(self.study), *share)
+        return (*place_columns(self.study.sweep), *share)
 
     @property
     def views(self) -> list[View]:
@@ -303,7 +304,7 @@ def inject(
     answer.messages = [
         *(text for star in answer.stars for text in star.messages),
         *collect_messages(answer.inputs),
-        *orbit_lines(prepared[0]),
+        *orbit_lines(study.stare, study.orbit, prepared[0].instrument.frame_s),
     ]
     return answer
 
@@ -312,17 +313,18 @@ def _completeness(case: Case, engine: Stares | Pool, report: Callable[[float], N
     """Inject flares into the stare of a case and search for them; `report` receives the share that is done."""
     choice, asked, seed = case.study.search, case.study.injections, case.study.run.seed
     processes = case.study.processes.additive_only
-    known, survey = case.survey, case.survey.survey
+    known = survey_star(case)
+    survey = known.survey
     drawn = None
     if choice.nulls:
         maxima = _reduced(engine, survey.largest_value_request(choice.nulls, seed, processes))["maximum"]
         drawn = CountedRate(np.sort(maxima), survey.stare.observed_s / DAY_S)
-    tail = survey.sampled_rate(seed)
+    tail = sampled_rate(survey, seed)
     threshold = (
         tail.threshold(choice.rate) if choice.null == "sampled" or drawn is None else drawn.threshold(choice.rate)
     )
     sizes = Sizes.chosen(case)
-    values = injected_sizes(case, sizes, threshold.value)
+    values = injected_sizes(case, sizes, known.unit_snr, threshold.value)
     positions = min(asked.positions, asked.count)
     injections = Injections(
         survey, 0, asked.half_widths_s, threshold.value, seed, positions, -(-asked.count // positions), processes

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import itemgetter
@@ -20,6 +20,7 @@ from mauvecl.answers.stares.star_stare import SearchResult, StareFlare, StarStar
 from mauvecl.lightcurve.flares.energies import Kind
 from mauvecl.lightcurve.flares.events import Event, coefficients, temperatures_of
 from mauvecl.lightcurve.search.alarms import alarms
+from mauvecl.lightcurve.search.sampled_rate import sampled_rate
 from mauvecl.lightcurve.stares.light_curves import Draw, draw_light_curves
 from mauvecl.runs.checkpoint import kept
 from mauvecl.schema.calls import validated
@@ -32,6 +33,7 @@ from mauvecl.study.messages import collect_messages
 from mauvecl.study.stare_expectation import energy_of, orbit_lines, threshold_line, unused_lines
 from mauvecl.study.stare_section import check_sweep
 from mauvecl.study.study import Study
+from mauvecl.study.surveys import survey_star
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
@@ -203,7 +205,7 @@ class StareAnswer(Answer):
     def _columns(self) -> tuple[Column, ...]:
         searched = SEARCHED_COLUMNS if self.study.stare.search else ()
         drifting = () if self.study.stare.pointing is None else (POINTING_COLUMN,)
-        return (*place_columns(self.study), *COLUMNS, *searched, SATURATED_COLUMN, *drifting)
+        return (*place_columns(self.study.sweep), *COLUMNS, *searched, SATURATED_COLUMN, *drifting)
 
     @property
     def events(self) -> QTable:
@@ -222,7 +224,7 @@ class StareAnswer(Answer):
 
     def _after_place(self, columns: Iterable[Column]) -> list[Column]:
         """Return columns of the second part of rows after those of the star and cell, which are the first part."""
-        place = place_columns(self.study)
+        place = place_columns(self.study.sweep)
         return [*(one.of(itemgetter(0)) for one in place), *(one.of(itemgetter(1)) for one in columns)]
 
     def _table(self, columns: Iterable[Column], rows: Iterable[object]) -> QTable:
@@ -230,7 +232,7 @@ class StareAnswer(Answer):
 
     @property
     def views(self) -> list[View]:
-        place, asked = place_columns(self.study), self.study.search
+        place, asked = place_columns(self.study.sweep), self.study.search
         alarms = "false alarm" if asked.false_alarms == 1 else "false alarms"
         return [
             View("One stare each", self._columns, self.table),
@@ -324,7 +326,7 @@ def stare(
     checkpoint : Checkpoint, optional
         Keeps the frames that are drawn and the thresholds of searches.
     """
-    check_sweep(study)
+    check_sweep(study.sweep, study.stare, study.events)
     prepared = cases(study)
     # Sweeps do not change the frames.
     frames = prepared[0].stare.n_frames
@@ -346,8 +348,10 @@ def stare(
         drawn.append(_draw(case, engine, checkpoint))
         if progress is not None:
             progress(len(drawn), len(prepared))
-    messages = collect_messages(quiet) + orbit_lines(prepared[0])
-    messages += dict.fromkeys(line for case in prepared for line in unused_lines(case))
+    messages = collect_messages(quiet) + orbit_lines(study.stare, study.orbit, prepared[0].instrument.frame_s)
+    messages += dict.fromkeys(
+        line for case in prepared for line in unused_lines(case.study.observation.exposure_s, case.stare, case.events)
+    )
     messages += [one.search for one in drawn if isinstance(one.search, str)]
     messages += [
         threshold_line(one.title, one.search.threshold)
@@ -401,18 +405,18 @@ def _search(case: Case, draw: Draw, checkpoint: Checkpoint | None) -> SearchResu
     """Search the stare of a case for flares, or return a message if no search is possible."""
     study, staring, events = case.study, case.stare_expectation, case.events
     try:
-        known = case.survey
+        known = survey_star(case)
         survey = replace(known.survey, components=staring.components(known.templates.weights))
 
         def computed() -> Arrays:
-            tail = survey.sampled_rate(study.run.seed)
+            tail = sampled_rate(survey, study.run.seed)
             return {"threshold": np.array(tail.threshold(study.search.rate).value), "shifted": np.array(tail.shifted)}
 
         tail = kept(checkpoint, ("threshold", survey, study.text()), computed)
         threshold = float(tail["threshold"])
     except InputError as error:
         return Message(f"{case.label} is not searched: {error}.", "not searched")
-    scale = _log_energy(case)
+    scale = _log_energy(case, known.templates.temperatures_k)
     raised = alarms(survey, known.templates, draw(survey.components), threshold, scale)
     energies, nearest = [], []
     for alarm in raised:
@@ -437,12 +441,13 @@ def _event_of(case: Case, fit: FittedFlares) -> Event:
     return Event(*values, kelvin, case.study.search.shape)
 
 
-def _log_energy(case: Case) -> Factor | None:
+def _log_energy(case: Case, kelvin: Sequence[float]) -> Factor | None:
     """Return the logarithm of the energy per second of equivalent duration as a function of log temperature.
+
+    It is a spline through the energies at temperatures, K.
 
     Returns None if the star's size is unknown, or a template's temperature gives no energy.
     """
-    kelvin = case.survey.templates.temperatures_k
     one = Event(0.0, 1.0, 1.0, kelvin[0], case.study.search.shape)
     events = [replace(one, temperature=k) for k in kelvin]
     energies = np.array([_found_energy(case, event) for event in events])
@@ -461,7 +466,7 @@ def _found_energy(case: Case, event: Event) -> float:
     photosphere = flare.photosphere_temperature_k or case.source.temperature_k
     if flare.geometry == "replaces" and photosphere is not None and event.hottest_k <= photosphere:
         return float("nan")
-    energy = energy_of(case, event, "bolometric")
+    energy = energy_of(case.study, case.source, event, "bolometric")
     return float("nan") if energy is None else energy
 
 
@@ -470,7 +475,7 @@ def _flares(case: Case) -> tuple[StareFlare, ...]:
     staring, kelvin, frames = case.stare_expectation, temperatures_of(case.events), case.stare
     flares = []
     for event in case.events:
-        energies = [energy_of(case, event, kind, kelvin) for kind in KINDS]
+        energies = [energy_of(case.study, case.source, event, kind, kelvin) for kind in KINDS]
         band, bolometric = (float("nan") if energy is None else energy for energy in energies)
         own = coefficients([event], frames.start_s, frames.frame_s, kelvin)
         flares.append(StareFlare(event, band, bolometric, staring.snr(own)))

@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.search.importance_sampling import SampledRate, sample_rate
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.search.trend import Trend
-from mauvecl.lightcurve.search.unknown_shifts import UnknownShifts
 from mauvecl.lightcurve.stares.stare_requests import StaresRequest
 from mauvecl.lightcurve.stares.sum_cumulants import method_for
 from mauvecl.noise.processes import NONE, Processes
@@ -28,8 +26,6 @@ Float = NDArray[np.float64]
 
 #: Relative norm of a curve's residual below which it is a linear combination of others.
 MIN_CURVE = 1e-6
-#: Largest length of the part of a stare that importance sampling uses, star-days.
-SAMPLED_DAYS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,11 +127,6 @@ class Survey:
         return StaresRequest(
             self.components, self.stare, count, seed, method=method, processes=processes, reduction=largest
         )
-
-    def sampled_rate(self, seed: int) -> SampledRate:
-        """Estimate the false-alarm rate by importance sampling, including the stare's unknowns."""
-        part = self.of_days(SAMPLED_DAYS)
-        return sample_rate(part.search, seed=seed).under(UnknownShifts.of(self, seed, part))
 
     def of_days(self, days: float) -> Survey:
         """Return the survey of at most the first `days` star-days of the stare."""
