@@ -84,9 +84,10 @@ def test_study_has_a_stare_along_the_orbit(orbit: Orbit, night: OrbitStare) -> N
     assert found.start_s == pytest.approx(night.stare.start_s)
     assert found.temperature_c == pytest.approx(night.stare.temperature_c)
     assert [one.name for one in found.unknowns] == ["sky offset"]
-    assert "assumptions" in orbit_lines(Case(study))[-1]
-    assert "mean Sun-synchronous" in orbit_lines(Case(study.with_settings(["orbit.start=2027-06-01"])))[0]
-    assert orbit_lines(Case(Study())) == []
+    later = study.with_settings(["orbit.start=2027-06-01"])
+    assert "assumptions" in orbit_lines(study.stare, study.orbit, 5.0)[-1]
+    assert "mean Sun-synchronous" in orbit_lines(later.stare, later.orbit, 5.0)[0]
+    assert orbit_lines(Study().stare, Study().orbit, 5.0) == []
     for wrong in ("stare.orbit_gap_s=100", "orbit.targets=['eps Eri', 'Vega']"):
         with refused("stare.along_orbit"):
             _ = Case(study.with_settings([wrong])).stare

@@ -106,7 +106,7 @@ def test_drawn_light_carries_the_stated_energy(seed: int) -> None:
         }
         assert drawn[text.energy] == pytest.approx(text.energy_erg, rel=5e-4)
         for kind in ("band", "bolometric"):
-            stated = energy_of(case, flare, kind, kelvin)  # type: ignore[arg-type]
+            stated = energy_of(case.study, case.source, flare, kind, kelvin)  # type: ignore[arg-type]
             assert stated == pytest.approx(drawn[kind], rel=5e-4)
 
 

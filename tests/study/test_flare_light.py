@@ -122,7 +122,7 @@ def test_answers_take_any_spectrum(name: str) -> None:
     frames = [x.source_electrons for x in Case(one).expectations]
     np.testing.assert_allclose(0.05 * staring.flare_electrons[0], frames[1] - frames[0], rtol=1e-6, atol=1e-9)
     scale = EnergyScale.of_star(star, 5.0, flare=TEXTS[name][1])
-    energy = energy_of(case, event, "bolometric")
+    energy = energy_of(case.study, case.source, event, "bolometric")
     assert energy == pytest.approx(scale.erg_per_s * event.equivalent_duration_s, rel=1e-9)
 
 
