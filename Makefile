@@ -5,7 +5,7 @@ BIN := .venv/bin
 # Compiled files are kept whatever the shell says: the tests start Python some hundred times.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo check quick test lowest lint page docs dist mutants clean
+.PHONY: demo check quick test lowest lint page docs dist try-wheel mutants clean
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "mauvecl needs Python 3.11 or newer, found " + sys.version.split()[0])'
@@ -73,6 +73,15 @@ dist: .venv/dist.stamp
 	diff -r dist build/again
 	$(BIN)/twine check --strict dist/*
 	cd dist && sha256sum *
+
+# The wheel in an empty environment, from outside the checkout. Nothing but it and the linker is in the path: no compiler.
+WHEEL := build/wheel
+try-wheel:
+	$(PYTHON) -m venv --clear $(WHEEL)
+	$(WHEEL)/bin/python -m pip install --quiet --disable-pip-version-check dist/*.whl
+	mkdir $(WHEEL)/home && ln -s "$$(command -v ld)" $(WHEEL)/bin/ld
+	cd $(WHEEL)/home && env -i HOME="$$PWD" PATH="$$PWD/../bin" mauvecl selftest
+	cd $(WHEEL)/home && env -i HOME="$$PWD" PATH="$$PWD/../bin" mauvecl detect
 
 mutants: .venv/test.stamp
 	$(BIN)/python tools/mutation_check.py

@@ -1,0 +1,144 @@
+"""The public interface, line by line: what `docs/stability.md` promises for a major version.
+
+`tests/data/public_interface.txt` is derived from the registry of verbs, the schema of studies and instruments, the
+columns of tables and `mauvecl.__all__`. To accept additions: python tests/test_public_interface.py. A line that is
+gone breaks somebody's study, script or table; only a major version may delete it from the file, by hand.
+"""
+
+from __future__ import annotations
+
+import inspect
+import pkgutil
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from typer.main import get_command
+
+import mauvecl
+from mauvecl.answers.verbs import VERBS
+from mauvecl.cli.app import app
+from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.observations.mapping import FrameMapping
+from mauvecl.schema.fields import Unit, first
+from mauvecl.schema.section import fields_of
+from mauvecl.schema.tables import Column
+from mauvecl.study.study import Study
+
+FILE = Path(__file__).parent / "data" / "public_interface.txt"
+#: What is listed, with the least number of lines; fewer would mean that the listing lost sight of something.
+LEAST = {"command": 500, "study": 150, "instrument": 30, "mapping": 10, "column": 300, "python": 300}
+#: Classes that functions make, or that files fill: their constructors are not public.
+MADE = {"Detection", "Expectation", "Frames", "Instrument", "Source", "Study"}
+
+
+def commands(command: Any, path: str = "mauvecl") -> Iterator[str]:
+    """Yield each verb and each of its flags and arguments."""
+    yield f"command {path}"
+    for one in command.params:
+        if one.param_type_name == "argument":
+            yield f"command {path} {one.name.upper()}"
+        elif one.name != "help":
+            yield from (f"command {path} {flag}" for flag in (*one.opts, *one.secondary_opts))
+    for name, inner in getattr(command, "commands", {}).items():
+        yield from commands(inner, f"{path} {name}")
+
+
+def keys(section: Any, kind: str) -> Iterator[str]:
+    """Yield each key of a file, with its unit."""
+    for path, field in fields_of(section):
+        unit = first(field, Unit)
+        yield f"{kind} {'.'.join(path)}" + (f" [{unit.name}]" if unit and unit.name else "")
+
+
+def columns() -> Iterator[str]:
+    """Yield each column that a table of an answer or result can have, by the module that declares it."""
+    for package in ("answers", "results", "noise", "lightcurve", "store"):
+        home = import_module(f"mauvecl.{package}")
+        for found in pkgutil.walk_packages(home.__path__, f"{home.__name__}."):
+            module = import_module(found.name)
+            for declared in vars(module).values():
+                if isinstance(declared, tuple) and declared and all(isinstance(one, Column) for one in declared):
+                    for one in declared:
+                        yield f"column {found.name.split('.')[-1]}: {one.name}" + (f" [{one.unit}]" if one.unit else "")
+
+
+def call(name: str, function: Any) -> Iterator[str]:
+    """Yield a function with each of its parameters: by place, by name, and if one must be given."""
+    yield f"python {name}()"
+    parameters = [one for one in inspect.signature(function).parameters.values() if one.name not in ("self", "cls")]
+    for place, one in enumerate(parameters, 1):
+        where = "" if one.kind in (one.KEYWORD_ONLY, one.VAR_KEYWORD) else f"{place} "
+        star = {one.VAR_POSITIONAL: "*", one.VAR_KEYWORD: "**"}.get(one.kind, "")
+        needed = ", required" if one.default is one.empty and not star else ""
+        yield f"python {name}({where}{star}{one.name}{needed})"
+
+
+def python() -> Iterator[str]:
+    """Yield the names of `mauvecl`, parameters of functions, and what classes have of their own."""
+    for name in mauvecl.__all__:
+        value = getattr(mauvecl, name)
+        if isinstance(value, ModuleType):
+            for inner, member in inspect.getmembers(value, inspect.isfunction):
+                if member.__module__ == value.__name__ and not inner.startswith("_"):
+                    yield from call(f"{name}.{inner}", member)
+        elif inspect.isclass(value):
+            if not issubclass(value, Exception):
+                yield from call(name, value) if name not in MADE else (f"python {name}",)
+            for inner, member in inspect.getmembers_static(value):
+                module = getattr(getattr(member, "fget", None) or getattr(member, "__func__", member), "__module__", "")
+                if inner.startswith("_") or not str(module or "").startswith("mauvecl"):
+                    continue
+                if isinstance(member, property):
+                    yield f"python {name}.{inner}"
+                elif callable(getattr(value, inner)):
+                    yield from call(f"{name}.{inner}", getattr(value, inner))
+        elif callable(value):
+            yield from call(name, value)
+        else:
+            yield f"python {name}"
+    yield from (f"python {older}, now {verb.name}" for verb in VERBS.values() for older in verb.older)
+
+
+def public_interface() -> list[str]:
+    """Return every line, each once, sorted."""
+    lines = {*commands(get_command(app)), *keys(Study, "study"), *keys(Instrument, "instrument")}
+    lines |= {*keys(FrameMapping, "mapping"), *columns(), *python()}
+    return sorted(lines)
+
+
+def test_nothing_public_is_gone() -> None:
+    promised = FILE.read_text(encoding="utf-8").splitlines()
+    gone = sorted(set(promised) - set(public_interface()))
+    assert not gone, "public names are gone or have changed: deprecate them instead (docs/stability.md)"
+
+
+def test_additions_are_listed() -> None:
+    """To accept: python tests/test_public_interface.py."""
+    assert not sorted(set(public_interface()) - set(FILE.read_text(encoding="utf-8").splitlines()))
+
+
+def test_listing_covers_every_kind() -> None:
+    lines = public_interface()
+    for kind, least in LEAST.items():
+        assert len([line for line in lines if line.startswith(f"{kind} ")]) >= least, kind
+    for known in (
+        "command mauvecl detect --fap",
+        "study observation.exposure_s [s]",
+        "column detection: threshold",
+        "python expect(1 source, required)",
+        "python Engine.detect(realisations, required)",
+    ):
+        assert known in lines
+
+
+def main() -> None:
+    """Add what is new, and keep what is promised."""
+    promised = set(FILE.read_text(encoding="utf-8").splitlines()) if FILE.exists() else set()
+    FILE.write_text("\n".join(sorted(promised | set(public_interface()))) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
