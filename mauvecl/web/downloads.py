@@ -1,35 +1,24 @@
-"""Downloads: tables, and the study that reproduces them as a file, program or command."""
+"""Downloads: tables, and the studies that reproduce them, with their commands and programs."""
 
 from __future__ import annotations
 
 import io
-import json
-import shlex
 import tempfile
 import zipfile
 from pathlib import Path
-from pprint import pformat
 from typing import TYPE_CHECKING
 
 from mauvecl.schema.errors import InputError
+from mauvecl.web.commands import as_command, as_program
 from mauvecl.web.question import STAR_FILE
+from mauvecl.web.simulations import asked
+from mauvecl.web.tabs import TABS
 
 if TYPE_CHECKING:
     from mauvecl.study.study import Study
     from mauvecl.web.closed_forms import ClosedForms
     from mauvecl.web.question import Question
     from mauvecl.web.tabs.tab import Answers, Tab
-
-PYTHON = """from mauvecl import Engine, Study, detect
-
-study = Study.build(
-    {data},
-    "page",
-)
-answer = detect(study, Engine())
-print(answer.table)
-"""
-
 
 def study_file(study: Study, name: str) -> tuple[str, bytes]:
     """Return name and content of the study file, in a zip archive with an uploaded star."""
@@ -79,53 +68,29 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
         return path.name, path.read_bytes()
 
 
-def as_python(question: Question) -> str:
-    """Return the question as a Python program."""
-    data = pformat(question.data(), indent=4, width=100, sort_dicts=False)
-    return PYTHON.format(data=data.replace("\n", "\n    "))
+def taken_along(tab: Tab, question: Question, folder: Path) -> list[dict[str, str]]:
+    """Return what a tab asks as commands and Python programs, one each for each of its `questions`.
+
+    Parameters
+    ----------
+    tab : Tab
+    question : Question
+    folder : Path
+        Where an uploaded spectrum is written for the study.
+    """
+    found = []
+    for name in tab.questions:
+        verb, study = asked(name, question.study(folder))
+        if question.uploaded is not None:
+            # Relative to the study, instead of that on the server.
+            study = study.with_value(("star", "file"), Path(STAR_FILE))
+        found.append({"question": name, "command": as_command(verb, study), "python": as_program(verb, study)})
+    return found
 
 
-def as_command(question: Question) -> str:
-    """Return the question as a command; an uploaded spectrum requires the study file."""
-    q = question
-    if q.uploaded is not None or len(q.own_unknown) > 20:
-        return "mauvecl detect study.toml"
-    data = q.data()
-    spectrum = data["flare"].get("spectrum", {})
-    words = ["mauvecl", "detect", "--star", q.star, "--magnitude", f"{q.magnitude:.15g}", "--band", q.band]
-    words += [
-        "--amplitude",
-        repr(data["flare"]["amplitudes"][0]),
-        "--flare-temperature",
-        f"{q.flare_temperature_k:.15g}",
-    ]
-    for key, flag in (
-        ("balmer_jump", "--balmer-jump"),
-        ("second_temperature_k", "--second-temperature"),
-        ("second_area", "--second-area"),
-    ):
-        words += [flag, f"{spectrum[key]:.15g}"] if key in spectrum else []
-    for name, fraction in q.lines:
-        words += ["--line", f"{name}={fraction:.15g}"]
-    words += ["--exposure", f"{q.exposure_s:.15g}", "--instrument", q.instrument]
-    words += ["--temperature", f"{q.temperature_c:.15g}"]
-    words += {
-        "brightness": ["--sky", f"{q.sky_brightness:.15g}"],
-        "target and time": ["--target", q.target, "--time", q.time],
-        "none": ["--sky", "none"],
-    }[q.sky]
-    for name in data["run"]["statistics"]:
-        words += ["--statistic", name]
-    words += ["--fap", f"{q.fap:.15g}", "--realisations", str(q.realisations.number), "--seed", str(q.seed)]
-    if q.unknown == "the usual":
-        words.append("--with-unknowns")
-    if q.own_unknown:
-        points = ", ".join(f"[{nm!r}, {dn!r}]" for nm, dn in q.own_unknown)
-        words += ["--set", f"nuisances.own.own.points=[{points}]"]
-    if q.see.strip():
-        words += ["--set", f"orbit.targets={json.dumps([q.see.strip()])}", "--set", f"plan.hours={q.hours!r}"]
-    if q.signal != "net":
-        words += ["--set", f"observation.signal={q.signal}"]
-    if q.realisations.tails != "counted":
-        words += ["--set", f"run.tails={q.realisations.tails}"]
-    return shlex.join(words)
+def asked_study(name: str, study: Study) -> tuple[str, bytes]:
+    """Return the file of the study that one of a tab's `questions` asks; raises InputError for another name."""
+    if name not in {one for tab in TABS.values() for one in tab.questions}:
+        raise InputError(f"no tab asks {name[:40]!r}", "a question of a tab", key="name", value=name)
+    _, wanted = asked(name, study)
+    return study_file(wanted, "study")

@@ -24,7 +24,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 from mauvecl.web.card import card
 from mauvecl.web.closed_forms import ClosedForms
-from mauvecl.web.downloads import as_command, as_file, as_python, study_file
+from mauvecl.web.downloads import as_file, asked_study, taken_along
 from mauvecl.web.fields import UPLOADED, UPLOADED_UNKNOWN
 from mauvecl.web.simulations import DRAWING, SIMULATIONS
 from mauvecl.web.state import State
@@ -332,7 +332,7 @@ class Visitor(WebSocketHandler):
         which = key, tab, name, ending, tuple(answers)
         if which not in self._files:
             made = (
-                as_file(TABS[tab], name, ending, closed, answers) if tab in TABS else study_file(closed.study, "study")
+                as_file(TABS[tab], name, ending, closed, answers) if tab in TABS else asked_study(name, closed.study)
             )
             self._files[which] = made
             while len(self._files) > MOST_KEPT:
@@ -340,17 +340,13 @@ class Visitor(WebSocketHandler):
         return self._files[which]
 
     def _ask_export(self, asked: dict[str, Any]) -> None:
-        """Send the question as a Python program and as a command."""
-        try:
-            question = self.state(asked["link"]).question()
-        except InputError as error:
-            self.send(n=asked["n"], refused=str(error))
-            return
-        uploaded = question.uploaded is not None
-        self.send(
-            n=asked["n"], python=as_python(question), command=as_command(question), uploaded=uploaded,
-            study="" if uploaded else question.study().toml(),
-        )  # fmt: skip
+        """Send what a tab asks as commands and as Python programs."""
+        n, tab = asked["n"], tab_of(str(asked.get("tab")))
+        self._give(self._export(n, self.state(asked["link"]), tab), n=n)
+
+    async def _export(self, n: int, state: State, tab: Tab) -> None:
+        work = partial(taken_along, tab, state.question(), Path(self._folder.name))
+        self.send(n=n, taken=await self._in_thread(work))
 
 
 def tab_of(name: str) -> Tab:

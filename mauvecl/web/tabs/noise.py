@@ -64,6 +64,7 @@ class Noise(Tab):
     name, title = "noise", "Noise"
     about = "Where the noise comes from, pixel by pixel, without a flare; of pinned scenarios the photons of the star."
     pictures = (Budget(),)
+    questions = ("snr",)
     files = {"noise-budget": None}  # noqa: RUF012
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:

@@ -61,6 +61,7 @@ class Signal(Tab):
     about = "How well the star itself is measured, wavelength by wavelength."
     pictures = (SignalToNoise(),)
     simulations = {"detection": "Simulate"}  # noqa: RUF012
+    questions = ("snr",)
     files = {"snr": "detection"}  # noqa: RUF012
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:

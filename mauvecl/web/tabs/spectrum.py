@@ -99,6 +99,7 @@ class Spectrum(Tab):
     name, title = "spectrum", "Spectrum"
     about = "What the detector records, and the light that comes to the telescope."
     pictures = (Recorded(), Telescope())
+    questions = ("simulate",)
     files = {"observation": None}  # noqa: RUF012
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:

@@ -106,13 +106,21 @@ class Tab(ABC):
     simulations: ClassVar[Mapping[str, str]] = {}
     answer: ClassVar[str] = ""
     view: ClassVar[int] = 0
+    #: What is taken along: names of simulations or verbs; by default its own simulations.
+    questions: ClassVar[tuple[str, ...]] = ()
     #: Tables that can be taken along, with the simulation that each needs, or none.
     files: ClassVar[Mapping[str, str | None]] = {}
 
     def __init_subclass__(cls, **words: Any) -> None:
         super().__init_subclass__(**words)
-        if not cls.verb:
-            return
+        if cls.verb:
+            cls._follow_verb()
+        if "questions" not in vars(cls):
+            cls.questions = tuple(cls.simulations) or ("detection",)
+
+    @classmethod
+    def _follow_verb(cls) -> None:
+        """Take from the verb what the tab does not state itself."""
         verb, title = cls.verb, cls.verb.capitalize()
         about, *_ = VERBS[verb].help.split("\n")
         of_verb = {"name": verb, "title": title, "about": about, "simulations": {verb: title}, "answer": verb}

@@ -1,0 +1,174 @@
+"""A study as a command and as a Python program, from the metadata of its fields."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from pprint import pformat
+from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel
+
+from mauvecl.answers.verbs import VERBS
+from mauvecl.schema import parsing
+from mauvecl.schema.fields import Flag, found
+from mauvecl.schema.section import fields_of
+from mauvecl.study.sections import Star
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from mauvecl.answers.verbs import Verb
+
+#: Keys that are stated even at their default, so that readers see what was assumed.
+STATED = ("star", "flare.amplitudes", "observation.exposure_s", "observation.instrument", "sky", "run.fap",
+          "run.realisations", "run.seed")  # fmt: skip
+#: Keys without a flag of their own verb that it uses: unknowns are drawn by everything that observes.
+ALWAYS_USED = ("nuisances.", "observation.temperature_c")
+#: Longest value in a command; a longer one is in the study file.
+MOST_CHARACTERS = 500
+#: Name of the study file in a command that needs it.
+STUDY_FILE = "study.toml"
+
+#: Arguments of verbs for what their command does if a flare is given.
+OPTIONS = {"simulate": ", flaring=True"}
+
+PROGRAM = """from mauvecl import Engine, Study, {verb}
+
+study = Study.build(
+    {data},
+    "page",
+)
+answer = {verb}(study, Engine(){options})
+print(next(iter(answer.tables.values())))
+"""
+
+
+def differing(new: BaseModel, old: BaseModel, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the dotted path and the plain value of each key that has another value in `old`, or is `STATED`."""
+    for key, field in type(new).model_fields.items():
+        name, values = f"{path}{key}", (getattr(new, key), getattr(old, key))
+        # A new sky replaces all keys of the old one, and so does a section with a flag of its own.
+        whole = name == "sky" or bool(found(field, Flag))
+        if isinstance(values[0], BaseModel) and isinstance(values[1], BaseModel) and not whole:
+            yield from differing(*values, f"{name}.")
+        elif values[0] is not None and (values[0] != values[1] or name in STATED):
+            yield name, _plain(values[0])
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as TOML can hold it, without the defaults of records."""
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
+    if isinstance(value, tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, dict):
+        return {key: _plain(one) for key, one in value.items()}
+    return str(value) if isinstance(value, Path) else value
+
+
+def as_program(verb: str, study: Study) -> str:
+    """Return a question to a verb as a Python program."""
+    data: dict[str, Any] = {}
+    for name, value in _keys_of(VERBS[verb], study, Study()):
+        *sections, key = name.split(".")
+        place = data
+        for section in sections:
+            place = place.setdefault(section, {})
+        place[key] = value
+    text = pformat(data, width=100, sort_dicts=False).replace("\n", "\n    ")
+    return PROGRAM.format(verb=verb, data=text, options=OPTIONS.get(verb, ""))
+
+
+def as_command(verb: str, study: Study) -> str:
+    """Return a question to a verb as a command, which names a study file if flags cannot say all of it."""
+    one = VERBS[verb]
+    base = Study().with_settings([f"{key}={value}" for key, value in (one.defaults or {}).items()])
+    words = ["mauvecl", verb]
+    for name, value in _keys_of(one, study, base):
+        if name == "star":
+            words += [word for star in value for word in _star_words(star)]
+        elif name == "sky":
+            words += _sky_words(value)
+        else:
+            words += _flag_words(name, value, one) or ["--set", f"{name}={_toml(value)}"]
+    long = any(len(word) > MOST_CHARACTERS for word in words)
+    if long or any(star.file is not None for star in study.star):
+        words = ["mauvecl", verb, STUDY_FILE]
+    return shlex.join(words)
+
+
+def _keys_of(verb: Verb, study: Study, base: Study) -> Iterator[tuple[str, Any]]:
+    """Yield the keys of a study that a verb uses and that need to be said."""
+    flagged = {".".join(path) for path, field in fields_of(Study) if any(found(field, Flag))}
+    observes = _takes(verb, "star.library")
+    for name, value in differing(study, base):
+        if name in ("star", "sky"):
+            used = observes if name == "star" else _takes(verb, "sky.surface_brightness")
+        else:
+            used = _takes(verb, name) or name not in flagged or (observes and name.startswith(ALWAYS_USED))
+        if used:
+            yield name, value
+
+
+def _takes(verb: Verb, name: str) -> bool:
+    """Return whether a verb accepts the flag of a key."""
+    taken = (key for key in (*verb.observation, *verb.takes) if key != verb.without)
+    return name != verb.without and any(name == key or name.startswith(f"{key}.") for key in taken)
+
+
+def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
+    """Return the words of a key's flag, or none if the verb has no flag that takes such a value."""
+    path = tuple(name.split("."))
+    flags = [flag for key, field in fields_of(Study) if key == path for flag in found(field, Flag)]
+    if not _takes(verb, name):
+        return []
+    for flag in flags:
+        if isinstance(value, bool) and flag.read is None:
+            return [flag.names[0]] if value else []
+        if flag.read is parsing.line_fluxes:
+            return [word for line, share in value.items() for word in (flag.names[0], f"{line}={share!r}")]
+        if flag.read is parsing.axis and "start" in value:
+            spaced = [value["quantity"], *(_text(value[key]) for key in ("start", "stop", "steps"))]
+            return [flag.names[0], ":".join(spaced + ["log"] * value.get("log", False))]
+        if flag.read in (None, parsing.words) and flag.kind in (None, str):
+            values = value if isinstance(value, list) else [value]
+            if all(isinstance(one, str | int | float) for one in values):
+                return [word for one in values for word in (flag.names[0], _text(one))]
+    return []
+
+
+def _star_words(star: dict[str, Any]) -> list[str]:
+    """Return the flags of a star of the library."""
+    names = {key: flag.names[0] for key, field in Star.model_fields.items() for flag in found(field, Flag)}
+    usual = Star(library=star.get("library"))
+    said = {key: value for key, value in star.items() if key in names and value != getattr(usual, key)}
+    said = {"library": star.get("library")} | said
+    return [word for key, value in said.items() for word in (names[key], _text(value))]
+
+
+def _sky_words(sky: dict[str, Any]) -> list[str]:
+    if sky.get("none"):
+        return ["--sky", "none"]
+    if "target" in sky:
+        return ["--target", sky["target"], "--time", sky["time"]]
+    return ["--sky", _text(sky["surface_brightness"])] if "surface_brightness" in sky else []
+
+
+def _text(value: str | float) -> str:
+    """Return a value as it is typed, with every digit of a number."""
+    return value if isinstance(value, str) else f"{value:.17g}" if float(f"{value:.15g}") != value else f"{value:.15g}"
+
+
+def _key(key: str) -> str:
+    return key if key.isidentifier() and key.isascii() else json.dumps(key)
+
+
+def _toml(value: Any) -> str:
+    """Return a value as TOML on one line."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{_key(key)} = {_toml(one)}" for key, one in value.items()) + "}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_toml, value))}]"
+    return json.dumps(value, ensure_ascii=False)
