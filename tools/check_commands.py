@@ -2,7 +2,7 @@
 
 python tools/check_commands.py [--count 20] [--seed 1] [--tab NAME ...]
 
-Each tab's tables are simulated as its buttons do, its printed commands are run, and every column is compared bit by bit.
+Each tab's tables are simulated as its buttons do, its printed commands are run, and columns are compared bit by bit.
 """
 
 from __future__ import annotations

@@ -132,7 +132,7 @@ def takes_study(
             if "given" in kinds:
                 values["given"] = given
             study = study_of(study_file, given, flags, default)
-            question_values(study, detects="fap" in flags)
+            question_values(study, detects={"fap", "realisations"} <= flags.keys())
             if draws:
                 question_time(study, **{key: how[key] for key in ("device", "cluster", "insist")})
             with Session(called, study, **how) as session:

@@ -71,7 +71,7 @@ def _plain(value: Any) -> Any:
 def as_program(verb: str, study: Study) -> str:
     """Return a question to a verb as a Python program."""
     data: dict[str, Any] = {}
-    for name, value in _keys_of(VERBS[verb], study, Study()):
+    for name, value in keys_used(VERBS[verb], study, Study()):
         *sections, key = name.split(".")
         place = data
         for section in sections:
@@ -86,7 +86,7 @@ def as_command(verb: str, study: Study) -> str:
     one = VERBS[verb]
     base = Study().with_settings([f"{key}={value}" for key, value in (one.defaults or {}).items()])
     words = ["mauvecl", verb]
-    for name, value in _keys_of(one, study, base):
+    for name, value in keys_used(one, study, base):
         if name == "star":
             words += [word for star in value for word in _star_words(star)]
         elif name == "sky":
@@ -99,8 +99,8 @@ def as_command(verb: str, study: Study) -> str:
     return shlex.join(words)
 
 
-def _keys_of(verb: Verb, study: Study, base: Study) -> Iterator[tuple[str, Any]]:
-    """Yield the keys of a study that a verb uses and that need to be said."""
+def keys_used(verb: Verb, study: Study, base: Study) -> Iterator[tuple[str, Any]]:
+    """Yield the keys that a verb uses of a study, with their plain values, if they are `differing` from a base."""
     flagged = {".".join(path) for path, field in fields_of(Study) if any(found(field, Flag))}
     observes = _takes(verb, "star.library")
     for name, value in differing(study, base):

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mauvecl.web.question import Question
     from mauvecl.web.tabs.tab import Answers, Tab
 
+
 def study_file(study: Study, name: str) -> tuple[str, bytes]:
     """Return name and content of the study file, in a zip archive with an uploaded star."""
     file = study.star[0].file

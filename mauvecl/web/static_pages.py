@@ -29,6 +29,20 @@ KINDS = {
     "json": "application/json",
     "html": "text/html; charset=utf-8",
 }
+#: What to cite, as in the project's file CITATION.cff; the paper's volume and pages are not known there.
+BIBTEX = """@software{{mauvecl,
+  author = {{{{The mauvecl developers}}}},
+  title = {{mauvecl: would the Mauve satellite see this stellar flare?}},
+  version = {{{version}}}
+}}
+
+@article{{mauvesim,
+  author = {{Saba, A. and Favata, F. and Savini, G. and Tinetti, G. and Bradley, L. and Stotesbury, I. and
+            Tessenyi, M.}},
+  title = {{MauveSim: the instrument simulator software for the Blue Skies Space Mauve satellite}},
+  journal = {{RAS Techniques and Instruments}}
+}}
+"""
 _FOLDER = Path(__file__).parent / "assets"
 
 
@@ -92,8 +106,9 @@ def front() -> bytes:
     lookup = TemplateLookup([str(_FOLDER)], default_filters=["h"], strict_undefined=True)
     template = lookup.get_template("page.html.mako")
     text = template.render(
-        fields=fields, tabs=TABS, version=VERSION, words=json.dumps(words).replace("<", "\\u003c"), digest=_digest()
-    )
+        fields=fields, tabs=TABS, version=VERSION, bibtex=BIBTEX.format(version=VERSION), digest=_digest(),
+        words=json.dumps(words).replace("<", "\\u003c"),
+    )  # fmt: skip
     return str(text).encode()
 
 

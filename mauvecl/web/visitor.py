@@ -331,9 +331,7 @@ class Visitor(WebSocketHandler):
         answers = self._answers.get(key, {})
         which = key, tab, name, ending, tuple(answers)
         if which not in self._files:
-            made = (
-                as_file(TABS[tab], name, ending, closed, answers) if tab in TABS else asked_study(name, closed.study)
-            )
+            made = as_file(TABS[tab], name, ending, closed, answers) if tab in TABS else asked_study(name, closed.study)
             self._files[which] = made
             while len(self._files) > MOST_KEPT:
                 self._files.popitem(last=False)

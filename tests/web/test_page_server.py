@@ -13,7 +13,6 @@ import lzma
 import math
 import re
 import resource
-import shlex
 import socket
 import tempfile
 import threading
@@ -44,11 +43,10 @@ from mauvecl.statistics.registry import STATISTICS
 from mauvecl.study.study import Study
 from mauvecl.web import access, closed_forms, server, tabs, visitor
 from mauvecl.web.closed_forms import ClosedForms, percent
-from mauvecl.web.downloads import as_command, as_python
 from mauvecl.web.fields import FIELDS, PRESETS, UPLOADED_UNKNOWN, Number, star_words
 from mauvecl.web.figures import INKS
 from mauvecl.web.plain_log import Plain
-from mauvecl.web.simulations import SIMULATIONS, campaign_plan
+from mauvecl.web.simulations import SIMULATIONS, asked, campaign_plan
 from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS, limit
 from mauvecl.web.tabs.tab import FIXED
@@ -625,8 +623,9 @@ def test_downloads_equal_the_files_of_the_command_line(served: Any, tmp_path: Pa
         for tab in TABS.values():
             for name in tab.files:
                 _, table = await talk.file(link=link, tab=tab.name, name=name, ending="ecsv")
-                own = tab.name if tab.name in ("limit", "measure", "completeness", "plan") else ""
-                file, study = await talk.file(link=link, tab=own, name=name, ending="study")
+                verb, _, _ = COMMANDS[name]
+                (question,) = (one for one in tab.questions if asked(one, Study())[0] == verb)
+                file, study = await talk.file(link=link, tab="", name=question, ending="study")
                 assert file.endswith(".zip")
                 found[name] = table, study
         talk.end()
@@ -654,44 +653,6 @@ def test_downloads_equal_the_files_of_the_command_line(served: Any, tmp_path: Pa
     (folder / "star.ecsv").write_bytes(star_file(tmp_path / "other.txt"))
     with refused("file", value="star.ecsv"):
         Study.read(folder / "out" / "detection.ecsv")
-
-
-@pytest.mark.parametrize(
-    "link",
-    [
-        "",
-        "?star=Vega&magnitude=3&band=GALEX+NUV&sky=none&realisations=100000+sampled&fap=1e-06&unknown=the+usual",
-        "?sky=target+and+time&target=290.68+%2B11.12&time=2026-09-01T12:00&own_unknown=200+1,+450+3&seed=7&see=eps+Eri"
-        "&signal=paper",
-        "?balmer_jump=2.5&lines=Mg+II%3D0.03,+280%3D0.01",
-        "?second_temperature_k=30000&second_area=0.1",
-    ],
-)
-def test_command_and_program_reproduce_the_question(link: str, tmp_path: Path) -> None:
-    state = State()
-    state.follow(link)
-    question = state.question()
-    wanted = question.study()
-    program = as_python(question)
-    given: dict[str, Any] = {}
-    exec(program.partition("answer =")[0], given)
-    assert given["study"] == wanted
-    seen: list[Study] = []
-    from mauvecl.cli import session
-
-    def stop(self: Any, **_: Any) -> Any:
-        seen.append(self.study)
-        raise InputError("seen")
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(session.Session, "pool", stop)
-        patch.chdir(tmp_path)
-        words = shlex.split(as_command(question))
-        assert words.pop(0) == "mauvecl"
-        CliRunner().invoke(app, words)
-    (found,) = seen
-    # The page says of nothing that it is not said; what it comes to is the same.
-    assert found.toml() == wanted.toml()
 
 
 # Who is let in

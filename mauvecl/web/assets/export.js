@@ -5,6 +5,7 @@ import {byId, every} from "./dom.js"
 
 /** @typedef {import("./protocol.js").Live} Live */
 /** @typedef {import("./routing.js").Routing} Routing */
+/** @typedef {{question: string, command: string, python: string}} Taken */
 
 /** Save content as a file.
  * @param {string} name
@@ -44,7 +45,10 @@ export class Export {
     this.routing = routing
     this.offer = offer
     this.refused = refused
-    byId("study").onclick = () => this.take("", "study", "study", byId("study"))
+    /** @type {Taken[]} */
+    this.taken = []
+    byId("of").onchange = () => this.show()
+    byId("study").onclick = () => this.take("", this.chosen.question, "study", byId("study"))
     for (const button of every("[data-file]")) {
       const tab = button.closest("[role=tabpanel]").id.replace("panel-", "")
       button.onclick = () => this.take(tab, button.dataset.file, button.dataset.ending, button)
@@ -68,13 +72,29 @@ export class Export {
     })
   }
 
-  // Show the question as a command and as a program.
+  // Show what the open tab asks as commands and as programs.
   open() {
-    const n = this.live.ask("export", {link: this.routing.link}, message => {
+    const n = this.live.ask("export", {link: this.routing.link, tab: this.routing.seen.tab}, message => {
       this.live.done(n)
-      byId("as-command").textContent = message.refused ?? message.command
-      byId("as-python").textContent = message.refused ?? message.python
+      if (message.refused) {
+        this.refused(message.refused)
+        return
+      }
+      this.taken = message.taken
+      byId("of").replaceChildren(...this.taken.map(({command}) => new Option(command.split(" ", 2).join(" "))))
+      byId("of").parentElement.hidden = this.taken.length === 1
+      this.show()
       byId("export").showModal()
     })
+  }
+
+  /** The question of which command and program are shown. */
+  get chosen() {
+    return this.taken[byId("of").selectedIndex]
+  }
+
+  show() {
+    byId("as-command").textContent = this.chosen.command
+    byId("as-python").textContent = this.chosen.python
   }
 }

@@ -209,10 +209,12 @@ ${control(name)}
 <footer><p id="nominal">Nominal throughput, pieced together from the paper, datasheets and assumptions: not a flight calibration. Sensible uncertainty: 30 %, and 50 % below 250 nm.</p></footer>
 <dialog id="export" aria-labelledby="export-head">
 <h2 id="export-head">Take this question along</h2>
-<p>The same numbers, to the bit, wherever mauvecl runs.</p>
+<p>What this tab shows after its simulation: the same numbers, to the bit, wherever mauvecl runs.</p>
+<p class="row"><label for="of">Answer of</label> <select id="of"></select></p>
 <div class="row"><button type="button" class="main" id="study">Study for the command line</button><button type="button" data-copy="address">Copy the link</button></div>
 <h3>Command line</h3><pre id="as-command" tabindex="0"></pre><button type="button" data-copy="as-command">Copy the command</button>
 <h3>Python</h3><pre id="as-python" tabindex="0"></pre><button type="button" data-copy="as-python">Copy the program</button>
+<h3>Citation</h3><pre id="as-bibtex" tabindex="0">${bibtex}</pre><button type="button" data-copy="as-bibtex">Copy the BibTeX</button>
 <div class="row"><button type="button" data-closes>Close</button></div>
 </dialog>
 <dialog id="about" aria-labelledby="about-head">

@@ -21,7 +21,7 @@
  * A message of the server: which entries it has depends on what was asked.
  * @typedef {{n: number, faults: Faults, stray: string, answer: Answer, refused: string, tab: string,
  *   pictures: Record<string, Drawn>, rows: string[][], draws: boolean, ended: string, kind: string, progress: number,
- *   message: string, lacks: string, entered: string, file: string, command: string, python: string,
+ *   message: string, lacks: string, entered: string, file: string, taken: any[],
  *   pins: Record<string, Columns>, hello: string}} Message
  *
  * What the server says of a picture once.

@@ -1,0 +1,127 @@
+"""Commands and programs that the page prints: they are the question, and their numbers are the page's."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip("bokeh")
+
+from typer.testing import CliRunner
+
+from mauvecl.answers.verbs import VERBS
+from mauvecl.cli import session
+from mauvecl.cli.app import app
+from mauvecl.schema.errors import InputError
+from mauvecl.study.study import Study
+from mauvecl.web.commands import differing, keys_used
+from mauvecl.web.downloads import taken_along
+from mauvecl.web.simulations import asked
+from mauvecl.web.state import State
+from mauvecl.web.static_pages import BIBTEX
+from mauvecl.web.tabs import TABS
+
+ROOT = Path(__file__).parents[2]
+#: Links with fields that the random ones do not reach.
+LINKS = (
+    "",
+    "?star=Vega&magnitude=3&band=GALEX+NUV&sky=none&realisations=100000+sampled&fap=1e-06&unknown=the+usual",
+    "?sky=target+and+time&target=290.68+%2B11.12&time=2026-09-01T12:00&own_unknown=200+1,+450+3&seed=7&see=eps+Eri"
+    "&signal=paper&instrument=mauve-electrons",
+    "?balmer_jump=2.5&lines=Mg+II%3D0.03,+280%3D0.01&see=AU+Mic",
+    "?second_temperature_k=30000&second_area=0.1&visits=7",
+)
+
+
+def _tool() -> Any:
+    """Load `tools/check_commands.py`."""
+    spec = importlib.util.spec_from_file_location("check_commands", ROOT / "tools" / "check_commands.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+check_commands = _tool()
+
+
+def _study_of(command: str, monkeypatch: pytest.MonkeyPatch) -> Study:
+    """Return the study of a command, which is not answered."""
+    seen: list[Study] = []
+
+    def stop(self: Any) -> Any:
+        seen.append(self.study)
+        raise InputError("seen")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(session.Session, "__enter__", stop)
+        program, *words = shlex.split(command)
+        assert program == "mauvecl"
+        ended = CliRunner().invoke(app, words)
+        assert seen, ended.output
+    (found,) = seen
+    return found
+
+
+@pytest.mark.parametrize("number", range(len(LINKS) + 20))
+def test_command_and_program_are_the_question(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For every tab: links of choice, and 20 random ones; what the verb does not use is not said."""
+    monkeypatch.chdir(tmp_path)
+    state = State()
+    random = check_commands.random_link(np.random.default_rng([2, number]))
+    state.follow(LINKS[number] if number < len(LINKS) else random)
+    question = state.question()
+    for tab in TABS.values():
+        for one in taken_along(tab, question, tmp_path):
+            verb, wanted = asked(one["question"], question.study())
+            assert one["command"].startswith(f"mauvecl {verb}")
+            given: dict[str, Any] = {}
+            exec(one["python"].partition("answer =")[0], given)
+            found = _study_of(one["command"], monkeypatch), given["study"]
+            said = dict(keys_used(VERBS[verb], wanted, Study()))
+            assert said or verb == "visible", one["command"]
+            for study in found:
+                other = dict(differing(study, Study()))
+                assert {key: other.get(key) for key in said} == said, one["command"]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("tab", TABS)
+def test_printed_commands_give_the_numbers_of_the_page(tab: str, tmp_path: Path) -> None:
+    """Of a random question for each tab; `tools/check_commands.py` asks twenty."""
+    _, closed = check_commands.possible_question(np.random.default_rng([3, len(tab)]), tmp_path)
+    assert check_commands.differences(TABS[tab], closed, tmp_path) == []
+
+
+@pytest.mark.long
+def test_comparison_notices_another_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, closed = check_commands.possible_question(np.random.default_rng(5), tmp_path)
+    original = check_commands.taken_along
+
+    def reseeded(*how: Any) -> list[dict[str, str]]:
+        return [one | {"command": re.sub(r"--seed \d+", "--seed 99", one["command"])} for one in original(*how)]
+
+    monkeypatch.setattr(check_commands, "taken_along", reseeded)
+    assert check_commands.differences(TABS["spectrum"], closed, tmp_path)
+
+
+def test_bibtex_cites_what_the_citation_file_cites() -> None:
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    text = BIBTEX.format(version=cited["version"])
+    assert text.count("@") == 2
+    assert text.count("{") == text.count("}")
+    for entry in (cited, *cited["references"]):
+        assert f"title = {{{entry['title']}}}" in text
+        assert all(one.get("family-names", one.get("name")) in text for one in entry["authors"])
+    assert f"version = {{{cited['version']}}}" in text
+    assert cited["references"][0]["journal"] in text
