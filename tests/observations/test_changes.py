@@ -211,21 +211,6 @@ def test_visits_lie_in_windows() -> None:
         visit_times_d(windows, 5, 4000.0, 1)
 
 
-@pytest.mark.parametrize(
-    ("settings", "key"),
-    [
-        (["change.of=['nothing']"], "change.of"),
-        (["change.of=['spectrum']"], "change.file"),
-        (["change.of=['320-200']"], "change.of"),
-        (["change.periods=true", "change.visits=20"], "orbit.targets"),
-        (["change.shortest_d=40"], "change.longest_d"),
-    ],
-)
-def test_impossible_changes_raise(settings: list[str], key: str) -> None:
-    with refused(key):
-        change(Study().with_settings(settings))
-
-
 def test_answer_holds_every_change_and_magnitude() -> None:
     settings = ["star=[{library='M3V', magnitude=9}]", "sweep.axes=[{quantity='exposure', values=[50, 600]}]",
                 "nuisances.dark=0.1"]  # fmt: skip

@@ -6,10 +6,8 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.nddata import InverseVariance, StdDevUncertainty
-from astropy.table import QTable
 from astropy.time import Time
 from astropy.timeseries import BinnedTimeSeries, TimeSeries
-from refusals import refused
 
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.observations.reading import frames_of
@@ -58,11 +56,3 @@ def test_spectra_of_specutils_are_frames(kind: type | None) -> None:
     else:
         assert frames.error is not None
         np.testing.assert_allclose(frames.error, 0.5)
-
-
-def test_other_containers_are_refused() -> None:
-    for container in (FLUX, 3, None, "file.fits"):
-        with refused("container"):
-            frames_of(container)
-    with refused("mapping"):
-        frames_of(QTable({"a": [1.0]}))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from astropy.table import Table
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.observations.reading import read_frames
-from mauvecl.schema.errors import InputError
 
 RNG = np.random.default_rng(29)
 TIME = np.arange(100) * 20.0
@@ -37,27 +35,6 @@ def test_numbers_follow_the_cadence_over_gaps_and_slow_changes_of_the_times() ->
     numbers = np.arange(n)
     time = numbers * 120.0 + 500.0 * np.sin(2 * np.pi * numbers * 120.0 / 3.156e7)
     np.testing.assert_array_equal(Frames.of(time, RNG.normal(0, 1, n)).numbers, numbers)
-
-
-@pytest.mark.parametrize(
-    ("change", "key"),
-    [
-        ({"time_s": TIME[:5], "flux": FLUX[:5]}, "frames"),
-        ({"time_s": TIME[:50]}, "shape"),
-        ({"time_s": np.where(TIME == 40, np.nan, TIME)}, "time"),
-        ({"time_s": np.where(TIME == 40, 20.0, TIME)}, "time"),
-        ({"error": ERROR[:5]}, "error"),
-        ({"quality": np.zeros(3)}, "quality"),
-        ({"exposure_s": 0.0}, "exposure"),
-        ({"flux": np.tile(FLUX[:, None], 3)}, "error"),
-        ({"flux": np.tile(FLUX[:, None], 3), "error": None}, "wavelength"),
-    ],
-)
-def test_impossible_frames_are_refused(change: dict[str, Any], key: str) -> None:
-    with pytest.raises(InputError) as error:
-        Frames.of(**({"time_s": TIME, "flux": FLUX, "error": ERROR} | change))
-    assert error.value.key == key
-    assert error.value.expected
 
 
 def test_faults_of_the_file_are_reasons() -> None:
@@ -106,39 +83,3 @@ def test_light_curves_of_tess_and_kepler_need_no_mapping(tmp_path: Path) -> None
     assert frames.reference_mjd == pytest.approx(58_499.5)
     np.testing.assert_allclose(frames.flux, FLUX, rtol=1e-6)
     assert np.flatnonzero(frames.faults).tolist() == [9]
-
-
-@pytest.mark.parametrize(
-    ("change", "key"),
-    [
-        ({"time": "x"}, "column"),
-        ({"flux": "x"}, "column"),
-        ({"time_unit": None}, "time_unit"),
-        ({"time_unit": "parsec"}, "time_unit"),
-        ({"epoch": "yesterday"}, "epoch"),
-        ({"exposure_s": 5.0, "time": ("t", "t")}, "exposure"),
-    ],
-)
-def test_wrong_mappings_are_one_sentence(tmp_path: Path, change: dict[str, Any], key: str) -> None:
-    _table().write(tmp_path / "a.csv")
-    given: dict[str, Any] = {"time": "t", "time_unit": "d", "flux": "f"}
-
-    def read() -> None:
-        read_frames(tmp_path / "a.csv", FrameMapping(**(given | change)))
-
-    with pytest.raises(InputError) as error:
-        read()
-    assert error.value.key == key
-
-
-def test_a_mapping_with_an_unknown_key_names_it(tmp_path: Path) -> None:
-    (tmp_path / "m.toml").write_text('time = "t"\nflux = "f"\nfluxunit = "Jy"\n')
-    with pytest.raises(InputError, match="fluxunit"):
-        FrameMapping.read(tmp_path / "m.toml")
-
-
-@pytest.mark.parametrize("content", [b"", b"SIMPLE  =", b"a,b\n1,2\n", b"\x00\xff" * 50, b"time,flux\n1,x\n2,y\n"])
-def test_files_without_frames_are_one_sentence(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / "a.csv").write_bytes(content)
-    with pytest.raises(InputError):
-        read_frames(tmp_path / "a.csv")

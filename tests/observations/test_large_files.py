@@ -13,7 +13,6 @@ from astropy.io import fits
 from layouts import LAYOUTS, Truth
 
 from mauvecl.observations.reading import read_frames, reduce_frames
-from mauvecl.schema.errors import InputError
 
 FRAMES, PIXELS = 65_536, 1024
 #: The address space may grow by this while a file of 256 MiB is read.
@@ -131,10 +130,3 @@ def test_pieces_give_what_the_whole_gives(tmp_path: Path, monkeypatch: pytest.Mo
     np.testing.assert_allclose(pixels.scatter[6:], np.sqrt(np.nanmean(steps[:, 6:] ** 2, axis=0) / 2))
     assert pixels.stated is not None
     np.testing.assert_allclose(pixels.stated[6:], np.sqrt((np.delete(truth.error, 7, axis=0)[:, 6:] ** 2).mean(axis=0)))
-
-
-def test_weights_of_another_shape_are_refused(tmp_path: Path) -> None:
-    path, mapping = LAYOUTS["long CSV"](Truth.of(), tmp_path)
-    with pytest.raises(InputError) as error:
-        reduce_frames(path, np.ones((1, 5)), mapping)
-    assert error.value.key == "weights"

@@ -11,7 +11,6 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 from astropy.time import Time
-from refusals import refused
 
 from mauvecl import Study, analyse
 from mauvecl.host.orbit.orbit import Orbit
@@ -95,17 +94,6 @@ def test_nothing_is_downloaded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert barycentric(later, AU_MIC, Orbit()).position == "BARYCENTER"
 
 
-@pytest.mark.parametrize(
-    ("change", "key"),
-    [({"reference_mjd": None}, "epoch"), ({"scale": ""}, "scale"), ({"position": ""}, "position"),
-     ({"position": "MARS"}, "position"), ({"position": "TOPOCENTER"}, "orbit.tle")],
-)  # fmt: skip
-def test_times_of_unknown_kind_have_no_barycentric_ones(change: dict[str, Any], key: str) -> None:
-    given = {"reference_mjd": 61_000.0, "scale": "utc", "position": "GEOCENTER"} | change
-    with refused(key):
-        barycentric(Frames.of(TIME, FLUX, **given), AU_MIC)
-
-
 def test_barycentric_times_stay_as_they_are() -> None:
     once = barycentric(_frames(NEAR, "GEOCENTER"), AU_MIC)
     again = barycentric(once, AU_MIC)
@@ -143,15 +131,6 @@ def test_time_keywords_of_fits_are_read(
     zero = 0.0 if frames.reference_mjd is None or mjd is None else (frames.reference_mjd - mjd) * 86_400
     np.testing.assert_allclose(frames.time_s + zero, TIME + shift_s, atol=2e-5)
     assert (frames.reference_mjd is None) == (mjd is None)
-
-
-@pytest.mark.parametrize(("key", "value"), [("MJDREF", "new"), ("TIMEPIXR", 3.0), ("TIMEOFFS", "x"), ("MJDREFI", True)])
-def test_wrong_time_keywords_are_named(tmp_path: Path, key: str, value: Any) -> None:
-    hdu = fits.table_to_hdu(Table({"TIME": TIME, "FLUX": FLUX}))
-    hdu.header.update({"TIMEUNIT": "s", key: value})
-    hdu.writeto(tmp_path / "a.fits")
-    with refused(key):
-        read_frames(tmp_path / "a.fits")
 
 
 def test_dates_are_times(tmp_path: Path) -> None:
