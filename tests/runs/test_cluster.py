@@ -22,7 +22,6 @@ import numpy as np
 import psutil
 import pytest
 from answers import N, same, same_snr, small
-from refusals import refused
 from scenes import flaring_stares, instrument, star
 from typer.testing import CliRunner
 
@@ -35,7 +34,6 @@ from mauvecl.results.requests.requests import RealiseRequest, Shard
 from mauvecl.runs.cluster import DaskWorkers
 from mauvecl.runs.pool import Pool, Stopped, map_in_order
 from mauvecl.runs.shards import Task
-from mauvecl.schema.errors import InputError
 from mauvecl.store import bulk
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("small_shards")]
@@ -349,32 +347,3 @@ def test_scheduler_lost_during_a_fetch_raises() -> None:
     workers._came(awaited, None, 1, sent)  # type: ignore[arg-type]
     with pytest.raises(DeviceError, match="is gone"):
         awaited.result(timeout=1)
-
-
-@pytest.mark.parametrize(
-    ("where", "kind", "sentence"),
-    [
-        ("local:0", InputError, "cluster = 'local:0', expected local:N with N from 1"),
-        ("nowhere.json", InputError, "expected local:N, an address such as tcp://host:8786, or a scheduler file"),
-        ("tcp://127.0.0.1:1", DeviceError, "no scheduler answers at tcp://127.0.0.1:1, expected one within"),
-    ],
-)
-def test_missing_cluster_raises(
-    where: str, kind: type[Exception], sentence: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("mauvecl.runs.cluster.PATIENCE_S", 1.0)
-    with pytest.raises(kind, match=sentence.replace("(", r"\(")):
-        DaskWorkers(where)
-
-
-def test_missing_dask_raises(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with refused("dask", "'mauvecl[cluster]'"):
-        DaskWorkers("local:2")
-
-
-def test_missing_cryptography_raises(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No cluster rather than an open one."""
-    monkeypatch.setitem(sys.modules, "cryptography", None)
-    with refused("cryptography", "'mauvecl[cluster]'"):
-        DaskWorkers("local:2")

@@ -196,25 +196,6 @@ def test_another_study_raises_with_the_difference(path: Path, engine: Engine) ->
     assert bulk.verify(path) == []
 
 
-def test_impossible_places_raise(tmp_path: Path, engine: Engine) -> None:
-    (tmp_path / "notes").mkdir()
-    (tmp_path / "notes" / "mine.txt").write_text("keep me")
-    with refused("store", "'mine.txt'"):
-        bulk.realise(study(), tmp_path / "notes", engine)
-    with refused("store"):
-        bulk.forget(tmp_path / "notes")
-    assert (tmp_path / "notes" / "mine.txt").read_text() == "keep me"
-    with refused("store"):
-        bulk.realise(study(), tmp_path / "notes" / "mine.txt" / "store", engine)
-    with refused("store"):
-        bulk.read(tmp_path / "nowhere")
-    bulk.realise(study(20), tmp_path / "s.zarr", engine)
-    with refused("scenes", "'star-9/quiescent'"):
-        bulk.read(tmp_path / "s.zarr", "star-9/quiescent")
-    with refused("bulk.frames", value=7):
-        bulk.realise(study(20, bulk={"frames": [7]}), tmp_path / "t.zarr", engine)
-
-
 def test_second_writer_raises(path: Path, engine: Engine) -> None:
     with locked(path, "store"):
         with refused("lock", value=str(path)):
@@ -371,20 +352,6 @@ def test_hdf5_export_contains_the_frames(tmp_path: Path, engine: Engine) -> None
         assert file.attrs["first_row"] == 5
         assert data.attrs["units"] == "DN"
         assert "star-1/quiescent" not in file
-
-
-def test_impossible_exports_raise(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = bulk.realise(study(50), tmp_path / "s.zarr", engine)
-    with refused("rows", "0:50"):
-        Selection.of(made, rows=(10, 60))
-    with refused("file", "h5", "hdf5"):
-        export(Selection.of(made), tmp_path / "s.txt")
-    (tmp_path / "s.zarr" / "star-1/quiescent/c/0/0").unlink()
-    with refused("store", "star-1/quiescent/c/0/0"):
-        Selection.of(made)
-    monkeypatch.setattr("mauvecl.store.export.MAX_BYTES", 1000)
-    with refused("rows"):
-        Selection.of(made)
 
 
 @pytest.mark.long

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from refusals import refused
 from stores import study
 
 from mauvecl import read_frames
@@ -62,14 +61,6 @@ def test_stores_are_reduced_in_pieces(
     assert curve.error is not None
     assert error is not None
     np.testing.assert_allclose(curve.error, error, rtol=1e-12)
-
-
-def test_store_of_several_arrays_asks_for_one(tmp_path: Path, engine: Engine) -> None:
-    path = _written(tmp_path, study(40), engine, "zarr")
-    with refused("hdu", "star-1/quiescent", expected="FILE[star-1/flare-1]"):
-        read_frames(path)
-    with refused("hdu", value="star-2"):
-        read_frames(f"{path}[star-2]")
 
 
 def _written(folder: Path, asked: Study, engine: Engine, ending: str) -> Path:

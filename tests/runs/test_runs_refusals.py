@@ -1,0 +1,38 @@
+"""Clusters that are not there, and workers that fail, raise an error that names what is wrong."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+from refusals import refused
+
+from mauvecl.device.errors import DeviceError
+from mauvecl.runs.cluster import DaskWorkers
+
+#: Value of `cluster`, and what is expected instead.
+CLUSTERS = {
+    "local:0": "local:N with N from 1",
+    "nowhere.json": "local:N, an address such as tcp://host:8786, or a scheduler file",
+}
+
+
+@pytest.mark.parametrize("where", CLUSTERS)
+def test_invalid_cluster_raises(where: str) -> None:
+    with refused("cluster", expected=CLUSTERS[where]):
+        DaskWorkers(where)
+
+
+@pytest.mark.parametrize("package", ["distributed", "cryptography"])
+def test_missing_package_raises(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No cluster rather than one without encryption."""
+    monkeypatch.setitem(sys.modules, package, None)
+    with refused({"distributed": "dask"}.get(package, package), "'mauvecl[cluster]'"):
+        DaskWorkers("local:2")
+
+
+def test_absent_scheduler_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mauvecl.runs.cluster.PATIENCE_S", 1.0)
+    with pytest.raises(DeviceError) as error:
+        DaskWorkers("tcp://127.0.0.1:1")
+    assert "tcp://127.0.0.1:1" in str(error.value)

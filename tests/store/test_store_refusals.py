@@ -1,0 +1,69 @@
+"""Places, rows, arrays and files that a store cannot use raise an InputError that names the key."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from refusals import refused
+from stores import Painter, study
+
+from mauvecl import read_frames
+from mauvecl.store import bulk
+from mauvecl.store.export import Selection, export
+from mauvecl.store.layout import Store
+
+PAINTER = Painter()
+#: Rows of the store.
+ROWS = 20
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return a folder with a store and a file of the user's."""
+    bulk.realise(study(ROWS), tmp_path / "s.zarr", PAINTER)
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "mine.txt").write_text("keep me")
+    return tmp_path
+
+
+def selected(folder: Path, rows: tuple[int, int] | None = None) -> Selection:
+    return Selection.of(Store.open(folder / "s.zarr"), rows=rows)
+
+
+#: Calls with the folder, the key of the error, and what its sentence names.
+CALLS: dict[str, tuple[Callable[[Path], object], str, *tuple[str, ...]]] = {
+    "a folder of other files": (lambda at: bulk.realise(study(), at / "notes", PAINTER), "store", "'mine.txt'"),
+    "removal of other files": (lambda at: bulk.forget(at / "notes"), "store"),
+    "a store in a file": (lambda at: bulk.realise(study(), at / "notes" / "mine.txt" / "s", PAINTER), "store"),
+    "no store": (lambda at: bulk.read(at / "nowhere"), "store"),
+    "no such array": (lambda at: bulk.read(at / "s.zarr", "star-9/quiescent"), "scenes", "'star-9/quiescent'"),
+    "a frame beyond the exposure": (
+        lambda at: bulk.realise(study(ROWS, bulk={"frames": [7]}), at / "t.zarr", PAINTER), "bulk.frames"),
+    "rows beyond the store": (lambda at: selected(at, (10, 60)), "rows", f"0:{ROWS}"),
+    "an unknown format": (lambda at: export(selected(at), at / "s.txt"), "file", "h5", "hdf5"),
+    "frames of an unnamed array": (lambda at: read_frames(at / "s.zarr"), "hdu", "star-1/quiescent",
+                                   "FILE[star-1/flare-1]"),
+    "frames of an unknown array": (lambda at: read_frames(f"{at / 's.zarr'}[star-2]"), "hdu", "star-2"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_bad_input_raises(name: str, folder: Path) -> None:
+    call, key, *facts = CALLS[name]
+    with refused(key, *facts):
+        call(folder)
+    assert (folder / "notes" / "mine.txt").read_text() == "keep me"
+
+
+def test_export_without_a_chunk_raises(folder: Path) -> None:
+    (folder / "s.zarr" / "star-1/quiescent/c/0/0").unlink()
+    with refused("store", "star-1/quiescent/c/0/0"):
+        selected(folder)
+
+
+def test_export_of_too_many_rows_raises(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mauvecl.store.export.MAX_BYTES", 1000)
+    with refused("rows"):
+        selected(folder)
