@@ -5,7 +5,7 @@ BIN := .venv/bin
 # Compiled files are kept whatever the shell says: the tests start Python some hundred times.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo check quick test lowest lint page docs dist try-wheel mutants clean
+.PHONY: demo check quick test lowest lint page docs dist try-wheel coverage mutants clean
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "mauvecl needs Python 3.11 or newer, found " + sys.version.split()[0])'
@@ -76,12 +76,17 @@ dist: .venv/dist.stamp
 
 # The wheel in an empty environment, from outside the checkout. Nothing but it and the linker is in the path: no compiler.
 WHEEL := build/wheel
+ALONE = env -i HOME="$$PWD" PATH="$$PWD/../bin" $(if $(OCL_ICD_VENDORS),OCL_ICD_VENDORS=$(OCL_ICD_VENDORS))
 try-wheel:
 	$(PYTHON) -m venv --clear $(WHEEL)
 	$(WHEEL)/bin/python -m pip install --quiet --disable-pip-version-check dist/*.whl
 	mkdir $(WHEEL)/home && ln -s "$$(command -v ld)" $(WHEEL)/bin/ld
-	cd $(WHEEL)/home && env -i HOME="$$PWD" PATH="$$PWD/../bin" mauvecl selftest
-	cd $(WHEEL)/home && env -i HOME="$$PWD" PATH="$$PWD/../bin" mauvecl detect
+	cd $(WHEEL)/home && $(ALONE) mauvecl selftest
+	cd $(WHEEL)/home && $(ALONE) mauvecl detect
+
+# Lines and branches that the tests run, with the processes that they start; kernels do not count.
+coverage: .venv/coverage.stamp
+	$(PYTEST) -n 2 -q --cov --cov-report term:skip-covered --cov-report xml:build/coverage.xml
 
 mutants: .venv/test.stamp
 	$(BIN)/python tools/mutation_check.py

@@ -18,18 +18,21 @@ from mauvecl.host.version import VERSION
 
 ROOT = Path(__file__).parent.parent
 #: What a checkout has, or an unpacked sdist; a working copy has much more beside it.
-FOLDERS = (".ci", "bench", "docs", "host", "kernels", "mauvecl", "tests", "tools")
+FOLDERS = (".ci", ".github", "bench", "docs", "host", "kernels", "mauvecl", "recipe", "tests", "tools")
 FILES = (
+    ".dockerignore",
     ".gitignore",
     "CHANGELOG.md",
     "CITATION.cff",
     "CODE_OF_CONDUCT.md",
     "CONTRIBUTING.md",
+    "Dockerfile",
     "LICENSE",
     "Makefile",
     "README.md",
     "SECURITY.md",
     "SUPPORT.md",
+    "environment.yml",
     "pyproject.toml",
 )
 MADE = ("__pycache__", "_build", "_generated", "jupyter_execute", ".ipynb_checkpoints", "*_cache", ".hypothesis")
