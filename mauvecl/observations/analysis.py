@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,7 +15,7 @@ from mauvecl.lightcurve.search.importance_sampling import SampledRate
 from mauvecl.observations.colour import Colour, event_colour
 from mauvecl.observations.completeness import Completeness, inject
 from mauvecl.observations.event_spectrum import EventSpectrum, event_spectrum, measure_flare
-from mauvecl.observations.events import Detection, ObservedEvent, detect_events, measure_events
+from mauvecl.observations.events import ObservedEvent, detect_events, measure_events
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames
 from mauvecl.observations.level import QuiescentLevel, quiescent_level
@@ -103,9 +103,12 @@ class Analysis:
         return self.survey.stare.observed_s / DAY_S
 
     @cached_property
-    def changes_of_light(self) -> int:
-        """Number of events above the threshold that are steps or changes of throughput."""
-        return sum(one.kind in ("step", "throughput") and one.value >= self.threshold for one in self.events)
+    def light_misleads(self) -> bool:
+        """True if the light that all pixels share changes suddenly and the search does not leave it out."""
+        series = None if self.spectra is None else self.spectra.series
+        if series is None or "light" in free_of(series.jitters):
+            return False
+        return bool(series.changes) or misled(self.events)
 
     def false_alarms(self, event: ObservedEvent) -> tuple[float, float]:
         """Return the false alarms per star-day at an event's statistic: in normal noise, and in noise as measured."""
@@ -141,11 +144,10 @@ class Analysis:
             lines.append(f"The scatter of quiescent frames is {self.level.excess:.2f} times the stated errors; the "
                          "measured scatter is used.")  # fmt: skip
         lines += [] if self.spectra is None else _spectral_messages(self.spectra)
-        if self.spectra is not None and (count := self.changes_of_light):
+        if self.light_misleads:
             lines.append(
-                f"{count} {'event is a change' if count == 1 else 'events are changes'} of throughput, as by pointing "
-                'losses; shorter ones may resemble flares: search.frame.light = "free" searches without '
-                "the light that all pixels share, with a smaller S/N."
+                "The throughput changes, as by pointing losses; short changes may resemble flares: "
+                'search.frame.light = "free" searches without the light that all pixels share, with a smaller S/N.'
             )
         red = next((one for one in self.scatter if one.red), None)
         if red is not None:
@@ -190,11 +192,12 @@ def analyse_frames(
     rank : int
         Largest number of weighted sums of a spectrum.
     jitters : mapping of str to float, optional
-        Standard deviations of light, dark current and sky from frame to frame; as measured by default.
+        Standard deviations of light, dark current and sky from frame to frame, infinite for those that the search
+        leaves out. By default as measured, and infinite for the light where it changes suddenly.
     temperature_k : float
         Temperature of injected flares in spectra.
     """
-    wanted = per_day(false_alarms, per)
+    wanted, given = per_day(false_alarms, per), frames
     cleaned = None if model is None else clean_spectra(frames, model)
     frames = frames if cleaned is None else cleaned.frames
     flux, error = frames.white_light
@@ -214,10 +217,22 @@ def analyse_frames(
     threshold = max(_threshold(normal, wanted), measured.threshold(wanted))
     candidates = min(max(first, measured.threshold(frequent)), threshold)
     detected, taken = detect_events(survey, candidates)
-    events = measure_events(survey, taken, candidates, detected)
+    seen = None if series is None else [event_spectrum(survey, series, taken, one) for one in detected]
+    causes = None if seen is None else [one.cause for one in seen]
+    events = measure_events(survey, taken, candidates, detected, causes)
+    if series is not None and jitters is None and "light" not in free_of(series.jitters) and misled(events):
+        # Changes that are too small to stand out by themselves, but not for the search.
+        return analyse_frames(
+            given, false_alarms=false_alarms, per=per, shape=shape, seed=seed, model=model, rank=rank,
+            jitters={**series.jitters, "light": np.inf}, temperature_k=temperature_k,
+        )  # fmt: skip
     spectra = None
-    if cleaned is not None and series is not None:
-        events, spectra = _with_spectra(survey, cleaned, series, taken, detected, events)
+    if cleaned is not None and series is not None and seen is not None:
+        measured_flares = [
+            measure_flare(survey, series, taken, one) if event.kind == "flare" else f"its kind is {event.kind}"
+            for event, one in zip(events, detected, strict=True)
+        ]
+        spectra = SpectralAnalysis(cleaned, series, seen, measured_flares)
     quiet = level.quiet[level.used] & ~taken
     residual = survey.along(len(survey.bank.directions) // 2) / np.sqrt(survey.variance)
     return Analysis(
@@ -227,25 +242,14 @@ def analyse_frames(
     )  # fmt: skip
 
 
-def _with_spectra(
-    survey: SeriesSurvey,
-    cleaned: CleanedSpectra,
-    series: SpectralSeries,
-    taken: NDArray[np.bool_],
-    detected: list[Detection],
-    events: list[ObservedEvent],
-) -> tuple[list[ObservedEvent], SpectralAnalysis]:
-    """Return events with the kind that their spectra give them, and their spectra and measurements."""
-    found = [event_spectrum(survey, series, taken, one) for one in detected]
-    judged = [
-        event if one.cause == "flare" else replace(event, kind=one.cause, components=[])
-        for event, one in zip(events, found, strict=True)
-    ]
-    measured = [
-        measure_flare(survey, series, taken, one) if event.kind == "flare" else f"its kind is {event.kind}"
-        for event, one in zip(judged, detected, strict=True)
-    ]
-    return judged, SpectralAnalysis(cleaned, series, found, measured)
+def free_of(jitters: Mapping[str, float]) -> list[str]:
+    """Return the names of the unknowns of single frames that are projected out."""
+    return [name for name, sd in jitters.items() if np.isinf(sd)]
+
+
+def misled(events: list[ObservedEvent]) -> bool:
+    """Return whether changes of throughput are among events that pass for flares in the searched sums."""
+    return any(one.kind in ("step", "throughput") for one in events)
 
 
 def _spectral_messages(spectra: SpectralAnalysis) -> list[str]:
@@ -264,8 +268,22 @@ def _spectral_messages(spectra: SpectralAnalysis) -> list[str]:
             f"The noise of {many} of {ratio.size} pixels departs from what is stated: their measured noise is used, "
             f"{ratio.min():.2f} to {ratio.max():.2f} times it."
         )
+    if changes := spectra.series.changes:
+        largest = max(changes, key=lambda one: abs(one.change))
+        times = "once" if len(changes) == 1 else f"{len(changes)} times"
+        lines.append(
+            f"The light that all pixels share changes suddenly {times}, by up to {100 * abs(largest.change):.2g} %, as "
+            "by pointing losses and re-acquisitions; the table of throughput states when."
+        )
     for name, sd in spectra.series.jitters.items():
-        size = "free" if np.isinf(sd) else f"{sd:.2g} deg C" if name == "dark" else f"{100 * sd:.2g} %"
+        if np.isinf(sd):
+            left = f"{100 * spectra.series.kept:.2g} %"
+            lines.append(
+                f"The search leaves out all changes of the {name} of single frames: flares keep {left} of their S/N. "
+                "search.frame states another treatment."
+            )
+            continue
+        size = f"{sd:.2g} deg C" if name == "dark" else f"{100 * sd:.2g} %"
         lines.append(f"The {name} of single frames changes: {size}, which the search marginalises over.")
     return lines
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K
 from mauvecl.noise.unknowns import NUISANCES, Amplitude
 from mauvecl.observations.events import MIN_BASELINE, Detection
+from mauvecl.observations.light_changes import CLEARLY, chi2_of_one
 from mauvecl.observations.search import SeriesSurvey
 from mauvecl.observations.spectra import SpectralSeries
 from mauvecl.results.measurements.fit import Measurement, fit
@@ -22,8 +23,6 @@ Float = NDArray[np.float64]
 Cause = Literal["flare", "throughput", "dark current", "sky", "cosmic ray"]
 #: Words for the unknowns of frames that may cause an event.
 CAUSES: dict[str, Cause] = {"light": "throughput", "dark": "dark current", "sky": "sky"}
-#: Fall of chi-squared by which another cause must fit better than a flare: 3 standard deviations for one parameter.
-CLEARLY = 9.0
 #: S/N of a flare, next to unknown changes of star, dark current and sky, from which an event is a flare.
 FLARE_SNR = 4.0
 #: Share of an event's chi-squared in a single pixel from which it is that of a cosmic ray.
@@ -93,16 +92,10 @@ def event_spectrum(
     flares = series.model.flares(TEMPERATURES_K)
     unknown = series.model.unknowns(series.light)
     whole = float((spectrum**2 / variance).sum())
-
-    def best(rows: Float) -> Float:
-        """Return chi-squared with each of some spectra alone."""
-        along = rows @ (spectrum / variance)
-        return np.asarray(whole - along**2 / np.einsum("kp,kp->k", rows, rows / variance))
-
     # Light is added, never taken away.
     rises = flares @ (spectrum / variance) > 0
-    chi2: dict[Cause, float] = {"flare": float(np.where(rises, best(flares), whole).min())}
-    chi2 |= {CAUSES[name]: float(best(row[None])[0]) for name, row in unknown.items()}
+    chi2: dict[Cause, float] = {"flare": float(np.where(rises, chi2_of_one(spectrum, variance, flares), whole).min())}
+    chi2 |= {CAUSES[name]: float(chi2_of_one(spectrum, variance, row[None])[0]) for name, row in unknown.items()}
     together = Nuisances(tuple(unknown), np.array(list(unknown.values())), np.full(len(unknown), np.inf))
     rows = together.rows(variance, together.spectra)
     optimal = flares / variance - (flares @ rows.T) @ rows

@@ -181,6 +181,26 @@ class SeriesSurvey:
         names = ("sums", "variance", "flux", "flux_variance", "time_s")
         return replace(self, stare=part, **{name: getattr(self, name)[kept] for name in names})
 
+    def binned(self, factor: int) -> SeriesSurvey:
+        """Return the survey of means of consecutive frames, without those that lack a frame."""
+        part = self.stare.numbers // factor
+        bins, first, counts = np.unique(part, return_index=True, return_counts=True)
+        whole = counts == factor
+        rows = first[whole][:, None] + np.arange(factor)
+
+        def mean(values: Float) -> Float:
+            return np.asarray(values[rows].mean(axis=1))
+
+        ones, frame_s = np.ones(rows.shape[0]), factor * self.stare.frame_s
+        stare = Stare(bins[whole] * frame_s, frame_s, ones, ones, ones, np.zeros(ones.size))
+        widths = tuple(width for width in self.bank.half_widths_s if width >= NARROWEST * frame_s)
+        return replace(
+            self, stare=stare, bank=replace(self.bank, half_widths_s=widths, frame_s=frame_s),
+            templates=replace(self.templates, noise=self.templates.noise / factor), sums=mean(self.sums),
+            variance=mean(self.variance) / factor, flux=mean(self.flux),
+            flux_variance=mean(self.flux_variance) / factor, time_s=mean(self.time_s),
+        )  # fmt: skip
+
     def normal_rate(self, rate: float, seed: int) -> SampledRate:
         """Return the false-alarm rate in normal noise of the measured variance.
 

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates
 from mauvecl.observations.frame_model import FrameModel
+from mauvecl.observations.frames import Reason
 from mauvecl.observations.level import MEDIAN_S, PER_MAD, QuiescentLevel, running_median, single_frames
+from mauvecl.observations.light_changes import LightChange, light_changes
 from mauvecl.observations.search import SeriesSurvey, bank_of, stare_of
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.nuisances import Nuisances
@@ -112,7 +114,11 @@ class SpectralSeries:
     noise : PixelNoise
     model : FrameModel
     jitters : mapping of str to float
-        Standard deviations of the unknowns that change from frame to frame.
+        Standard deviations of the unknowns that change from frame to frame; infinite for those that are projected out.
+    changes : list of LightChange
+        Sudden changes of the light that all pixels share.
+    kept : float
+        Share of the S/N of flares that is left because of these unknowns.
     """
 
     excess: Float
@@ -120,6 +126,8 @@ class SpectralSeries:
     noise: PixelNoise
     model: FrameModel
     jitters: Mapping[str, float]
+    changes: list[LightChange]
+    kept: float
 
 
 def relative_error(differences: int) -> float:
@@ -243,8 +251,8 @@ def survey_spectra(
     rank : int
         Largest number of sums of a frame.
     jitters : mapping of str to float, optional
-        Standard deviations of unknowns of each frame, infinite for those that are projected out; as measured by
-        default.
+        Standard deviations of unknowns of each frame, infinite for those that are projected out. By default as
+        measured, and infinite for the light if it changes suddenly.
 
     Returns
     -------
@@ -262,17 +270,23 @@ def survey_spectra(
     assert frames.wavelength_nm is not None
     shared = {name: unknown[name] for name in ("light", "dark")}
     noise = measure_noise(excess, pairs, cleaned.stated, np.array(list(shared.values())), frames.wavelength_nm)
+    flares = model.flares(TEMPERATURES_K)
+    compared = np.flatnonzero((level.reasons & ~Reason.BELOW) == 0)
+    others = np.vstack([flares, *(spectrum for name, spectrum in unknown.items() if name != "light")])
+    changes = light_changes(excess, compared, frames.numbers, light, others, noise.used)
     known = _jitters(excess, pairs, noise.used, shared) if jitters is None else dict(jitters)
+    if jitters is None and changes:
+        known["light"] = np.inf
     names = tuple(name for name in known if name in unknown)
     nuisances = Nuisances(names, np.array([unknown[name] for name in names]).reshape(len(names), light.size),
                           np.array([known[name] for name in names]))  # fmt: skip
-    flares = model.flares(TEMPERATURES_K)
     typical = abs(float(np.median(level.level[level.used])))
     # Flares that once more add the light of the star, in the sum over wavelength.
     flares *= typical / flares.sum(axis=1, keepdims=True)
     templates = Templates.of_spectra(
         noise.used**2, flares, model.gain, TEMPERATURES_K, nuisances=nuisances or None, rank=rank
     )
+    kept = float(np.median(templates.best / np.linalg.norm(flares / noise.used, axis=1)))
     sums = np.concatenate([excess[i : i + BLOCK] @ templates.weights.T for i in range(0, len(excess), BLOCK)])
     used = level.used
     width = max(3, round(MEDIAN_S / frames.cadence_s))
@@ -295,7 +309,7 @@ def survey_spectra(
         stare, bank_of(stare, directions, shape), templates, sums[used], variance, net, variance, scale, typical,
         photon, frames.time_s[used],
     )  # fmt: skip
-    return survey, SpectralSeries(excess[used], light, noise, model, known), level
+    return survey, SpectralSeries(excess[used], light, noise, model, known, changes, kept), level
 
 
 def _jitters(excess: Float, pairs: NDArray[np.intp], sd: Float, shared: Mapping[str, Float]) -> dict[str, float]:

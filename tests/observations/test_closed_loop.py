@@ -9,7 +9,7 @@ from scipy import stats
 
 from mauvecl.lightcurve.flares.shapes import shape_of
 from mauvecl.observations.analysis import analyse_frames
-from mauvecl.observations.events import detect_events, measure_event, measure_events
+from mauvecl.observations.events import FITTED_BINS, detect_events, measure_event, measure_events
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import quiescent_level
 from mauvecl.observations.noise import binned_scatter
@@ -67,6 +67,25 @@ def test_intervals_of_the_fitted_equivalent_duration_cover(threshold: float) -> 
         low, high = fitted.intervals["equivalent_duration_s"]
         inside += low <= amplitude * width * SHAPE.equivalent_duration <= high
     assert stats.binom.ppf(0.0005, number, 0.6827) <= inside <= stats.binom.ppf(0.9995, number, 0.6827)
+
+
+def test_long_flares_are_fitted_in_bins_with_the_same_result(threshold: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    survey = survey_of(light_curve(np.random.default_rng(298), LEVEL * (1 + 0.05 * flare(15_000, 3000))))
+    found, taken = detect_events(survey, threshold)
+    (best,) = found
+    fits = []
+    for bins in (FITTED_BINS, 10**9):
+        monkeypatch.setattr("mauvecl.observations.events.FITTED_BINS", bins)
+        (fitted,) = measure_event(survey, taken, threshold, best).components
+        fits.append((fitted, *fitted.intervals["equivalent_duration_s"]))
+    (binned, low, high), (whole, *ends) = fits
+    # A fifth of the frames, so that fits of long flares of short frames do not take minutes.
+    assert whole.dof > 4.5 * binned.dof
+    # A few per cent of the information are lost: both fits differ by a part of the standard error.
+    assert [low, high] == pytest.approx(ends, abs=0.15 * (high - low))
+    assert high - low == pytest.approx(ends[1] - ends[0], rel=0.05)
+    assert binned.recovered.peak_s == pytest.approx(whole.recovered.peak_s, abs=60)
+    assert np.isnan(binned.intervals["peak_s"]).all()
 
 
 def test_a_flare_is_found_at_its_time_and_a_step_is_a_step(threshold: float) -> None:

@@ -29,7 +29,8 @@ N, FRAME_S = 720, 5.0
 TIME = (np.arange(N) + 0.5) * FRAME_S
 # One false alarm per star-day needs few resampled frames.
 DAY: Any = {"per": "day"}
-STUDY = Study(star=[{"library": "M3V", "magnitude": 9.0, "distance_pc": 5.0}], search=DAY)  # type: ignore[arg-type]
+STAR: Any = [{"library": "M3V", "magnitude": 9.0, "distance_pc": 5.0}]
+STUDY = Study(star=STAR, search=DAY)
 Prepared = tuple[CleanedSpectra, SeriesSurvey, SpectralSeries]
 
 
@@ -183,7 +184,8 @@ def test_look_alikes_are_rejected_by_their_spectrum(kind: str, spectrum: str, si
     """A rise of five minutes: of the throughput, the detector's temperature, or a flare."""
     shape = flare(1800.0, 90.0, 1.0).sum(axis=1) / light().sum()
     added = flare(1800.0, 90.0, size) if not spectrum else size * np.outer(shape, model().unknowns(light())[spectrum])
-    analysis = analyse_frames(drawn(np.random.default_rng(305), added), model=model())
+    frames = drawn(np.random.default_rng(305), added)
+    analysis = analyse_frames(frames, model=model(), jitters={"light": 1e-6})
     assert analysis.spectra is not None
     event, found = max(zip(analysis.events, analysis.spectra.found, strict=True), key=lambda pair: pair[0].value)
     assert abs(analysis.survey.time_s[event.brightest] - 1800.0) < 60
@@ -293,16 +295,26 @@ def test_answer_states_measurements_or_why_there_are_none() -> None:
     assert event["temperature"].value == pytest.approx(answer.events["temperature"][k].value, rel=1e-3)
 
 
-def test_flare_like_a_change_of_throughput_is_a_candidate_where_such_changes_occur() -> None:
-    """A rise of the throughput, a cool flare whose spectrum resembles it, and a hot flare."""
-    rise = 0.3 * flare(900.0, 60.0, 1.0).sum(axis=1, keepdims=True) * light() / light().sum()
-    cool, hot = flare(1800.0, 60.0, 0.3, 5000.0), flare(2900.0, 60.0, 1.0)
-    verdicts = []
-    for added in (rise + cool + hot, cool + hot):
-        answer = analyse(STUDY, frames=drawn(np.random.default_rng(312), added))
-        verdicts.append({round(float(answer.analysis.survey.time_s[row.event.brightest]), -2): row.verdict
-                         for row in answer.rows})  # fmt: skip
-        assert any("search.frame.light" in line for line in answer.messages) == (len(verdicts) == 1)
-    assert verdicts == [
-        {900.0: "rejected", 1800.0: "candidate", 2900.0: "detected"}, {1800.0: "detected", 2900.0: "detected"}
-    ]  # fmt: skip
+def verdicts(rise: float, **search: Any) -> tuple[dict[float, str], list[str]]:
+    """Return the verdicts on a rise of the throughput, a cool flare that resembles it and a hot flare, and messages."""
+    added = flare(1800.0, 60.0, 0.3, 5000.0) + flare(2900.0, 60.0, 1.0)
+    added += rise * flare(900.0, 60.0, 1.0).sum(axis=1, keepdims=True) * light() / light().sum()
+    answer = analyse(Study(star=STAR, search=DAY | search), frames=drawn(np.random.default_rng(312), added))
+    found = {round(float(row.analysis.survey.time_s[row.event.brightest]), -2): row.verdict for row in answer.rows}
+    return found, answer.messages
+
+
+def test_where_the_throughput_changes_the_light_of_each_frame_is_left_out() -> None:
+    found, messages = verdicts(0.3)
+    assert found[2900.0] == "detected"
+    assert 900.0 not in found
+    assert sum("leaves out all changes of the light" in line for line in messages) == 1
+    found, messages = verdicts(0.0)
+    assert found == {1800.0: "detected", 2900.0: "detected"}
+    assert not any("leaves out" in line for line in messages)
+
+
+def test_study_keeps_the_light_and_flares_like_its_changes_are_candidates() -> None:
+    found, messages = verdicts(0.3, frame={"light": 1e-6})
+    assert found == {900.0: "rejected", 1800.0: "candidate", 2900.0: "detected"}
+    assert any('search.frame.light = "free"' in line for line in messages)

@@ -121,7 +121,7 @@ class EventRow:
         """
         if self.event.kind != "flare":
             return "rejected"
-        doubtful = self.spectrum is not None and self.spectrum.ambiguous and self.analysis.changes_of_light > 0
+        doubtful = self.spectrum is not None and self.spectrum.ambiguous and self.analysis.light_misleads
         return "detected" if self.significant and not doubtful else "candidate"
 
     @property
@@ -290,6 +290,16 @@ PIXELS = (
     Column("high", "high", "", "upper end"),
     Column("departs", "departs", "", "whether the search uses the measured noise"),
 )  # fmt: skip
+#: Columns of the changes of throughput, one row per change.
+THROUGHPUT = (
+    Column("date", lambda row: row[0].date(row[0].time_s[row[1].frame]), "", "first frame after the change", kind=str),
+    Column("time", lambda row: row[0].time_s[row[1].frame] / DAY_S, "d", "middle of this frame, from time zero"),
+    Column("frames", lambda row: row[1].width, "", "frames before and after the change whose means are compared",
+           kind=int),
+    Column("change", lambda row: row[1].change, "", "of the light that all pixels share, relative to the quiescent "
+           "star"),
+    Column("error", lambda row: row[1].error, "", "standard error of the change"),
+)  # fmt: skip
 #: Columns of the completeness, one row per half-width and equivalent duration.
 COMPLETENESS = (
     Column("half_width", lambda one: np.repeat(one.completeness.half_widths_s, one.completeness.detected.shape[1]), "s",
@@ -409,11 +419,18 @@ class AnalyseAnswer(Answer):
         return table_of(PIXELS, [] if one is None else [one.series.noise], unit=self.analysis.frames.unit)
 
     @property
+    def throughput(self) -> QTable:
+        """One row per sudden change of the light that all pixels of spectra share."""
+        one = self.analysis.spectra
+        rows = [] if one is None else [(one.cleaned.frames, change) for change in one.series.changes]
+        return table_of(THROUGHPUT, rows)
+
+    @property
     def tables(self) -> dict[str, Table]:
-        """Events, frames, completeness, limits and noise; of spectra, measured quantities and noise per pixel."""
+        """Events, frames, completeness, limits, noise; of spectra, measured quantities, pixels and throughput."""
         tables = {"events": self.events, "frames": self.frames, "completeness": self.completeness,
                   "limits": self.limits, "noise": self.noise}  # fmt: skip
-        of_spectra = {"measured": self.measured, "noise-per-pixel": self.pixels}
+        of_spectra = {"measured": self.measured, "noise-per-pixel": self.pixels, "throughput": self.throughput}
         blends = {"neighbour-flares": self.neighbour_flares} if self.study.has_neighbours else {}
         return tables | (of_spectra if self.analysis.spectra is not None else {}) | blends
 

@@ -8,7 +8,7 @@ end when there are no more alarms.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -90,8 +90,9 @@ class Candidate:
 
 
 def alarms(
-    survey: SearchedStare, templates: Templates, sums: NDArray[Any], threshold: float, energy: Factor | None = None
-) -> list[Alarm]:
+    survey: SearchedStare, templates: Templates, sums: NDArray[Any], threshold: float, energy: Factor | None = None,
+    *, profiled: Collection[str] = QUANTITIES,
+) -> list[Alarm]:  # fmt: skip
     """Detect and fit all flares of a stare, largest statistic first.
 
     Parameters
@@ -105,10 +106,12 @@ def alarms(
     energy : callable, optional
         Logarithm of the energy per second of equivalent duration as a function of the logarithm of the temperature,
         and its derivative.
+    profiled : collection of str
+        Those of `QUANTITIES` whose intervals are wanted; each takes many fits.
     """
     search = _StareSearch(StareSums(survey, templates, np.asarray(survey.net(sums[None])[0], np.float64)), threshold)
     search.run()
-    return sorted(_measured_alarms(search, energy), key=lambda alarm: -alarm.rho)
+    return sorted(_measured_alarms(search, energy, profiled), key=lambda alarm: -alarm.rho)
 
 
 @dataclass(eq=False)
@@ -344,7 +347,7 @@ def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in steps.reshape(-1, 2)]
 
 
-def _measured_alarms(search: _StareSearch, energy: Factor | None) -> list[Alarm]:
+def _measured_alarms(search: _StareSearch, energy: Factor | None, profiled: Collection[str]) -> list[Alarm]:
     """Measure all flares of a finished search."""
     measured_alarms = []
     for number, block in enumerate(search.blocks(), 1):
@@ -356,7 +359,7 @@ def _measured_alarms(search: _StareSearch, energy: Factor | None) -> list[Alarm]
             best, measured = better, []
             for j in range(len(block)):
                 gain = rows.without(best, j).chi2 - best.chi2
-                values, better = _measured(rows, best, j, gain, energy)
+                values, better = _measured(rows, best, j, gain, energy, profiled)
                 if better is not None:
                     break
                 measured.append(values)
@@ -366,7 +369,7 @@ def _measured_alarms(search: _StareSearch, energy: Factor | None) -> list[Alarm]
 
 
 def _measured(
-    rows: Block, best: BlendFit, j: int, gain: float, energy: Factor | None
+    rows: Block, best: BlendFit, j: int, gain: float, energy: Factor | None, profiled: Collection[str]
 ) -> tuple[tuple[FittedFlares, dict[str, tuple[float, float]], str], BlendFit | None]:
     """Return the values, intervals and note of a flare, and a better fit of its block if profiling finds one."""
     sums, theta = rows.sums, best.theta[j]
@@ -398,7 +401,7 @@ def _measured(
         factors["energy"] = (AMPLITUDE, energy, np.log(area))
     intervals, notes = {"energy": (np.nan, np.nan)}, []
     for name, (column, factor, offset) in factors.items():
-        if column == KELVIN and not several:
+        if name not in (*profiled, "energy") or (column == KELVIN and not several):
             intervals[name] = (np.nan, np.nan)
             continue
         if snr > MAX_PROFILED_SNR:
