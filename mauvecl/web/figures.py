@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
-from bokeh.models import DataRange1d, HoverTool, Range1d
+from bokeh.models import BoxZoomTool, DataRange1d, HoverTool, Range1d, ResetTool, WheelZoomTool
 from bokeh.models.annotations import Label, Span
 from bokeh.models.sources import ColumnDataSource
 from bokeh.plotting import figure
@@ -94,7 +94,9 @@ class Canvas:
             min_height=60,
             min_width=60,
             min_border=2,
-            tools="box_zoom,pan,reset",
+            # The wheel alone scrolls the page; two fingers zoom.
+            tools=[BoxZoomTool(), WheelZoomTool(modifiers={"ctrl": True}), ResetTool()],
+            active_scroll="auto",
             toolbar_location=None,
             background_fill_color=None,
             border_fill_color=None,
@@ -178,15 +180,20 @@ class Canvas:
         self.legend.append(("saturated", self.ink.own, "band", "if any"))
 
     def tooltips(self, made: Any, *lines: tuple[str, str], mode: Literal["mouse", "hline", "vline"] = "vline") -> None:
-        """Add a tooltip with columns in four significant digits."""
+        """Add a tooltip with the name of what is drawn and columns in four significant digits."""
         columns = [column for _, column in lines]
+        rows = "".join(f"<div>{name}: <b>@{column}{{%.4g}}</b></div>" for name, column in lines)
+        over = made
+        if made.glyph.__class__.__name__ == "Step":
+            # BokehJS finds no steps below the pointer.
+            over = self.plot.line("x", "y", source=made.data_source, line_alpha=0)
         self.plot.add_tools(
             HoverTool(
-                renderers=[made],
+                renderers=[over],
                 mode=mode,
                 point_policy="snap_to_data",
                 line_policy="nearest",
-                tooltips=[(name, f"@{column}{{%.4g}}") for name, column in lines],
+                tooltips=f"<b>{made.name}</b>{rows}",
                 formatters={f"@{column}": "printf" for column in columns},
             )
         )

@@ -91,8 +91,8 @@ def fresh(browser: Browser, address: str, **how: Any) -> Page:
     page.set_default_timeout(PATIENCE)
     faults: list[str] = []
     page.on("pageerror", lambda error: faults.append(str(error)))
-    # A browser says of a connection that it is lost.
-    page.on("console", lambda m: faults.append(m.text) if m.type == "error" and "WebSocket" not in m.text else None)
+    # A browser says of a connection that it is lost; nothing else stands in its console.
+    page.on("console", lambda m: None if "WebSocket" in m.text else faults.append(f"{m.type}: {m.text}"))
     page.faults = faults  # type: ignore[attr-defined]
     page.goto(address)
     settled(page)
@@ -223,7 +223,7 @@ def test_pictures_are_drawn_and_downloaded(page: Page) -> None:
     page.locator("#theme").click()
     assert page.evaluate("document.documentElement.dataset.theme") != dark
     page.locator("#figure-recorded").get_by_label("log y").check()
-    ends = "page.pictures.all.%s.models.get('wavelength')"
+    ends = "page.pictures.all.%s.figure?.models.get('wavelength')"
     until(page, lambda: page.evaluate(f"Boolean({ends % 'recorded'})"))
     page.evaluate(f"{ends % 'recorded'}.setv({{start: 250, end: 300}})")
     until(page, lambda: page.evaluate(f"{ends % 'telescope'}.end") == 300)
@@ -235,21 +235,171 @@ def test_pictures_are_drawn_and_downloaded(page: Page) -> None:
         assert Path(coming.value.path()).read_bytes().startswith(first)
 
 
+def ranges(page: Page, picture: str) -> list[float]:
+    """Return the ends of a picture's axes."""
+    plot = f"page.pictures.all.{picture}.figure.plot"
+    return list(page.evaluate(f"[{plot}.x_range, {plot}.y_range].flatMap(range => [range.start, range.end])"))
+
+
+def settled_ranges(page: Page, picture: str) -> list[float]:
+    """Return the ends of a picture's axes once it is drawn."""
+    until(page, lambda: page.evaluate(f"page.pictures.all.{picture}.figure?.view?.has_finished() ?? false"))
+    return ranges(page, picture)
+
+
+def test_pictures_zoom_and_reset(page: Page) -> None:
+    """By box, by wheel, by keys; the reset resets both axes. Without Ctrl or focus the wheel scrolls the page."""
+    page.locator("#figure-excess .legend li:visible", has_text="drawn exposure").wait_for()
+    before = settled_ranges(page, "excess")
+    box = page.locator("#plot-excess").bounding_box()
+    assert box is not None
+    x, y = box["x"] + 0.4 * box["width"], box["y"] + 0.3 * box["height"]
+    reset = page.locator("#figure-excess").get_by_role("button", name="Reset zoom")
+
+    def inside() -> None:
+        until(page, lambda: ranges(page, "excess") != before)
+        low, high, bottom, top = ranges(page, "excess")
+        assert before[0] <= low < high <= before[1]
+        assert high - low < before[1] - before[0]
+        assert top - bottom < before[3] - before[2], "both axes"
+
+    def back() -> None:
+        until(page, lambda: ranges(page, "excess") == before)
+
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 60, y + 60, steps=4)
+    page.mouse.up()
+    inside()
+    reset.click()
+    back()
+    page.evaluate("document.activeElement.blur()")
+    page.mouse.move(x, y)
+    page.mouse.wheel(0, -200)
+    page.wait_for_timeout(300)
+    assert ranges(page, "excess") == before, "the wheel alone scrolls"
+    page.keyboard.down("Control")
+    page.mouse.wheel(0, -200)
+    page.keyboard.up("Control")
+    inside()
+    page.locator("#plot-excess").focus()
+    page.keyboard.press("0")
+    back()
+    page.mouse.wheel(0, -200)
+    inside()
+    page.keyboard.press("0")
+    back()
+    page.keyboard.press("+")
+    inside()
+
+
+def test_two_fingers_zoom(browser: Browser, server: Server) -> None:
+    page = fresh(browser, server.address, viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
+    before = settled_ranges(page, "excess")
+    page.locator("#plot-excess").scroll_into_view_if_needed()
+    box = page.locator("#plot-excess").bounding_box()
+    assert box is not None
+    at = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+    touch = page.context.new_cdp_session(page)
+    for kind, apart in (("touchStart", 20), *(("touchMove", 20 + 8 * k) for k in range(1, 9)), ("touchEnd", 0)):
+        points = [{"x": at["x"] + side * apart, "y": at["y"], "id": (side + 1) // 2} for side in (-1, 1) if apart]
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    until(page, lambda: ranges(page, "excess")[1] - ranges(page, "excess")[0] < before[1] - before[0])
+    assert page.evaluate("visualViewport.scale") == 1, "the picture, not the page"
+    page.context.close()
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_tooltip_names_its_curve(browser: Browser, server: Server, theme: str) -> None:
+    page = fresh(browser, server.address, color_scheme=theme)
+    for picture, curve in (("excess", "expected per element of 10.5 nm"), ("distributions", "no flare")):
+        settled_ranges(page, picture)
+        box = page.locator(f"#plot-{picture}").bounding_box()
+        assert box is not None
+        tip = page.locator(".bk-Tooltip", has_text=curve)
+        for k in range(200):
+            page.mouse.move(box["x"] + 0.4 * box["width"] + k % 5, box["y"] + 0.4 * box["height"])
+            if tip.is_visible():
+                break
+            page.wait_for_timeout(20)
+        colours = tip.evaluate("e => [getComputedStyle(e).color, getComputedStyle(e).backgroundColor]")
+        wanted = page.locator("#asked").evaluate(
+            "e => [getComputedStyle(e).color, getComputedStyle(e).backgroundColor]"
+        )
+        assert colours == wanted, "those of the page"
+    page.context.close()
+
+
+def test_drawn_exposure_lies_behind_star_and_flare(page: Page) -> None:
+    tab(page, "Spectrum")
+    settled_ranges(page, "recorded")
+    names = page.evaluate("page.pictures.all.recorded.figure.plot.renderers.map(one => one.name)")
+    assert names.index("drawn exposure") < names.index("star") < names.index("star with flare")
+
+
+def test_saved_picture_is_complete(browser: Browser, server: Server, tmp_path: Path) -> None:
+    """At least 1600 pixels on white, with title, legend, and what was asked, whatever the page's colours are."""
+    from PIL import Image
+
+    page = fresh(browser, f"{server.address}?magnitude=8&statistic=chi2", color_scheme="dark")
+    settled_ranges(page, "distributions")
+    frame, saved = page.locator("#figure-distributions"), {}
+    for ending in ("svg", "png", "pdf"):
+        with page.expect_download() as coming:
+            frame.get_by_role("button", name=ending.upper(), exact=True).click()
+        assert coming.value.suggested_filename == f"mauvecl-distributions.{ending}"
+        saved[ending] = Path(coming.value.path()).read_bytes()
+    svg = saved["svg"].decode()
+    asked = ("V = 8", "Detection statistic: chi2", "mauvecl 0")
+    for part in ("The statistic without and with the flare", "no flare", "threshold", *asked):
+        assert part in svg, part
+    with Image.open(io.BytesIO(saved["png"])) as image:
+        assert image.width >= 1600
+        assert image.convert("RGB").getpixel((2, 2)) == (255, 255, 255)
+        dark = np.mean(np.asarray(image.convert("L"))[image.height // 3 : -image.height // 3] < 100)
+    assert dark < 0.1, "dark on light"
+    assert saved["pdf"].startswith(b"%PDF-")
+    at = int(saved["pdf"].split(b"startxref\n")[1].split()[0])
+    table = saved["pdf"][at:].split(b"\n")
+    assert table[0] == b"xref"
+    for n in range(1, 6):
+        place = int(table[n + 2].split()[0])
+        assert saved["pdf"][place:].startswith(b"%d 0 obj" % n)
+    page.context.close()
+
+
+def test_picture_has_its_data_as_a_table(page: Page) -> None:
+    settled_ranges(page, "roc")
+    frame = page.locator("#figure-roc")
+    frame.get_by_text("Data as a table").click()
+    table = frame.locator("table", has_text="closed form")
+    assert table.locator("caption").inner_text() == "closed form: 50 of 120 rows"
+    assert table.locator("th").all_inner_texts() == ["false-alarm probability per test", "detection probability"]
+    first = [float(text) for text in table.locator("tr").nth(1).locator("td").all_inner_texts()]
+    assert first[0] == 1e-6
+    assert 0 < first[1] < 0.2
+    enter(page, "Magnitude", "7")
+    until(page, lambda: float(table.locator("tr").nth(1).locator("td").nth(1).inner_text()) > first[1] + 0.3)
+
+
 def test_click_on_the_map_sets_the_question(page: Page) -> None:
     tab(page, "Limit and map")
     page.locator("#text-map", has_text="At least half").wait_for()
     before = shown(page)
-    until(page, lambda: page.evaluate("page.pictures.all.map.view?.has_finished() ?? false"))
+    until(page, lambda: page.evaluate("page.pictures.all.map.figure?.view?.has_finished() ?? false"))
     box = page.locator("#plot-map").bounding_box()
     assert box is not None
     page.mouse.click(box["x"] + 0.5 * box["width"], box["y"] + 0.4 * box["height"])
     until(page, lambda: "magnitude=8.5" not in page.url and "magnitude" in page.url)
     assert shown(page) != before
     entered = float(page.get_by_label("Magnitude", exact=True).input_value())
-    own = page.evaluate("[...page.pictures.all.map.models.get('own').data.x]")
+    own = page.evaluate("[...page.pictures.all.map.figure.models.get('own').data.x]")
     until(
         page,
-        lambda: own != [] and abs(page.evaluate("page.pictures.all.map.models.get('own').data.x[0]") - entered) < 1e-3,
+        lambda: (
+            own != []
+            and abs(page.evaluate("page.pictures.all.map.figure.models.get('own').data.x[0]") - entered) < 1e-3
+        ),
     )
 
 
@@ -465,10 +615,10 @@ def test_scenarios_are_compared(page: Page) -> None:
     assert len(set(colours)) == 2
     for name, picture in (("Detection", "excess"), ("S/N", "snr"), ("Limit and map", "map")):
         tab(page, name)
-        models = f"page.pictures.all.{picture}.models"
+        models = f"page.pictures.all.{picture}.figure?.models"
         filled = f"[0, 1, 2].map(k => Object.values({models}?.get(`pin ${{k}}`).data ?? {{}})[0]?.length > 0)"
         until(page, partial(lambda script: page.evaluate(script) == [True, True, False], filled))
-        lines = f"page.pictures.all.{picture}.plot.renderers.filter(r => r.name?.startsWith('pinned'))"
+        lines = f"page.pictures.all.{picture}.figure.plot.renderers.filter(r => r.name?.startsWith('pinned'))"
         drawn = page.evaluate(f"{lines}.map(r => r.glyph.line_color.value)")
         assert [colour for colour in drawn if colour != "#ffffff"][:2] == colours
         key = page.locator(f"#panel-{page.evaluate('page.routing.seen.tab')} .pins")

@@ -12,7 +12,6 @@ export default [
       "no-shadow": "error",
       "no-unused-expressions": ["error", {allowTernary: true}],
       "no-var": "error",
-      "no-await-in-loop": "error",
       "require-atomic-updates": "error",
       "object-shorthand": "error",
       "prefer-const": "error",

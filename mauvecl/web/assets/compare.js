@@ -2,7 +2,7 @@
 // Scenarios that are pinned, side by side, and what was simulated; the browser's tab keeps them.
 
 import {byId, element} from "./dom.js"
-import {dashed} from "./pictures.js"
+import {dashed} from "./legend.js"
 
 /** @typedef {import("./protocol.js").Entered} Entered */
 /**
@@ -54,9 +54,10 @@ export class Compare {
     this.keep()
   }
 
-  // What is drawn how, in a few words, for a picture's reader.
-  key() {
-    const look = this.pins[document.documentElement.dataset.theme]
+  /** What is drawn how, in a few words, for a picture's reader.
+   * @returns {Element[]} */
+  key(theme = document.documentElement.dataset.theme) {
+    const look = this.pins[theme]
     return this.drawn.flatMap((one, slot) => {
       if (!one) return []
       const {star, band, magnitude, amplitude_percent, exposure_s} = one.entered

@@ -74,6 +74,8 @@ if name == "realisations":
 elif name == "signal":
     option = {"net": "the star (net)", "paper": "star and sky (paper)"}[option]
 %>${option}</%def>
+<noscript><p class="noscript">This page needs JavaScript. Without it, the command line gives the same answers: mauvecl detect --star G2V --magnitude 8.5.</p></noscript>
+<p id="zoom-keys" hidden>Keys: plus and minus zoom, arrows move, 0 resets.</p>
 <a class="skip" href="#answer">To the answer</a>
 <header>
 <h1>mauvecl</h1>
@@ -151,7 +153,7 @@ ${control(name)}
 <figure id="figure-${picture.name}" data-picture="${picture.name}">
 <h3>${picture.title}</h3>
 <ul class="legend" aria-label="Colours of ${picture.title}"></ul>
-<div class="plot" id="plot-${picture.name}" role="img" aria-labelledby="text-${picture.name}"></div>
+<div class="plot" id="plot-${picture.name}" role="img" tabindex="0" aria-label="${picture.title}" aria-describedby="text-${picture.name} zoom-keys"></div>
 <figcaption><p id="text-${picture.name}">Not drawn yet.</p>
 <div class="tools">
 % for axis in picture.logs:
@@ -161,9 +163,13 @@ ${control(name)}
 <label><input type="checkbox" data-show="${tag}"> ${title}</label>
 % endfor
 <button type="button" class="plain" data-reset>Reset zoom</button>
-<button type="button" class="plain" data-save="svg">SVG</button>
-<button type="button" class="plain" data-save="png">PNG</button>
-</div></figcaption>
+<span>Save picture:</span>
+% for ending in ("svg", "png", "pdf"):
+<button type="button" class="plain" data-save="${ending}">${ending.upper()}</button>
+% endfor
+</div>
+<details class="data"><summary>Data as a table</summary><div class="wide" tabindex="0" role="region" aria-label="Data of ${picture.title}"></div></details>
+</figcaption>
 </figure>
 % endfor
 </div>
@@ -185,6 +191,9 @@ ${control(name)}
 <label><input type="checkbox" data-marks="more marks"> H alpha</label>
 % endif
 </div>
+% if tab.pictures:
+<p class="hint">To zoom: drag a box, pinch, or turn the wheel with Ctrl or after a click. Keys: + − arrows 0.</p>
+% endif
 <div class="wide rows" tabindex="0" role="region" aria-label="Table of ${tab.title}" hidden></div>
 % if tab.files:
 <div class="row files"><span>Tables:</span>

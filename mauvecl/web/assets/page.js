@@ -48,7 +48,7 @@ class Page {
       changed: last => this.changed(last, true), none: () => this.none(this.uploads.lacks), again: () => this.ask(),
     })
     this.export = new Export(this.live, this.routing, () => this.offer(), refused)
-    this.pictures = new Pictures(words, given => this.enter(given), give)
+    this.pictures = new Pictures(words, given => this.enter(given), give, () => this.about())
     this.pins = new Map()
     this.compare = new Compare(words.pins, link => { this.follow(link); this.changed(true, true) }, () => this.pinned())
     this.wire()
@@ -229,6 +229,14 @@ class Page {
     const {shown, interval, facts, words: said} = this.answer
     const entered = {...this.fields.entered}
     return {link: this.routing.link, entered, files: this.uploads.of(entered), shown, interval, facts, words: said}
+  }
+
+  // What a saved picture says of the question.
+  about() {
+    const others = Object.entries(this.fields.entered).filter(([name, text]) => text !== words.fields[name])
+    const entered = others.map(([name, text]) => `${this.fields.label(name)}: ${text}`).join("; ")
+    const sentences = [this.answer && `${this.answer.shown} ${this.answer.words}.`, entered && `Entered: ${entered}.`]
+    return {sentences: [...sentences.filter(Boolean), `mauvecl ${words.version}`], pins: this.compare.key("light")}
   }
 
   // The connection

@@ -2,32 +2,16 @@
 // The pictures of a tab: empty figures that are fetched once for each theme, and data that come with every answer.
 
 import {byId, every} from "./dom.js"
+import {Figure, isEmpty} from "./figure.js"
+import {items} from "./legend.js"
+import {pictureFile} from "./picture-files.js"
+import {tables} from "./picture-table.js"
 
 /** @typedef {import("./protocol.js").Columns} Columns */
 /** @typedef {import("./protocol.js").Drawn} Drawn */
 /** @typedef {import("./protocol.js").Entered} Entered */
 /** @typedef {import("./protocol.js").PictureWords} PictureWords */
 /** @typedef {import("./protocol.js").Words} Words */
-
-const coarse = window.matchMedia("(pointer: coarse)").matches
-
-/** Numbers as they are sent: base64 of 32-bit floats.
- * @param {Columns[string]} column */
-function unpacked(column) {
-  if (Array.isArray(column)) return column
-  const bytes = Uint8Array.from(atob(column.f4), c => c.charCodeAt(0))
-  const values = new Float32Array(bytes.buffer)
-  if (column.shape.length === 1) return values
-  const {ndarray} = Bokeh.require("core/util/ndarray")
-  return [ndarray(values, {dtype: "float32", shape: column.shape.slice(1)})]
-}
-
-const line = (/** @type {string} */ colour, /** @type {string} */ dashes) => `<path d="M0 5h22" stroke="${colour}" stroke-width="2.5" stroke-dasharray="${dashes}"/>`
-const swatch = (/** @type {string} */ shape) =>
-  `<svg aria-hidden="true" class="swatch" viewBox="0 0 22 10">${shape}</svg>`
-/** How a line is drawn, small.
- * @param {[string, string]} look colour and dashes */
-export const dashed = look => swatch(line(...look))
 
 class Picture {
   /**
@@ -39,15 +23,10 @@ class Picture {
     this.name = name
     this.sets = sets
     this.pins = pins
-    /** BokehJS's view of the figure, and its model.
-     * @type {any} */
-    this.view = null
-    /** @type {any} */
-    this.plot = null
-    /** Models by name.
-     * @type {Map<string, any> | null} */
-    this.models = null
+    /** @type {Figure | null} */
+    this.figure = null
     this.frame = byId(`figure-${name}`)
+    this.box = byId(`plot-${name}`)
     this.logs = new Set(logs.filter(axis => axis !== axis.toLowerCase()).map(axis => axis.toLowerCase()))
     this.wanted = new Set([""])
     /** Theme and logarithmic axes of the figure that is here, or comes.
@@ -67,12 +46,18 @@ class Picture {
     for (const box of every("[data-show]", this.frame)) {
       box.addEventListener("change", () => this.want(box.dataset.show, box.checked))
     }
-    this.frame.querySelector("[data-reset]").addEventListener("click", () => {
-      for (const range of [this.plot?.x_range, this.plot?.y_range]) range?.reset()
-    })
+    this.frame.querySelector("[data-reset]").addEventListener("click", () => this.figure?.reset())
     for (const button of every("[data-save]", this.frame)) {
       button.addEventListener("click", () => this.save(button.dataset.save))
     }
+    const [data] = every("details.data", this.frame)
+    data.addEventListener("toggle", () => this.tabulate())
+    this.box.addEventListener("focusin", () => this.figure?.wheel(true))
+    this.box.addEventListener("focusout", () => this.figure?.wheel(false))
+    this.box.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => {
+      if (event.ctrlKey || event.altKey || event.metaKey || !this.figure?.press(event.key)) return
+      event.preventDefault()
+    })
   }
 
   /**
@@ -89,64 +74,59 @@ class Picture {
   put(drawn) {
     this.drawn = drawn
     this.frame.querySelector("figcaption p").textContent = drawn.text
+    this.tabulate()
     return this.draw()
   }
 
   async draw() {
-    const wanted = `${document.documentElement.dataset.theme} ${[...this.logs].sort().join("")}`
-    if (this.made !== wanted) {
+    if (!this.drawn) return
+    const wanted = `${document.documentElement.dataset.theme} ${this.logged}`
+    const empty = isEmpty(this.drawn)
+    this.box.classList.toggle("nothing", empty)
+    for (const button of every(".tools button", this.frame)) button.disabled = empty
+    if (empty) {
+      // How to have it drawn is said below.
+      this.made = null
+      this.figure?.remove()
+      this.figure = null
+      this.box.replaceChildren()
+    } else if (this.made !== wanted) {
       this.made = wanted
       await this.make(wanted)
-    }
-    if (this.made === wanted && this.models && this.drawn) this.fill()
+    } else if (this.figure) this.fill()
+  }
+
+  get logged() {
+    return [...this.logs].sort().join("")
+  }
+
+  /** The figure in a theme, with its legend.
+   * @param {string} theme */
+  async fetched(theme) {
+    const answer = await fetch(`figures/${theme}/${this.name}.json?log=${this.logged}&v=${this.pictures.version}`)
+    const {item, legend} = await answer.json()
+    return {figure: new Figure(item, this.pins), entries: items(legend)}
   }
 
   /** @param {string} wanted theme and logarithmic axes */
   async make(wanted) {
-    const [theme, logs] = wanted.split(" ")
-    const answer = await fetch(`figures/${theme}/${this.name}.json?log=${logs}&v=${this.pictures.version}`)
-    const {item, legend} = await answer.json()
+    const {figure, entries} = await this.fetched(wanted.split(" ")[0])
     if (this.made !== wanted) return
-    const box = byId(`plot-${this.name}`)
-    this.view?.remove()
-    box.replaceChildren()
-    const views = await Bokeh.embed.embed_item(item, box.id)
-    const [view] = views
-    this.view = view
-    this.plot = view.model
-    this.models = new Map()
-    for (const model of view.model.references()) {
-      if (model.name && model.type !== "GlyphRenderer") this.models.set(model.name, model)
-    }
-    this.legend(legend)
-    if (coarse) for (const tool of this.plot.toolbar.tools) if ("active" in tool) tool.active = tool.type === "HoverTool"
-    const range = this.models.get("wavelength")
+    this.figure?.remove()
+    this.box.replaceChildren()
+    this.figure = figure
+    this.frame.querySelector(".legend").replaceChildren(...entries)
+    const range = figure.models.get("wavelength")
     if (range) this.pictures.link(range)
-    if (this.sets) this.plot.on_event("tap", (/** @type {any} */ event) => this.pictures.clicked(this.sets, event))
-    this.reveal()
+    if (this.sets) figure.plot.on_event("tap", (/** @type {any} */ event) => this.pictures.clicked(this.sets, event))
+    figure.reveal(this.shown)
+    this.fill()
+    await figure.mount(this.box)
   }
 
   fill() {
-    for (const [name, columns] of Object.entries(this.drawn.sources)) this.columns(name, columns)
-    if (this.pins) {
-      /** @type {Columns} */
-      const none = {}
-      for (const column of Object.keys(this.drawn.sources[this.pins])) none[column] = []
-      for (const slot of this.pictures.slots.keys()) this.columns(`pin ${slot}`, this.pinned[slot] ?? none)
-    }
-    for (const [name, props] of Object.entries(this.drawn.props)) this.models.get(name).setv(props)
+    this.figure.fill(this.drawn, this.pinned, this.pictures.slots.length)
     this.some()
-  }
-
-  /**
-   * @param {string} name
-   * @param {Columns} columns
-   */
-  columns(name, columns) {
-    /** @type {Record<string, any>} */
-    const data = {}
-    for (const [column, values] of Object.entries(columns)) data[column] = unpacked(values)
-    this.models.get(name).data = data
   }
 
   /** Pinned scenarios by slot: columns of each, or nothing.
@@ -154,51 +134,22 @@ class Picture {
   pin(pinned) {
     const same = pinned.every((columns, slot) => columns === (this.pinned[slot] ?? null))
     this.pinned = pinned
-    if (!same && this.models && this.drawn) this.fill()
+    if (!same && this.figure && this.drawn) this.fill()
   }
 
-  // Show the requested parts, and the marks that all pictures share.
+  /** Tags of the parts that are shown: those of this picture, and the marks that all of them share. */
+  get shown() {
+    return new Set([...this.wanted, ...this.pictures.marks])
+  }
+
   reveal() {
-    if (!this.plot) return
-    for (const model of this.plot.references()) {
-      const [tag] = model.tags ?? []
-      if (tag) model.visible = this.wanted.has(tag) || this.pictures.marks.has(tag)
-    }
-    this.some()
-  }
-
-  /** @param {[string, string, string, string][]} entries */
-  legend(entries) {
-    const svg = (/** @type {string} */ colour, /** @type {string} */ form) => {
-      /** @type {Record<string, string>} */
-      const shapes = {
-        line: line(colour, "none"),
-        dash: line(colour, "4 3"),
-        band: `<rect width="22" height="10" fill="${colour}" fill-opacity=".4"/>`,
-        bars: `<rect width="22" height="10" fill="${colour}" fill-opacity=".5"/>`,
-        bar: `<rect width="22" height="10" fill="${colour}"/>`,
-        dot: `<circle cx="11" cy="5" r="4" fill="${colour}"/>`,
-      }
-      return swatch(shapes[form])
-    }
-    this.frame.querySelector(".legend").replaceChildren(...entries.map(([called, colour, form, show]) => {
-      const item = document.createElement("li")
-      item.innerHTML = svg(colour, form)
-      item.append(called)
-      item.dataset.shows = show
-      item.dataset.called = called
-      return item
-    }))
+    this.figure?.reveal(this.shown)
     this.some()
   }
 
   // The legend holds what is there to be seen; what is not there yet has its room, so that nothing jumps.
   some() {
-    const empty = new Set()
-    for (const renderer of this.plot?.renderers ?? []) {
-      const source = renderer.data_source
-      if (source && renderer.name && source.get_length() === 0) empty.add(renderer.name)
-    }
+    const empty = new Set(this.figure?.empty ?? [])
     for (const item of every(".legend li", this.frame)) {
       const {shows, called} = item.dataset
       item.hidden = shows !== "" && shows !== "if any" && !this.wanted.has(shows)
@@ -206,10 +157,31 @@ class Picture {
     }
   }
 
+  // The data as tables, if they are open.
+  tabulate() {
+    const [data] = every("details.data", this.frame)
+    if (!data.open) return
+    const axis = (/** @type {string} */ of) => this.figure?.models.get(`${of} axis`)?.axis_label ?? of
+    const [x, y] = [axis("x"), axis("y")]
+    data.querySelector("div").replaceChildren(...this.drawn ? tables(this.drawn, {x, y, low: `${y}, low`, high: `${y}, high`}) : [])
+  }
+
   /** @param {string} ending */
   async save(ending) {
-    if (!this.view) return
-    const blob = await this.view.export(ending).to_blob()
+    if (!this.drawn || !this.figure) return
+    const {figure, entries} = await this.fetched("light")
+    figure.reveal(this.shown)
+    figure.fill(this.drawn, this.pinned, this.pictures.slots.length)
+    for (const range of ["x_range", "y_range"]) {
+      const {start, end} = this.figure.plot[range]
+      if (this.figure.plot[range].type !== "FactorRange") figure.plot[range].setv({start, end})
+    }
+    const here = every(".legend li", this.frame)
+    const {sentences, pins} = this.pictures.about()
+    const legend = entries.filter((_, k) => !here[k].hidden && !here[k].classList.contains("absent"))
+    if (this.pins && this.pictures.marks.has("pins")) legend.push(...pins)
+    const [title] = every("h3", this.frame)
+    const blob = await pictureFile(ending, figure, title.textContent, legend, [this.drawn.text, ...sentences])
     this.pictures.give(`mauvecl-${this.name}.${ending}`, blob)
   }
 }
@@ -219,11 +191,13 @@ export class Pictures {
    * @param {Words} words
    * @param {(given: Entered) => void} set enter the fields that a click on a picture sets
    * @param {(name: string, content: Blob) => void} give save a file
+   * @param {() => {sentences: string[], pins: Element[]}} about what was asked, in sentences, and the key of what is pinned
    */
-  constructor(words, set, give) {
+  constructor(words, set, give, about) {
     this.version = words.version
     this.give = give
     this.set = set
+    this.about = about
     this.marks = new Set(["marks", "pins"])
     this.slots = words.pins.light
     /** @type {Set<any>} */
@@ -243,7 +217,7 @@ export class Pictures {
       })
     }
     window.addEventListener("mauvecl-theme", () => {
-      for (const picture of Object.values(this.all)) if (picture.made) picture.draw()
+      for (const picture of Object.values(this.all)) picture.draw()
     })
   }
 
