@@ -62,7 +62,7 @@ class Visitor:
         return self._n
 
     async def change(self, magnitude: float) -> float:
-        """Seconds from a change to its answer; its pictures come behind it, and a drawn exposure as a browser asks."""
+        """Return the time from a change to its answer, s; pictures and a drawn exposure follow, as in a browser."""
         start, link = time.perf_counter(), f"?magnitude={magnitude:.4f}"
         n = await self._ask("answer", link=link, tab="detection")
         answered = 0.0
@@ -78,7 +78,7 @@ class Visitor:
                 raise RuntimeError(str(told))
 
     async def draw(self, magnitude: float) -> None:
-        """One exposure, half a second after the last change."""
+        """Draw one exposure, half a second after the last change."""
         await self._ask("draw", link=f"?magnitude={magnitude:.4f}", tab="detection")
 
     async def upload(self, name: str, content: bytes) -> None:
@@ -110,13 +110,13 @@ async def bombs(visitor: Visitor, until: asyncio.Event) -> int:
 
 
 def spent(process: int) -> float:
-    """Seconds of processor time of a process and the children that it has ended."""
+    """Return the processor time of a process and its ended children, s."""
     fields = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()
     return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
 
 async def measure(host: str, process: int, visitors: int, changes: int, with_bombs: bool) -> dict[str, float]:
-    """All visits."""
+    """Run all visits and return their times."""
     first = Visitor(host)
     await first.come()
     before = spent(process)

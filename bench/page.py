@@ -62,7 +62,7 @@ WATCH = """
 
 
 def waits(page: Page, name: str, values: list[str]) -> np.ndarray:
-    """Milliseconds to the answer and to its picture, and how often it was drawn, one row per value."""
+    """Return the times to the answer and to its picture, ms, and the number of draws, one row per value."""
     rows = []
     for value in values:
         rows.append(page.evaluate(WATCH, [name, value]))
@@ -72,7 +72,7 @@ def waits(page: Page, name: str, values: list[str]) -> np.ndarray:
 
 
 def first_load(browser: Browser, address: str) -> tuple[float, float, float]:
-    """Seconds to the first answer and to the first picture of a visitor who was never here, and megabytes sent."""
+    """Return the times to a new visitor's first answer and first picture, s, and the megabytes sent."""
     page = browser.new_context().new_page()
     sent = 0.0
 

@@ -50,7 +50,7 @@ def probabilities(mean: float, read: float, edges: NDArray[np.float64]) -> NDArr
 
 
 def moments(counts: NDArray[np.int64], expected: NDArray[np.float64]) -> list[float]:
-    """Of the binned counts, orders one to four, less the expected ones, in standard errors."""
+    """Return moments of orders one to four of the binned counts less the expected ones, in standard errors."""
     x = np.arange(counts.size) - float(np.arange(counts.size) @ expected)
     x /= np.sqrt(x**2 @ expected)
     share, n = counts / counts.sum(), counts.sum()

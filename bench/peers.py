@@ -55,7 +55,7 @@ def _blocks(n: int, size: int = 64) -> list[tuple[int, int]]:
 
 
 def numpy_peer(m: Model) -> Peer:
-    """NumPy's Generator, one thread: float32 normals, blocks that stay in the cache."""
+    """Return the peer of NumPy's Generator: one thread, float32 normals, blocks that stay in the cache."""
     generator = np.random.default_rng(1)
 
     def chi2(n: int) -> np.ndarray:
@@ -88,7 +88,7 @@ def _numpy_block(m: Model, generator: np.random.Generator, n: int) -> np.ndarray
 
 
 def numba_peer(m: Model) -> Peer:
-    """Numba, prange over realisations, its own generators."""
+    """Return the peer of Numba: prange over realisations, Numba's generators."""
     import numba
 
     @numba.njit(parallel=True, fastmath=True)
@@ -111,7 +111,7 @@ def numba_peer(m: Model) -> Peer:
 
 
 def jax_peer(m: Model) -> Peer:
-    """JAX on the CPU, compiled, in blocks."""
+    """Return the peer of JAX on the CPU: compiled, in blocks."""
     import jax
     import jax.numpy as jnp
 
@@ -134,7 +134,7 @@ def jax_peer(m: Model) -> Peer:
 
 
 def mkl_peer(m: Model) -> Peer:
-    """Intel MKL's generators through mkl_random; its Poisson of a large mean is a rounded normal."""
+    """Return the peer of Intel MKL through mkl_random, whose Poisson of a large mean is a rounded normal."""
     import mkl_random
 
     generator = mkl_random.MKLRandomState(1, brng="PHILOX4X32X10")
@@ -173,7 +173,7 @@ class Child:
             print(f"CAUTION: {self.name} has a mean chi2 of {mean:.1f} for {pixels} pixels")
 
     def seconds(self) -> float:
-        """Time of one run of its realisations."""
+        """Return the time of one run, s."""
         self._pipe.send(True)
         return float(self._pipe.recv())
 

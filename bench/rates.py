@@ -45,7 +45,7 @@ class Line:
         self.processor_seconds = (*self.processor_seconds, time.process_time() - start)
 
     def rate(self, pixels: int, *, best: bool = False) -> float:
-        """Pixel-realisations per second, counted per scenario, by the median time or the shortest."""
+        """Return pixel-realisations per second, counted per scenario, by the median time or the shortest."""
         seconds = min(self.seconds) if best else float(np.median(self.seconds))
         return self.realisations * pixels * self.scenarios / seconds
 

@@ -47,7 +47,7 @@ LOOPS = (("words", 8), ("normals", 8), ("statistic", 4 * VECTORS))
 
 
 def peak_rate(engine: Engine, turns: int = 3_000_000) -> float:
-    """512-bit fused multiply-adds per second of the whole device."""
+    """Measure the 512-bit fused multiply-adds per second of the whole device."""
     cl, items = engine.open_device.cl, engine.device.compute_units
     kernel = cl.Kernel(cl.Program(engine.open_device.context, PEAK).build(), "peak")
     out = cl.Buffer(engine.open_device.context, cl.mem_flags.READ_WRITE, 4 * items)
@@ -61,7 +61,7 @@ def peak_rate(engine: Engine, turns: int = 3_000_000) -> float:
 
 
 def copy_rate() -> float:
-    """Bytes written per second by a copy far larger than the caches."""
+    """Measure the bytes written per second by a copy far larger than the caches."""
     source = np.ones(2**28, np.uint8)
     target, seconds = np.empty_like(source), []
     for _ in range(7):
@@ -92,7 +92,7 @@ def innermost_loops(library: Path, function: str) -> list[list[str]]:
 
 
 def kinds(code: list[str]) -> dict[str, int]:
-    """Instructions of a loop by kind."""
+    """Count the instructions of a loop by kind."""
     found = {"arithmetic": 0, "moves": 0, "scalar": 0}
     for one in code:
         name = one.split()[0]
@@ -164,7 +164,7 @@ def main() -> None:
 
 
 def picture(path: Path, points: list[tuple[str, float, float, float]], peak: float, copy: float) -> None:
-    """Vector operations per byte to memory, against vector operations per second, under both ceilings."""
+    """Plot vector operations per second against vector operations per byte to memory, with both ceilings."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.0, 3.8), layout="constrained")

@@ -207,7 +207,7 @@ def numpy_lines() -> list[Line]:
 
 
 def altaipony(python: str) -> dict[str, float | str]:
-    """Injections and recoveries by AltaiPony in its own environment."""
+    """Inject and recover flares with AltaiPony in its own environment."""
     child = subprocess.run([python, "-c", ALTAIPONY, str(FRAMES), "50"], capture_output=True, text=True, check=True)
     found: dict[str, float | str] = json.loads(child.stdout.splitlines()[-1])
     return found

@@ -33,7 +33,7 @@ print(time.perf_counter() - start)
 
 
 def wall(*command: str) -> float:
-    """Seconds of a whole process."""
+    """Return the time of a whole process, s."""
     start = time.perf_counter()
     subprocess.run(command, check=True, capture_output=True)
     return time.perf_counter() - start

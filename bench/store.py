@@ -41,7 +41,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
 
 
 def study(realisations: int) -> Study:
-    """Frames of the paper's G2V star, without and with a flare."""
+    """Return a study of frames of the paper's G2V star, without and with a flare."""
     star = {"library": "G2V", "magnitude": 7.4}
     data = {"star": [star], "flare": {"amplitudes": [0.24]}, "observation": {"exposure_s": 5.0}}
     return Study.build(data | {"run": {"realisations": realisations}}, "bench")

@@ -22,7 +22,7 @@ def processor() -> str:
 
 
 def versions() -> dict[str, str]:
-    """Of what a rate depends on."""
+    """Return the versions of the packages on which a rate depends."""
     return {
         "mauvecl": __version__,
         "python": platform.python_version(),

@@ -90,7 +90,7 @@ finally:
 
 
 def measured(words: list[str], folder: str) -> dict[str, float]:
-    """Seconds of one run."""
+    """Return the times of one run, s."""
     start = time.perf_counter()
     child = subprocess.run(
         [sys.executable, "-c", CHILD, json.dumps(words)], capture_output=True, text=True, cwd=folder, check=False

@@ -19,12 +19,12 @@ from astropy.table import QTable
 
 
 def no_network(*_: object, **__: object) -> None:
-    """In the place of every connection."""
+    """Refuse every connection."""
     raise OSError("no network in this bench")
 
 
 def cpu_s() -> float:
-    """Of this process, s."""
+    """Return the processor time of this process, s."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
 

@@ -16,7 +16,7 @@ class Registry(Protocol):
         """Return every picture of a thing by the name of its file."""
 
     def documents_of(self, thing: Any) -> dict[str, Callable[[], bytes]]:
-        """Return what makes each document of a thing, by the full name of its file."""
+        """Return the functions that make the documents of an object, by file name."""
 
 
 class Drawable:
@@ -36,7 +36,7 @@ class Drawable:
 
 
 def documents_of(thing: Drawable) -> dict[str, Callable[[], bytes]]:
-    """Return what makes each registered document of a thing, by the full name of its file."""
+    """Return the functions that make the registered documents of an object, by file name."""
     return _registry().documents_of(thing)
 
 

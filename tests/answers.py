@@ -34,7 +34,7 @@ QUICK: dict[str, list[str]] = {
 
 
 def same(ours: Detection, theirs: Detection) -> None:
-    """Every count, sum and extreme, to the bit."""
+    """Check that every count, sum and extreme is equal to the bit."""
     assert ours._distributions.keys() == theirs._distributions.keys()
     for key, found in ours._distributions.items():
         other = theirs._distributions[key]

@@ -21,14 +21,14 @@ class Done:
 
 
 def run(*words: str | Path, folder: Path, code: int = 0) -> Done:
-    """In this process, which spares most tests a start of Python; `started` makes one of its own."""
+    """Run a command in this process, which is faster than `started`."""
     found, out, told = ended(*words, folder=folder)
     assert found == code, out + told
     return Done(out, told)
 
 
 def ended(*words: str | Path, folder: Path) -> tuple[int, str, str]:
-    """In this process: exit code, standard output, standard error."""
+    """Run a command in this process; return exit code, standard output and standard error."""
     out, told = io.StringIO(), io.StringIO()
     code = 0
     with (
@@ -46,7 +46,7 @@ def ended(*words: str | Path, folder: Path) -> tuple[int, str, str]:
 
 
 def started(*words: str | Path, folder: Path, code: int = 0, **environment: str) -> Done:
-    """In a process of its own, as from a shell."""
+    """Run a command in another process, as from a shell."""
     done = subprocess.run(
         [sys.executable, "-m", "mauvecl", *map(str, words)],
         cwd=folder,

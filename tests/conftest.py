@@ -22,7 +22,7 @@ def engine() -> Engine:
 
 @pytest.fixture
 def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shards of 4096 realisations."""
+    """Set shards of 4096 realisations."""
     monkeypatch.setattr(shards, "SHARD_WORK", 1)
 
 
@@ -47,6 +47,6 @@ def scene() -> list[Expectation]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with long tests first, so that none is left when the others have ended, and the page's before all."""
+    """Sort tests so that files with long ones run first, those of the page before all others."""
     long = {item.path for item in items if item.get_closest_marker("long")}
     items.sort(key=lambda item: (item.path.name != "test_page.py", item.path not in long))

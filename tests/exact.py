@@ -14,7 +14,7 @@ Float = NDArray[np.float64]
 def counts(
     gaussian: float, poisson: Sequence[tuple[float, float]], mean: float, low: int, size: int, frames: int = 1
 ) -> Float:
-    """Probabilities of low, low + 1, ... as the sum of frames, each rounded to whole DN.
+    """Return the probabilities of low, low + 1, ... for the sum of frames that are each rounded to whole DN.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def of_polynomial(coefficients: Sequence[float], sd: float, mean: float, low: in
 
 
 def draws_to_tell(p: Float, q: Float) -> float:
-    """Draws from q after which Pearson's test against p stands at five sigma."""
+    """Return the number of draws from q after which Pearson's test against p reaches five sigma."""
     common = p > 1e-14
     return float(5 * np.sqrt(2 * common.sum()) / np.sum((p - q)[common] ** 2 / p[common]))
 

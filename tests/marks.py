@@ -9,7 +9,7 @@ import pytest
 
 
 def long_but(cases: Iterable[Any], *short: Any) -> list[Any]:
-    """Parameters, or tuples of them, all long but for some."""
+    """Mark all parameters, or tuples of them, as long except for some."""
     cases = list(cases)
     assert all(case in cases for case in short)
     given = [case if isinstance(case, tuple) else (case,) for case in cases]

@@ -47,7 +47,7 @@ def star(
 
 
 def flaring_stares(method: Any = "cumulants", **more: Any) -> StaresRequest:
-    """Two hundred stares of half a minute, each with flares of its own in two scenarios."""
+    """Return two hundred stares of half a minute, each with different flares in two scenarios."""
     quiet, flare = star(amplitudes=(1.0,), exposure=5.0, payload=instrument(part=True))
     slope = np.linspace(-1.0, 1.0, quiet.wavelength_nm.size)
     components = Components.of(quiet, [flare], np.stack([np.ones_like(slope), slope]))

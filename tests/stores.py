@@ -19,7 +19,7 @@ CHUNK, LAST = "star-1/quiescent/c/1/0", "star-1/flare-1/c/4/0"
 
 
 def study(realisations: int = 300, **sections: Any) -> Study:
-    """One star with one flare on 197 pixels, one frame each by default."""
+    """Return a study of one star with one flare on 197 pixels, by default of one frame."""
     data = {
         "star": [{"library": "G2V", "magnitude": 7.4}],
         "flare": {"amplitudes": [0.24]},
@@ -32,7 +32,7 @@ def study(realisations: int = 300, **sections: Any) -> Study:
 
 
 def tree(path: Path) -> dict[str, bytes]:
-    """Every file of a store; lists of digests sorted, since their order tells only what was written first."""
+    """Read every file of a store; lists of digests are sorted, since their order is that of writing."""
     found = {str(p.relative_to(path)): p.read_bytes() for p in path.rglob("*") if p.is_file()}
     lists = {name: b"".join(sorted(set(text.splitlines()))) for name, text in found.items() if "digests" in name}
     return {name: text for name, text in found.items() if not Path(name).name.startswith(".")} | lists
@@ -62,7 +62,7 @@ class Painter(Engine):
 
 
 def forked(work: Callable[[], object]) -> int:
-    """Do work in a child process; its number."""
+    """Do work in a child process, and return its number."""
     child = os.fork()
     if child == 0:
         try:
@@ -73,7 +73,7 @@ def forked(work: Callable[[], object]) -> int:
 
 
 def killed(child: int) -> bool:
-    """Whether it ended by SIGKILL."""
+    """Return whether a process ended by SIGKILL."""
     _, status = os.waitpid(child, 0)
     return os.WIFSIGNALED(status)
 

@@ -174,7 +174,7 @@ class Spectrum:
 
 
 def entries() -> list[Spectrum]:
-    """Everything the library holds."""
+    """Return all spectra of the library."""
     found = [
         Spectrum(
             t,
@@ -202,12 +202,12 @@ def wheel_of(package: str) -> str:
 
 
 def digest(file: Path) -> str:
-    """SHA-256 of a file."""
+    """Return the SHA-256 of a file."""
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def write_inputs(source: Path) -> None:
-    """Which file of which wheel each spectrum and band is from, with digests."""
+    """Write the wheel and file of each spectrum and band, with digests."""
     rows = []
     for entry in entries():
         rows.append((f"spectrum {entry.name}", "pyphot" if entry.file.startswith("pyphot") else "EXOSIMS", entry.file))
@@ -241,14 +241,14 @@ def fetch(folder: Path, given: Path | None) -> None:
 
 
 def bin_means(wavelength: np.ndarray[Any, Any], flux: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """Mean flux of each bin of EDGES, from the exact integral of the piecewise-linear spectrum."""
+    """Return the mean flux in each bin of EDGES, from the exact integral of the piecewise-linear spectrum."""
     keep = np.append(True, np.diff(wavelength) > 0)
     integral = make_interp_spline(wavelength[keep], flux[keep], k=1).antiderivative()
     return np.asarray(np.diff(integral(EDGES)) / np.diff(EDGES))
 
 
 def uv_quality(wavelength: np.ndarray[Any, Any], flux: np.ndarray[Any, Any]) -> str:
-    """Three ultraviolet bands over the mean at 540-560 nm."""
+    """Return the means in three ultraviolet bands over the mean at 540-560 nm."""
 
     def mean(low: float, high: float) -> float:
         return float(flux[(wavelength >= low) & (wavelength < high)].mean())
@@ -260,7 +260,7 @@ def uv_quality(wavelength: np.ndarray[Any, Any], flux: np.ndarray[Any, Any]) -> 
 
 
 def noisy_below(wavelength: np.ndarray[Any, Any], flux: np.ndarray[Any, Any]) -> float:
-    """Where noise begins to rule the ultraviolet of a cool star, nm; 0 if nowhere from 200 nm on.
+    """Return the wavelength below which noise dominates a cool star, nm; 0 if it is below 200 nm.
 
     A photosphere's flux falls bluewards, 20 nm by 20 nm; where it rises again by a fifth, the band and all bluer ones
     count as noise. The bands with Mg II, which stars emit, are passed over.
@@ -272,7 +272,7 @@ def noisy_below(wavelength: np.ndarray[Any, Any], flux: np.ndarray[Any, Any]) ->
 
 
 def write_spectrum(entry: Spectrum, source: Path) -> dict[str, str]:
-    """One ECSV file; returns its row of the index."""
+    """Write one ECSV file and return its row of the index."""
     with fits.open(source / entry.file) as hdus:
         data = hdus[1].data
         wavelength, flux = (np.asarray(data[name], float) for name in ("WAVELENGTH", "FLUX"))
@@ -312,7 +312,7 @@ def write_spectrum(entry: Spectrum, source: Path) -> dict[str, str]:
 
 
 def published_band(node: str, source: Path) -> tuple[str, np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """Which package a band is from, its wavelengths, nm, and its response."""
+    """Return the package of a band, its wavelengths, nm, and its response."""
     own = source / f"speclite/data/filters/{node}.ecsv"
     if own.exists():
         table = QTable.read(own, format="ascii.ecsv")
@@ -327,7 +327,7 @@ def published_band(node: str, source: Path) -> tuple[str, np.ndarray[Any, Any], 
 
 
 def write_band(name: str, source: Path) -> None:
-    """One band as ECSV, thinned where the published table is finer than needed."""
+    """Write one band as ECSV, thinned if the published table is finer than needed."""
     (node, title, response), (system, vega, zero_point) = BANDS[name], ZERO_POINTS[name]
     package, nm, throughput = published_band(node, source)
     inside = np.flatnonzero(throughput > 1e-4 * throughput.max())

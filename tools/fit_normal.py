@@ -14,7 +14,7 @@ Function = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 def fit(exact: Function, degree: int, low: float, high: float, weight: Function) -> tuple[list[str], float]:
-    """Coefficients in float32's hexadecimal form, lowest power first, and the largest weighted error."""
+    """Return float32 coefficients in hexadecimal, lowest power first, and the largest weighted error."""
     x = (low + high) / 2 + (high - low) / 2 * np.cos(np.pi * (np.arange(400) + 0.5) / 400)
     powers, y, w = np.vander(x, degree + 1, increasing=True), exact(x), weight(x)
     share = np.full(x.size, 1 / x.size)

@@ -308,7 +308,7 @@ MUTATIONS = {
 
 
 def fails(folder: Path, test: str) -> tuple[bool, str]:
-    """Whether a test fails in a copy of the project, and pytest's closing line."""
+    """Return whether a test fails in a copy of the project, and pytest's closing line."""
     run = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", test],
         cwd=folder,

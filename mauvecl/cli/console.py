@@ -81,7 +81,7 @@ class Meter:
         return f"{seconds:.0f} s left"
 
     def _rate(self, done: int) -> float:
-        """Work per second, without parts from a checkpoint."""
+        """Return the work done per second, without parts from a checkpoint."""
         resumed = self.standing().resumed if self.standing is not None and self._unit == "realisations" else 0
         return (done - resumed) / max(time.monotonic() - self._started, 1e-9)
 
@@ -119,7 +119,7 @@ class Meter:
 
 
 def show(lines: Sequence[str]) -> None:
-    """Plain lines on standard output."""
+    """Print plain lines on standard output."""
     from rich.console import Console
 
     console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)

@@ -1,4 +1,4 @@
-"""Engine that draws realisations on an OpenCL device and returns what is reduced there."""
+"""Engine that draws realisations on an OpenCL device and reduces them there."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ def _lower(what: int, soft: int, hard: int) -> None:
 
 
 def _build(request: dict[str, Any]) -> str:
-    """Draw a small scene and return what is wrong with it, or an empty string."""
+    """Draw a small scene and return a message if its counts are wrong, or an empty string."""
     handle, record = choose_device(str(request["number"]))
     if record.label != request["label"]:
         return f"device {request['number']} is {record.label} in a new process, expected {request['label']}"

@@ -247,7 +247,7 @@ def pearson(counts: NDArray[np.int64], probability: NDArray[np.float64]) -> floa
 
 
 def counts_of(engine: Engine, x: Expectation, realisations: int, recipe: Any) -> tuple[NDArray[np.int64], int]:
-    """Return the histogram of raw counts over all pixels, which are alike, and the count of its first bin."""
+    """Return the histogram of raw counts over all pixels, which are equal, and the count of its first bin."""
     signal = engine.snr(x, realisations=realisations, seed=SEED, recipe=recipe)
     first = int(signal.scene.base_dn[0, 0]) - layout.OBSERVER_BINS // 2
     return signal.counts.pixel.sum(axis=0), first

@@ -111,7 +111,7 @@ class Scene:
     def constants(
         self, weights: NDArray[np.float32], linear_end: NDArray[np.uint32], pixels_end: NDArray[np.uint32]
     ) -> NDArray[np.float32]:
-        """Compute what the reference's fractions of a DN add to chi-squared and to each linear statistic.
+        """Compute the contribution of the reference's fractions of a DN to chi-squared and to each linear statistic.
 
         Sums of resolution elements include them already.
 

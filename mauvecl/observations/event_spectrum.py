@@ -64,7 +64,7 @@ class EventSpectrum:
 
     @property
     def reason(self) -> str:
-        """Why the event is no flare, or what is doubtful if it is one; empty if nothing is."""
+        """Reason why the event is not a flare, or is doubtful; empty for a clear flare."""
         if self.cause == "cosmic ray":
             return "its light is in a single pixel, as that of a cosmic ray"
         if self.cause != "flare":

@@ -60,7 +60,7 @@ class FrameModel:
     def of(cls, frames: Frames, quiet: Expectation, flare: FlareModel) -> Self:
         """Match frames with the pixels or resolution elements of an instrument.
 
-        Raises InputError if their wavelengths or their unit are others.
+        Raises InputError if their wavelengths or unit differ from the instrument's.
         """
         unit = _plain(frames.unit)
         if unit not in {_plain(each) for each in (*COUNT_UNITS, *RATE_UNITS)}:

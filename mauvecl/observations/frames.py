@@ -69,7 +69,7 @@ class Frames:
     scale : str
         Time scale of the dates, such as "utc" or "tdb"; empty if unknown.
     position : str
-        Where the times are measured, as FITS TREFPOS has it, such as "TOPOCENTER" or "BARYCENTER"; empty if unknown.
+        Where the times are measured, in words of FITS TREFPOS, as "TOPOCENTER" or "BARYCENTER"; empty if unknown.
     direction_deg : (float, float) or None
         Right ascension and declination (ICRS) that barycentric times refer to.
     name : str

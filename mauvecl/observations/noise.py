@@ -1,4 +1,4 @@
-"""Noise of observed frames as measured, against what the file states."""
+"""Measured noise of observed frames, compared with the stated noise."""
 
 from __future__ import annotations
 

@@ -169,7 +169,7 @@ def stored_in_fits(file: FitsFile, name: str | None) -> StoredFile | None:
 
 
 def _in_groups(root: Any, name: str | None, what: str) -> StoredFile:
-    """Return a scene in the groups of a Zarr store or an HDF5 file, which are alike."""
+    """Return a scene in the groups of a Zarr store or an HDF5 file, which have the same layout."""
     with parsing(what, EXPECTED):
         found = [f"{star}/{scene}" for star in sorted(root) if star.startswith("star-") for scene in sorted(root[star])
                  if scene == "quiescent" or (scene.startswith("flare-") and scene[6:].isdigit())]  # fmt: skip

@@ -68,7 +68,7 @@ def schema_of(hint: Any) -> CoreSchema:
 
 
 def _leaf(take: Callable[[Any], Any], words: str) -> CoreSchema:
-    """Return the schema of what a function takes; an error states what is accepted."""
+    """Return the schema of a function's argument, whose errors state the accepted values."""
     schema = core_schema.no_info_plain_validator_function(take)
     return core_schema.custom_error_schema(schema, "expected", custom_error_message=f"Input should be {words}")
 
@@ -184,7 +184,7 @@ def _origin(hint: Any) -> Any:
 
 
 def _kind(value: Any) -> str:
-    """Return NumPy's letter for the type of a number or array, without reading what is on a disk."""
+    """Return NumPy's letter for the type of a number or array, without reading arrays on a disk."""
     if type(value) is int:
         return "i"
     if not hasattr(value, "dtype"):

@@ -95,7 +95,7 @@ class Range:
         return handler(schema) | {name: end for name, end in ends.items() if math.isfinite(end)}
 
     def words(self, unit: str = "", *, whole: bool = False) -> str:
-        """Return what is accepted, for the message of an error."""
+        """Describe the accepted values, for error messages."""
         noun = "a whole number" if whole else word_of(unit)
         low, high = (str(end) if whole else f"{end:g}" for end in (self.low, self.high))
         has_low, has_high = math.isfinite(self.low), math.isfinite(self.high)
@@ -153,7 +153,7 @@ class OrNone:
 
 
 def _or_error(schema: CoreSchema, words: str, **metadata: str) -> CoreSchema:
-    """Replace every error of a schema by the statement of what is accepted."""
+    """Replace every error of a schema by a statement of the accepted values."""
     from pydantic_core import core_schema
 
     return core_schema.custom_error_schema(

@@ -97,7 +97,7 @@ def realise(
     resume : bool
         Whether to complete an unfinished store; otherwise it raises InputError.
     restart : bool
-        Whether to remove an existing store first, whatever its study.
+        Whether to remove an existing store first, even one of another study.
     progress : callable, optional
         Called as ``progress(done, total)`` in spectra. It may raise to stop the work, which keeps written chunks.
 

@@ -1,4 +1,4 @@
-"""Parts of what is too much to show, with a note that states how much is left out."""
+"""Parts of lists that are too long to show, with a note on the number left out."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def read_upload(name: str, content: bytes) -> Source:
     Parameters
     ----------
     name : str
-        As the visitor's computer has it; what the file is shows in its content.
+        Name on the visitor's computer; the format follows from the content.
     content : bytes
         Packed or not.
 

@@ -90,14 +90,14 @@ NUMBER = re.compile(r"(?<![\w.^])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?![\w])")
 
 
 def printed(token: str, values: list[float]) -> bool:
-    """Whether one of the values is the number that is printed, to half of its last digit."""
+    """Return whether one of the values equals a printed number to half of its last digit."""
     mantissa, _, exponent = token.partition("e")
     unit = 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
     return bool(np.any(np.abs(np.array(values) - float(token)) <= 0.5001 * unit))
 
 
 def held(table: Table, column: str, target: str) -> list[float]:
-    """All numbers of a table's column, in its texts too, of one target where the table has them."""
+    """Return all numbers in a table's column, for one target if the table lists targets."""
     if "target" in table.colnames:
         table = table[table["target"] == target]
     values: list[float] = []

@@ -136,7 +136,7 @@ VALUES = st.recursive(
 
 
 def keys() -> list[str]:
-    """Every key that a study has, but those that ask for work."""
+    """Return all keys of a study except those that lengthen a run."""
     from pydantic import BaseModel
 
     from mauvecl.study.study import Study

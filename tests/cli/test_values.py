@@ -36,7 +36,7 @@ def test_lists_are_read() -> None:
 
 
 def numeric() -> list[tuple[str, str]]:
-    """Verb and flag of every option that takes a number."""
+    """Return verb and flag of every option that takes a number."""
     found = []
     for name, verb in get_command(app).commands.items():  # type: ignore[attr-defined]
         for option in getattr(verb, "params", ()):

@@ -78,7 +78,7 @@ def test_shown_text_is_short_and_on_one_line() -> None:
 
 
 def half_noise(size: int) -> bytes:
-    """Bytes that pack badly in part."""
+    """Return bytes of which a part compresses badly."""
     import random
 
     return random.Random(7).randbytes(size // 2) + bytes(size - size // 2)

@@ -19,7 +19,7 @@ from mauvecl.host.stars.source import Source
 
 
 def near_ultraviolet(name: str) -> float:
-    """Mean flux at 290-310 nm over that at 540-560 nm."""
+    """Return the mean flux at 290-310 nm over that at 540-560 nm."""
     star = Source.from_library(name)
 
     def mean(low: float, high: float) -> float:

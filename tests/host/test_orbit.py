@@ -30,7 +30,7 @@ def day(orbit: Orbit) -> Track:
 
 
 def verification() -> list[tuple[str, str, list[list[float]]]]:
-    """Elements and (minutes, x, y, z) of each satellite of SGP4's verification."""
+    """Read elements and rows (minutes, x, y, z) of each satellite in the verification of SGP4."""
     lines = (VECTORS / "SGP4-VER.TLE").read_text().splitlines()
     tles = [(a[:69], b[:69]) for a, b in pairwise(lines) if a[:2] == "1 " and b[:2] == "2 "]
     blocks: list[list[list[float]]] = []

@@ -27,7 +27,7 @@ def mauve() -> Instrument:
 
 
 def line_function(x: Float, top_hat: float, fwhm: float) -> Float:
-    """Top hat convolved with a Gaussian, nm^-1, written anew."""
+    """Return a top hat convolved with a Gaussian, nm^-1, implemented independently."""
     sigma = fwhm / 2.354820045030949
     if top_hat == 0:
         return np.asarray(np.exp(-(x**2) / (2 * sigma**2)) / (sigma * np.sqrt(2 * np.pi)))
@@ -38,7 +38,7 @@ def line_function(x: Float, top_hat: float, fwhm: float) -> Float:
 
 
 def landing(offset: Float, instrument: Instrument) -> Float:
-    """Integral of the line function over a pixel `offset` nm away, by brute force, for an array of offsets."""
+    """Integrate the line function numerically over pixels at an array of offsets, nm."""
     half, top_hat, fwhm = (
         instrument.dispersion_nm_per_pixel / 2,
         instrument.top_hat_width_nm,
@@ -52,7 +52,7 @@ def landing(offset: Float, instrument: Instrument) -> Float:
 
 
 def brute(instrument: Instrument, wavelength: Float, flux: Float, pixel: int, order: Order) -> float:
-    """One pixel's electrons per second by adaptive quadrature between all kinks."""
+    """Compute a pixel's electrons per second by adaptive quadrature between all kinks."""
     centre = instrument.wavelength_nm[pixel]
     corner = (instrument.top_hat_width_nm + np.array([-1, 1]) * instrument.dispersion_nm_per_pixel) / 2
     reach = corner[1] + 8 * instrument.gaussian_fwhm_nm / 2.35
@@ -110,7 +110,7 @@ def test_random_spectra_agree_with_quadrature(mauve: Instrument, top_hat: float,
 
 
 def per_efficiency(instrument: Instrument, rate: Float) -> Float:
-    """Flux per pixel, FLAM nm, from electrons per second in the paper's order."""
+    """Return the flux per pixel, FLAM nm, from electrons per second in the paper's order."""
     own = instrument.efficiency(instrument.wavelength_nm) * instrument.quantum_efficiency_a_per_w.at(
         instrument.wavelength_nm
     )

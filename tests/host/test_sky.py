@@ -40,7 +40,7 @@ CELLS = {
 
 
 def almanac(ra_deg: float, dec_deg: float, utc: str) -> tuple[float, float, float]:
-    """Helio-ecliptic longitude, latitude and the Sun's separation, degrees, to 0.03 deg for 1950-2050.
+    """Return helio-ecliptic longitude, latitude and the Sun's separation, degrees, to 0.03 deg for 1950-2050.
 
     The Astronomical Almanac's low-precision Sun (page C5), a rotation by the obliquity of J2000, general precession.
     """

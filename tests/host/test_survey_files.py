@@ -95,7 +95,7 @@ def test_nested_segments_need_a_choice(tmp_path: Path) -> None:
 
 
 def lamost_image(tmp_path: Path) -> Path:
-    """DR1-DR7: an image of five rows, the wavelengths in COEFF0 and COEFF1, relative fluxes without a unit."""
+    """Write a file as of DR1-DR7: an image of five rows, COEFF0 and COEFF1, relative fluxes without a unit."""
     angstrom = 10**LOGLAM
     rows = np.array([1e15 * light(angstrom), 1e3 + 0 * angstrom, angstrom, 0 * angstrom, 1 + 0 * angstrom], np.float32)
     cards = {
@@ -114,7 +114,7 @@ def lamost_image(tmp_path: Path) -> Path:
 
 
 def lamost_table(tmp_path: Path) -> Path:
-    """DR8 and later: a table COADD with a row of arrays."""
+    """Write a file as of DR8 and later: a table COADD with a row of arrays."""
     angstrom = 10**LOGLAM
     form = f"{N_LOG}E"
     names = ("FLUX", "IVAR", "WAVELENGTH", "ANDMASK", "ORMASK", "NORMALIZATION")

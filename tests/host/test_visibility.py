@@ -29,7 +29,7 @@ AXIS_KM = 6879.0
 
 @pytest.fixture(scope="module")
 def month() -> Visibility:
-    """Five targets, forty days over the end of a month."""
+    """Return the visibility of five targets over forty days that include the end of a month."""
     track = Orbit.load().track(TimeGrid("2026-12-20T06:30", 40.0, 60.0))
     names = ("eps Eri", "AU Mic", "V889 Her", "EK Dra", "DX Leo")
     return Visibility.of(track, np.array([Target.of(name).direction for name in names]))

@@ -10,6 +10,6 @@ from mauvecl.device.probes import Probes
 
 @pytest.fixture(scope="session", params=["vector forms", "vectors of built-ins", "scalar"])
 def probes(request: pytest.FixtureRequest, engine: Engine) -> Probes:
-    """PoCL's fast forms, the plain OpenCL vectors that other compilers get, and what a GPU runs."""
+    """Return probes of PoCL's fast forms, of the plain vectors for other compilers, and of a GPU's scalars."""
     width = 1 if request.param == "scalar" else 16
     return Probes(device=engine.open_device, width=width, vector_forms=request.param == "vector forms")

@@ -35,7 +35,7 @@ def one_pixel(dark: float, photons: float, read: float, *, unit: str = "DN", noi
 
 
 def exact(x: Expectation, low: int, size: int) -> np.ndarray:
-    """Probabilities of the raw counts low, low + 1, ...: every Poisson outcome with its Gaussian, summed."""
+    """Return the probabilities of the raw counts low, low + 1, ..., summed over all Poisson outcomes."""
     dark, photons, read = x.dark_dn[0], x.source_electrons[0], x.read_noise_dn[0]
     step, gain = x.dark_step_dn[0], x.gain_dn_per_electron[0]
     if x.photon_noise == "gaussian":

@@ -44,7 +44,7 @@ class Noise:
 
     @classmethod
     def at(cls, point: np.ndarray) -> Noise:
-        """Of a point of the search, in decades: Gaussian over Poisson step, step, dark, light's step over it, light."""
+        """Return the noise at a point, in decades: Gaussian over Poisson step, step, dark, ratio of light, light."""
         over, step, dark, ratio, light = 10.0 ** point[:5]
         return cls(over * step * max(1.0, ratio), dark, step, light if point[4] > -4 else 0.0, step * ratio, point[5])
 

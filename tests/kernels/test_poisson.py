@@ -47,7 +47,7 @@ def test_extreme_words_and_column_edges(probes: Probes, mean: float) -> None:
 
 
 def pearson(counts: np.ndarray, low: int, mean: float) -> float:
-    """Both tails of Pearson's statistic against scipy's probabilities of low, low + 1, ..."""
+    """Return the two-sided p-value of Pearson's statistic with scipy's probabilities of low, low + 1, ..."""
     return selftest.pearson(counts, stats.poisson.pmf(low + np.arange(counts.size), mean))
 
 
@@ -58,7 +58,7 @@ EXPANDED = [SMALLEST_EXPANDED, 2225.0, 22250.0, 222500.0]
 
 @pytest.fixture(scope="module")
 def drawn(probes_fast: Probes) -> dict[tuple[str, float], np.ndarray]:
-    """How often each count was drawn of each mean, by table and by expansion: the same 1e8 words for all."""
+    """Count the draws of each value for each mean, by table and by expansion, from the same 1e8 words."""
     tables = {mean: alias_table(mean) for mean in MEANS}
     half = {mean: int(10 * np.sqrt(mean)) for mean in EXPANDED}
     counts = {("table", mean): np.zeros(2**table.bits, np.int64) for mean, table in tables.items()}
@@ -96,7 +96,7 @@ def test_pearson_of_the_expansion(drawn: dict[tuple[str, float], np.ndarray], me
 
 
 def draws_to_tell(mean: float, offset: float, slope: float, cubic: float) -> float:
-    """Draws after which Pearson's test sees the expansion at five sigma, from its exact distribution."""
+    """Return the number of draws after which Pearson's test detects the expansion at five sigma."""
     half = int(9 * np.sqrt(mean))
     n = np.arange(-half, half + 1) + round(mean)
     z = np.linspace(-8.9, 8.9, 400_001)

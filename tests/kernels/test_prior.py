@@ -55,7 +55,7 @@ def factors(name: str, prior: Prior) -> Factors:
 
 
 def drawn(probes: Probes, name: str, prior: Prior, tail: np.ndarray, upper: bool) -> np.ndarray:
-    """Factors on the device at probabilities from an end of the table."""
+    """Return the device's factors at probabilities from an end of the table."""
     found = factors(name, prior)
     scaled = np.append(tail, np.full(-tail.size % 16, 0.5)) * 2**32
     word = np.minimum(np.floor(scaled), 2**31 - 1).astype(np.uint32)
@@ -68,7 +68,7 @@ def drawn(probes: Probes, name: str, prior: Prior, tail: np.ndarray, upper: bool
 
 
 def density(prior: Prior) -> tuple[np.ndarray, np.ndarray]:
-    """Values and weights of a quadrature over the prior, from its density alone."""
+    """Return values and weights of a quadrature over the prior, from its density alone."""
     low, high = prior.low, prior.high
     shape = np.zeros_like
     if isinstance(prior, Normal):
@@ -90,7 +90,7 @@ def density(prior: Prior) -> tuple[np.ndarray, np.ndarray]:
 
 
 def moments(x: np.ndarray, weight: np.ndarray) -> tuple[float, float, float, float]:
-    """Mean, standard deviation, skewness and kurtosis."""
+    """Return mean, standard deviation, skewness and kurtosis."""
     mean = float(weight @ x)
     sd = float(np.sqrt(weight @ (x - mean) ** 2))
     return mean, sd, *(float(weight @ ((x - mean) / sd) ** k) for k in (3, 4))
@@ -136,14 +136,14 @@ def invert(name: str, factor: float) -> float:
 
 
 def outside(prior: Prior, value: float, upper: bool) -> float:
-    """Probability beyond a value, by quadrature of the density between it and the end."""
+    """Integrate the density between a value and the end of the prior."""
     value = min(max(value, prior.low), prior.high)
     low, high = (value, prior.high) if upper else (prior.low, value)
     if isinstance(prior, Uniform):
         return (high - low) / (prior.high - prior.low)
 
     def log_integral(a: float, b: float) -> float:
-        """Of exp(-(x - mean)^2 / 2 sd^2), from where it is largest."""
+        """Return the logarithm of the integral of exp(-(x - mean)^2 / 2 sd^2), without underflow."""
         top = np.clip(prior.mean, a, b)
         slope = abs(top - prior.mean) / prior.sd
         reach = prior.sd * min(12.0, 60.0 / slope if slope > 0 else 12.0)

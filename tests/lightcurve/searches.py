@@ -21,7 +21,7 @@ KNOWN = Baseline(offset=False, slope=False, window_s=0.0)
 
 @cache
 def spectra(star, magnitude, kelvin=TEMPERATURES_K, *, part=False):
-    """One frame of a quiescent star, and DN that flares of one amplitude add; of some 200 pixels alone."""
+    """Return one frame of a quiescent star and the DN added by flares of unit amplitude, for some 200 pixels."""
     source = Source.from_library(star).at_magnitude(magnitude)
     mauve, sky = instrument(part=part), Sky.of_brightness(22.1)
     quiet, *flares = (

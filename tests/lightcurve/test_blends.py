@@ -27,7 +27,7 @@ def known() -> StarSurvey:
 
 
 def found(known: StarSurvey, events: list[Event], seed: int, threshold: float = THRESHOLD) -> list[Alarm]:
-    """Alarms of one stare with normal noise, that of the flares' photons included."""
+    """Return the alarms of one stare with normal noise, which includes that of the flares' photons."""
     stare, components = known.survey.stare, known.survey.components
     coefs = components.coefficients(stare, coefficients(events, stare.start_s, stare.frame_s, np.array([10_000.0])))
     scatter = np.linalg.cholesky(components.covariance(coefs))
@@ -37,7 +37,7 @@ def found(known: StarSurvey, events: list[Event], seed: int, threshold: float = 
 
 
 def check(alarm: Alarm, event: Event) -> None:
-    """Within five standard errors: beyond that once in 2e6 for a normal error."""
+    """Check agreement within five standard errors, which a normal error exceeds once in 2e6 times."""
     fit = alarm.recovered
     assert abs(fit.peak_s[0] - event.peak_s) < 5 * fit.peak_error_s[0]
     assert abs(np.log(fit.half_width_s[0] / event.half_width_s)) < 5 * fit.half_width_error_s[0] / fit.half_width_s[0]

@@ -19,7 +19,7 @@ METHODS = ["pixels", "cumulants"]
 
 @pytest.fixture(scope="module")
 def stares(engine: Engine) -> Stares:
-    """On the engine's device."""
+    """Return stares on the engine's device."""
     return Stares(engine.open_device)
 
 
@@ -159,7 +159,7 @@ def test_sums_by_cumulants_are_distributed_as_by_pixels(stares: Stares, name: st
 
 
 def mixture_cumulants(components: Components, coefficients: Any, mixture: Any, sd: float) -> tuple[float, float]:
-    """Third and fourth cumulants of a mixture of the sums in one frame, over powers of its standard deviation."""
+    """Return the standardised third and fourth cumulants of a mixture of the sums in one frame."""
     third = np.einsum("i,j,k,ijk", mixture, mixture, mixture, components.third(coefficients))
     fourth = np.einsum("i,j,k,l,ijkl", mixture, mixture, mixture, mixture, components.fourth(coefficients))
     return float(third / sd**3), float(fourth / sd**4)

@@ -86,7 +86,7 @@ def stares():
 
 @pytest.fixture(scope="module")
 def injections():
-    """Into a jittered stare with a gap, for a bank of three half-widths."""
+    """Return injections into a jittered stare with a gap, for a bank of three half-widths."""
     one, _ = survey(STARE, LEVEL, (15.0, 40.0, 110.0), part=True)
     return Injections(one, 0, (15.0, 40.0, 90.0), 5.2, 3, POSITIONS, DRAWS)
 
@@ -115,7 +115,7 @@ def pixel_injection(one, half_width, amplitude, peaks, rng, rays):
 
 
 def all_filters(one):
-    """Every template of the bank by least squares, (n_filter, n_frame)."""
+    """Compute every template of the bank by least squares, shape (n_filter, n_frame)."""
     bank, numbers = one.bank, STARE.numbers
     found = []
     for t in bank.templates:

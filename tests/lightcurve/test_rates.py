@@ -82,7 +82,7 @@ def test_rates_are_read_from_a_table(tmp_path: Path) -> None:
 
 
 def step_at(energy: float, band: str = "Kepler") -> Completeness:
-    """All from an energy on, none below it."""
+    """Return a completeness that rises from 0 to 1 at an energy."""
     grid = 10 ** np.array([28, np.log10(energy) - 1e-9, np.log10(energy), 38])
     return Completeness(grid, np.array([0.0, 0.0, 1.0, 1.0]), band, "test")
 

@@ -14,7 +14,7 @@ from mauvecl.lightcurve.stares.stare import Stare
 
 
 def filtered(search, sums, curves):
-    """Every value of a search by least squares, template by template."""
+    """Compute all values of a search by least squares, template by template."""
     stare, bank = search.stare, search.bank
     weight = 1 / search.variance
     for row, rho in search.values(sums):

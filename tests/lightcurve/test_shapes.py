@@ -32,7 +32,7 @@ KNOWN = [
 
 
 def between(function, first: float, last: float, kinks: list[float]) -> float:
-    """Quadrature, piece by piece."""
+    """Integrate a shape numerically, piece by piece."""
     ends = [first, *(k for k in kinks if first < k < last), last]
     return sum(quad(function, a, b, epsabs=1e-14, epsrel=1e-12, limit=400)[0] for a, b in itertools.pairwise(ends))
 

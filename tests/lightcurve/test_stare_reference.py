@@ -51,7 +51,7 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any], int, int, int, dict[str, 
 
 
 def case(name: str) -> tuple[Components, Stare, Any, Any, dict[str, Any]]:
-    """Components, stare, flares of each stare, amplitudes, further words."""
+    """Return components, stare, flares of each stare, amplitudes and further arguments."""
     payload, wobble, n_sums, n_flares, n_scenarios, more = CASES[name]
     options = {"output_min_nm": 300.0, "output_max_nm": 312.0} | payload
     used = instrument(options.pop("name", "mauve"), **options)
@@ -68,7 +68,7 @@ def case(name: str) -> tuple[Components, Stare, Any, Any, dict[str, Any]]:
 
 @pytest.fixture(scope="module", params=["vectors", pytest.param("scalar", marks=pytest.mark.long)])
 def stares(request: pytest.FixtureRequest, engine: Engine) -> Stares:
-    """As processors draw them, and one stare or frame to a work-item, as a GPU does."""
+    """Return stares with vectors, as on processors, and with one stare or frame per work-item, as on a GPU."""
     return Stares(engine.open_device) if request.param == "vectors" else Stares(width=1)
 
 

@@ -17,7 +17,7 @@ from mauvecl.lightcurve.stares.stare import Stare
 
 
 def drawn(one, rng, count, farther=1.0):
-    """Stares without a flare from pixels' means and variances, and the amplitudes of what is unknown of them.
+    """Draw stares without a flare from the pixels' means and variances; return them and their unknown amplitudes.
 
     The dark of each pixel is exponential in the temperature; photons, dark and reading are normal.
     """
@@ -47,7 +47,7 @@ def drawn(one, rng, count, farther=1.0):
 
 
 def random_stare(rng):
-    """Gaps, known and unknown cycles, drifts and offsets, each there or not; and how it is searched."""
+    """Return a stare with or without gaps, cycles, drifts and offsets, and the options of its search."""
     duration, cycle = float(rng.uniform(6000, 12_000)), bool(rng.integers(2))
     starts = rng.uniform(0, duration, rng.integers(0, 3))
     stare = Stare.of(

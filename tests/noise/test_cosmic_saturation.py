@@ -47,7 +47,7 @@ class Case:
         return self.rays.rate_per_cm2_s * 0.057 / 2048 * self.x.frame_s
 
     def drawn_by_numpy(self, rng: np.random.Generator) -> np.ndarray:
-        """Exposures as sums of single frames, each of its own hits, light, dark and read noise, rounded and cut off."""
+        """Draw exposures as sums of single frames, each with hits, light, dark and read noise, rounded and clipped."""
         x, (low, high) = self.x, (int(e) for e in self.rays.electrons)
         shape = (N, x.wavelength_nm.size)
         total = np.zeros(shape)

@@ -16,7 +16,7 @@ FAP = 1e-3
 
 
 def found(engine: Engine, *, magnitude: float = 7.4, exposure: float = 5.0, **options: object) -> dict[str, Departure]:
-    """Departures of a faint flare on a part of the pixels, by statistic."""
+    """Return the departures of a faint flare on a part of the pixels, by statistic."""
     comparison = options.pop("comparison", Comparison())
     statistics = options.pop("statistics", ("chi2", "chi2_element", "uv_excess"))
     payload = instrument(part=True, **options)

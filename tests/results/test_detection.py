@@ -34,7 +34,7 @@ def found(engine: Engine) -> Detection:
 
 
 def ks_probability(d: Distribution, sf: object) -> float:
-    """Kolmogorov-Smirnov at edges of the filled bins, 32 to a standard deviation."""
+    """Return the probability of the Kolmogorov-Smirnov test at the edges of filled bins, 32 per standard deviation."""
     filled = np.flatnonzero(d.counts)
     # The last edge, too: all values in one bin are no distribution.
     edges = np.asarray(d.edge(np.unique(np.append(np.arange(filled[0], filled[-1] + 2, 16), filled[-1] + 1))))

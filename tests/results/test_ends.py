@@ -82,7 +82,7 @@ class Sorted:
         return int(self.values.size - np.searchsorted(self.values, value))
 
     def close(self, value: float) -> int:
-        """Values so near that float32 may put them on either side."""
+        """Count the values so close to an edge that float32 may move them to either side."""
         return int(np.sum(np.abs(self.values - value) <= self.slack))
 
 

@@ -61,7 +61,7 @@ def free(x: Expectation, **more: float) -> Nuisances:
 
 
 def drawn(x: Expectation, counts: np.ndarray, n: int, seed: int, unknown: Nuisances | None = None) -> np.ndarray:
-    """Raw exposures with the variance of star and flare; unknowns by their priors, or of 5 % where they are free."""
+    """Draw raw exposures with the variance of star and flare; unknowns follow their priors, or 5 % if they are free."""
     rng = np.random.default_rng(seed)
     variance = x.variance_dn2 + x.gain_dn_per_electron * counts
     raw = x.recorded_dn + counts + rng.standard_normal((n, counts.size)) * np.sqrt(variance)

@@ -44,7 +44,7 @@ def test_sampled_tail_agrees_with_brute_force(found: Detection, statistic: str, 
 
 @pytest.fixture(scope="module")
 def plain(engine: Engine) -> Detection:
-    """Without dark, and 60 DN of noise, statistics are exactly normal and chi-squared."""
+    """Return a detection without dark and with 60 DN of noise, for which statistics are normal and chi-squared."""
     payload = instrument(dark_scale_dn_per_s=0.0, read_noise_dn=60.0, **PART)
     quiet, flare = star(amplitudes=(0.1,), payload=payload)
     return engine.detect(quiet, [flare], realisations=100, seed=1, statistics=tuple(STATISTICS), tails="sampled")
@@ -154,7 +154,7 @@ FEWER, ONE_IN = 1_000_000, 1e-4
 
 @pytest.fixture(scope="module", params=[Comparison(4), Comparison(1, True)], ids=["stack", "estimated"])
 def compared(request: pytest.FixtureRequest, engine: Engine) -> Detection:
-    """Every statistic of the same draws."""
+    """Return a detection with every statistic of the same draws."""
     quiet, flare = star(amplitudes=(0.1,), payload=instrument(output_min_nm=345.0, output_max_nm=360.0))
     how = {"statistics": tuple(STATISTICS), "comparison": request.param, "tails": "sampled"}
     return engine.detect(quiet, [flare], realisations=FEWER, seed=12, **how)

@@ -22,7 +22,7 @@ def star() -> Source:
 
 @cache
 def expectations() -> tuple[Expectation, Expectation, Expectation]:
-    """Without a flare, with one of two temperatures, and with one of 9000 K."""
+    """Return expectations without a flare, with one of two temperatures, and with one of 9000 K."""
     lit = (star().flaring(3.0, spectrum=FLARE), star().flaring(0.5, 9000.0))
     quiet, two, one = (expect(x, MAUVE, exposure=50.0) for x in (star(), *lit))
     return quiet, two, one

@@ -41,7 +41,7 @@ pytestmark = [pytest.mark.long, pytest.mark.usefixtures("small_shards")]
 
 @pytest.fixture(scope="module")
 def workers() -> Iterator[DaskWorkers]:
-    """Two processes; tests that kill some find new ones there afterwards."""
+    """Return two worker processes; those that a test kills are replaced."""
     found = DaskWorkers("local:2")
     yield found
     found.close()
@@ -84,7 +84,7 @@ def test_killed_worker_is_replaced(workers: DaskWorkers, engine: Engine, scene: 
 
 
 def greeted(port: int, context: ssl.SSLContext | None) -> bool:
-    """Whether whoever listens sends a visitor anything, as Dask's servers greet those they talk to."""
+    """Return whether a listener sends a visitor anything, as servers of Dask do."""
     try:
         plain = socket.create_connection(("127.0.0.1", port), timeout=3)
         with context.wrap_socket(plain) if context else plain as talk:

@@ -23,7 +23,7 @@ def strength(kind: str, fap: float, probability: float) -> tuple[float, float]:
 
 
 def counted(kind: str, fap: float, probability: float, n: int, seeds: int) -> tuple[np.ndarray, np.ndarray]:
-    """Flares above a simulated threshold and both ends of its interval, and the correlation; one row per seed."""
+    """Count flares above a simulated threshold and the ends of its interval; return counts and correlation per seed."""
     rng = np.random.default_rng([round(1e4 * fap), round(1e4 * probability), n, len(kind)])
     _, push = strength(kind, fap, probability)
     low, high = central_counts(n, fap)

@@ -42,7 +42,7 @@ def test_two_weights_with_a_closed_form() -> None:
 
 
 def of_two(form: QuadraticForm, x: float, *, upper: bool) -> float:
-    """Above or below x, for two terms: over all normals of the first term, whether the second reaches there."""
+    """Return the probability above or below x for two terms, integrated over the normal of the first."""
     (a, b), (first, second) = form.weight, form.shift
     most = np.sqrt(x / a)
 

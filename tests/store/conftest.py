@@ -9,5 +9,5 @@ from mauvecl.store import stored_scenes
 
 @pytest.fixture(autouse=True)
 def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Chunks of some 64 rows, so that a small store has several."""
+    """Set chunks of some 64 rows, so that a small store has several."""
     monkeypatch.setattr(stored_scenes, "CHUNK_BYTES", 64 * 197 * 2)

@@ -108,7 +108,7 @@ def until(page: Page, true: Callable[[], bool]) -> None:
 
 
 def settled(page: Page) -> None:
-    """Once what is shown is what is entered."""
+    """Wait until the page shows the answer to what was entered."""
     page.locator("#card[aria-busy=false]").wait_for()
     assert not page.faults, page.faults  # type: ignore[attr-defined]
 
@@ -133,7 +133,7 @@ def shown(page: Page) -> str:
 
 
 def answerless(page: Page) -> None:
-    """There is no answer, and nothing to press or to see."""
+    """Check that the page shows no answer, button or picture."""
     page.get_by_text("No answer.", exact=True).wait_for()
     for name in ("Simulate", "Pin"):
         assert page.get_by_role("button", name=name, exact=True).is_disabled()

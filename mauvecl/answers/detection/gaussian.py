@@ -198,7 +198,7 @@ class GaussianAnswer(Answer):
 
     @property
     def thresholds(self) -> QTable:
-        """One row per star, cell and statistic: false-alarm probabilities at the formula's thresholds, and why."""
+        """One row per star, cell and statistic: false-alarm probabilities at the formula's thresholds, with reasons."""
         return self.detection.departures
 
     @cached_property

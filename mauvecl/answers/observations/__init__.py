@@ -1,1 +1,1 @@
-"""What observed frames hold: flares, their false alarms, and what is excluded."""
+"""Answers from observed frames: flares, calibrated instruments, and changes between visits."""

@@ -36,7 +36,7 @@ LONGEST_S = 1e7
 
 @dataclass(frozen=True)
 class Exposure:
-    """One answer: whole frames."""
+    """Exposure time, in whole frames, that reaches an S/N."""
 
     star: str
     wavelength_nm: float

@@ -1,4 +1,4 @@
-"""Signal to noise of a study's stars, over whatever the study sweeps: distributions and noise budgets."""
+"""Signal-to-noise ratios of a study's stars in each cell of the sweep: distributions and noise budgets."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class SnrAnswer(Answer):
         ]
 
     def together(self, table_of: Callable[[SnrResult], QTable]) -> QTable:
-        """Return a table of each star and cell as one, with the star and what is swept in front."""
+        """Stack the tables of all stars and cells, with columns of the star and the swept values."""
         parts = ((star, table_of(star.result)) for star in self.stars)
         run = self.study.run
         return stacked(place_columns(self.study.sweep), parts, realisations=run.realisations, study=self.study.text())

@@ -132,7 +132,7 @@ class StarCompleteness(InCell):
 
     @property
     def limits(self) -> QTable:
-        """Sizes of which a half and nine tenths are found: all half-widths together, and each."""
+        """Sizes of which 50 % and 90 % are found, for all half-widths together and for each."""
         injected = self.injected
         every = (None, *range(len(injected.half_widths_s)))
         values = {"half_width": np.array([np.nan, *injected.half_widths_s])}
@@ -212,7 +212,7 @@ class InjectAnswer(Answer):
 
     @cached_property
     def table(self) -> QTable:
-        """One row per star, cell of the sweep, and what is found of all half-widths and of each: sizes E50 and E90."""
+        """Sizes E50 and E90: per star and cell of the sweep, one row for all half-widths and one for each."""
         return stacked(self._place, ((one, one.limits) for one in self.stars), **self._about)
 
     @cached_property

@@ -209,13 +209,13 @@ class StareAnswer(Answer):
 
     @property
     def events(self) -> QTable:
-        """One row per flare: when, how long, how large, how hot, and the S/N of one who looks for just this one."""
+        """One row per flare: peak, half-width, amplitude, temperature, energies, and the S/N of its matched filter."""
         rows = [(one, flare) for one in self.stares for flare in one.flares]
         return self._table(self._after_place(EVENT_COLUMNS), rows)
 
     @property
     def found(self) -> QTable:
-        """One row per flare that the search found: what it was by a fit, with 68 % intervals, and which was put in.
+        """One row per flare that the search found: fitted values with errors, and the number of the flare in the stare.
 
         Values are NaN where the fit does not measure the flare: `note` says why.
         """

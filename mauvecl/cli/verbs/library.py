@@ -1,4 +1,4 @@
-"""The verb of spectra: list them, keep your own, fetch public ones."""
+"""Command of the library: list spectra, keep the user's own, fetch public ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command that searches for limits: what is assumed is an option of its own."""
+"""Command that searches for limits, with an option that varies the assumptions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def limit(
         bool, typer.Option("--assumptions", help="Also: how far what is assumed of the instrument moves it.")
     ] = False,
 ) -> None:
-    """Search for limits, and for what moves them if asked."""
+    """Search for limits, and vary the assumptions about the instrument if `assumptions` is set."""
     answer = session.ask(study)
     if assumptions:
         from mauvecl.answers.limits.assumptions import what_matters

@@ -164,7 +164,7 @@ class Exposures:
         return np.concatenate([excess @ reduction.weights.T for excess in self._excess(rows)])
 
     def sums_and_rest(self, reduction: Reduction, rows: NDArray[np.intp]) -> tuple[Float, Float]:
-        """Return the sums of some frames, and chi-squared of what they leave, shape (n,)."""
+        """Return the sums of some frames, and chi-squared of the residuals, shape (n,)."""
         parts = []
         for excess in self._excess(rows):
             sums = excess @ reduction.weights.T

@@ -120,7 +120,7 @@ class Tab(ABC):
 
     @classmethod
     def _follow_verb(cls) -> None:
-        """Take from the verb what the tab does not state itself."""
+        """Set the attributes that the tab does not define from its verb."""
         verb, title = cls.verb, cls.verb.capitalize()
         about, *_ = VERBS[verb].help.split("\n")
         of_verb = {"name": verb, "title": title, "about": about, "simulations": {verb: title}, "answer": verb}
