@@ -1,10 +1,14 @@
 """Sphinx configuration."""
 
+import os
 from pathlib import Path
+from typing import Any
 
 from astropy.table import Table
 from pydantic import BaseModel
+from typer.main import get_command
 
+from mauvecl.cli.app import app
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.version import VERSION
 from mauvecl.schema.reference import keys_of
@@ -32,11 +36,17 @@ nb_merge_streams = True
 html_theme = "pydata_sphinx_theme"
 # Every page on the left of every page.
 html_sidebars = {"**": ["globaltoc.html"]}
-html_theme_options = {"navbar_center": [], "show_toc_level": 2}
+html_theme_options: dict[str, Any] = {"navbar_center": [], "show_toc_level": 2}
+# A site with the documentation of several versions gives the address of their list; without it nothing is fetched.
+if list_of_versions := os.environ.get("DOCS_VERSIONS"):
+    html_theme_options |= {
+        "switcher": {"json_url": list_of_versions, "version_match": VERSION},
+        "navbar_start": ["navbar-logo", "version-switcher"],
+    }
 html_static_path = ["_static"]
 html_css_files = ["wide.css"]
 smartquotes = False
-html_title = "mauvecl"
+html_title = f"mauvecl {VERSION}"
 exclude_patterns = ["_build", "_generated", "jupyter_execute", "**.ipynb_checkpoints"]
 numpydoc_show_class_members = False
 autodoc_typehints = "none"
@@ -64,12 +74,67 @@ def write_keys(section: type[BaseModel], name: str, columns: tuple[str, ...]) ->
     lines += ["", "   * - key", *(f"     - {one}" for one in columns)]
     for key in keys_of(section):
         lines += [
-            f"   * - ``{key.path}``",
+            f"   * - .. index:: single: {key.path} ({name.split('_')[0]} key)",
+            "",
+            f"       ``{key.path}``",
+            "",
             *(f"     - {getattr(key, one).replace('*', chr(92) + '*')}" for one in columns),
         ]
     (Path(__file__).parent / "_generated" / f"{name}.rst").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
+def command_lines(command: Any, path: str) -> list[str]:
+    """Return the help of a command and of those below it, with an index entry for each flag."""
+    lines = [path, "-" * len(path), ""]
+    if own := getattr(command, "commands", {}):
+        lines += [escaped(paragraph(command.help)), ""]
+    else:
+        lines += [f".. program:: {path}", "", *described(command.help or "")]
+        for one in command.params:
+            if one.param_type_name == "argument":
+                lines += [f".. option:: {one.name.upper()}", "", f"   {escaped(one.help)}", ""]
+            elif one.name != "help":
+                names = ", ".join([*one.opts, *one.secondary_opts])
+                lines += [f".. option:: {names}", "", f"   {escaped(one.help)}", ""]
+    for name, inner in own.items():
+        lines += command_lines(inner, f"{path} {name}")
+    return lines
+
+
+def described(text: str) -> list[str]:
+    """Return the paragraphs of a help text; those that are marked to be kept as they are become blocks of code."""
+    lines = []
+    for one in text.split("\n\n"):
+        if one.strip(" \n").startswith("\b"):
+            lines += [
+                ".. code-block:: none",
+                "",
+                *(f"   {line.strip()}" for line in one.strip("\b \n").splitlines()),
+                "",
+            ]
+        else:
+            lines += [escaped(" ".join(one.split())), ""]
+    return lines
+
+
+def paragraph(text: str | None) -> str:
+    """Return the first paragraph in one line."""
+    return " ".join((text or "").split("\n\n")[0].split())
+
+
+def escaped(text: str | None) -> str:
+    """Return help as text that reStructuredText does not read as markup."""
+    plain = (text or "").replace(chr(92), chr(92) * 2).strip()
+    return "".join(f"{chr(92)}{one}" if one in "*`|_" else one for one in plain)
+
+
+def write_commands() -> None:
+    """Write the reference of all commands as sections that a page includes."""
+    lines = [line for name, one in get_command(app).commands.items() for line in command_lines(one, f"mauvecl {name}")]  # type: ignore[attr-defined]
+    (Path(__file__).parent / "_generated" / "commands.rst").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
 bench_tables()
+write_commands()
 write_keys(Study, "study_keys", ("meaning", "accepted", "default", "flags"))
 write_keys(Instrument, "instrument_keys", ("meaning", "accepted"))

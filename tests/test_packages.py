@@ -18,7 +18,7 @@ from mauvecl.host.version import VERSION
 
 ROOT = Path(__file__).parent.parent
 #: What a checkout has, or an unpacked sdist; a working copy has much more beside it.
-FOLDERS = (".ci", ".github", "bench", "docs", "host", "kernels", "mauvecl", "recipe", "tests", "tools")
+FOLDERS = (".ci", ".github", "bench", "docs", "host", "kernels", "mauvecl", "paper", "recipe", "tests", "tools")
 FILES = (
     ".dockerignore",
     ".gitignore",

@@ -54,15 +54,16 @@ def keys(section: Any, kind: str) -> Iterator[str]:
 
 
 def columns() -> Iterator[str]:
-    """Yield each column that a table of an answer or result can have, by the module that declares it."""
+    """Yield each column that a table of an answer or result can have, by the package that declares it."""
     for package in ("answers", "results", "noise", "lightcurve", "store"):
         home = import_module(f"mauvecl.{package}")
         for found in pkgutil.walk_packages(home.__path__, f"{home.__name__}."):
             module = import_module(found.name)
+            where = found.name.removeprefix("mauvecl.").rpartition(".")[0]
             for declared in vars(module).values():
                 if isinstance(declared, tuple) and declared and all(isinstance(one, Column) for one in declared):
                     for one in declared:
-                        yield f"column {found.name.split('.')[-1]}: {one.name}" + (f" [{one.unit}]" if one.unit else "")
+                        yield f"column {where}: {one.name}" + (f" [{one.unit}]" if one.unit else "")
 
 
 def call(name: str, function: Any) -> Iterator[str]:
@@ -127,7 +128,7 @@ def test_listing_covers_every_kind() -> None:
     for known in (
         "command mauvecl detect --fap",
         "study observation.exposure_s [s]",
-        "column detection: threshold",
+        "column results.detection: threshold",
         "python expect(1 source, required)",
         "python Engine.detect(realisations, required)",
     ):
