@@ -143,7 +143,7 @@ MUTATIONS = {
     ),
     "7 rounds": Mutation(
         ((PHILOX, "range(3, 10)", "range(3, 7)"), (RANDOM_NUMBERS, "for r in range(10):", "for r in range(7):")),
-        "tests/kernels/test_philox.py::test_known_answers",
+        "tests/kernels/test_philox.py::test_philox_gives_the_known_answers",
     ),
     "swapped words": Mutation(
         (
@@ -151,7 +151,7 @@ MUTATIONS = {
             SWAPPED,
             (RANDOM_NUMBERS, "return (c0.astype(np.uint32), c1.astype", "return (c1.astype(np.uint32), c0.astype"),
         ),
-        "tests/kernels/test_philox.py::test_known_answers",
+        "tests/kernels/test_philox.py::test_philox_gives_the_known_answers",
     ),
     "swapped words, production kernel alone": Mutation(
         (SWAPPED,), "tests/noise/test_extremes.py::test_extreme_words_in_production_kernel_equal_reference"
@@ -228,11 +228,11 @@ MUTATIONS = {
                 ">> (ulong${half})32UL) * (ulong${half})(factor & 0xffff0000u);",
             ),
         ),
-        "tests/kernels/test_philox.py::test_known_answers",
+        "tests/kernels/test_philox.py::test_philox_gives_the_known_answers",
     ),
     "alias table off by one word": Mutation(
         (("mauvecl/noise/poisson.py", "rich << shift | left[poor]", "rich << shift | max(left[poor] - 1, 0)"),),
-        "tests/kernels/test_poisson.py::test_realised_probabilities",
+        "tests/kernels/test_poisson.py::test_alias_table_has_the_probabilities_of_scipy",
     ),
     "alias table off by one count": Mutation(
         (("mauvecl/noise/poisson.py", "low + int(inside[0]))", "low + int(inside[0]) + 1)"),),
@@ -244,14 +244,14 @@ MUTATIONS = {
     ),
     "priors' tables too coarse at their ends": Mutation(
         (("mauvecl/noise/layout.py", "PRIOR_BITS = 7", "PRIOR_BITS = 4"),),
-        "tests/kernels/test_prior.py::test_moments",
+        "tests/kernels/test_prior.py::test_drawn_factors_have_the_moments_of_the_prior",
     ),
     "priors' finer digits dropped": Mutation(
         (
             ("kernels/prior.cl.mako", "finer & (uintv)0x7fffffu", "finer & (uintv)0u"),
             ("mauvecl/noise/reference.py", "finer & np.uint32(0x7FFFFF)", "finer & np.uint32(0)"),
         ),
-        "tests/kernels/test_prior.py::test_tails",
+        "tests/kernels/test_prior.py::test_drawn_factors_have_the_tails_of_the_prior",
     ),
     "saturation at the ADC's end alone": Mutation(
         (("host/expectation.py", "min(self.saturation_dn, float(self.adc_max_dn))", "float(self.adc_max_dn)"),),

@@ -27,7 +27,7 @@ def found(study: Study) -> VisibleAnswer:
     return visible(study)
 
 
-def test_tables_agree(found: VisibleAnswer) -> None:
+def test_tables_give_the_same_hours(found: VisibleAnswer) -> None:
     table, months, days, windows = found.table, found.months, found.by_day, found.window_table
     for k, name in enumerate(NAMES):
         hours = table["hours"][k].value

@@ -88,7 +88,7 @@ def test_every_file_is_tried() -> None:
 
 
 @pytest.mark.parametrize(("name", "options", "read", "v"), RIGHT, ids=[entry[0] for entry in RIGHT])
-def test_read_right(name: str, options: dict[str, Any], read: Any, v: float | None) -> None:
+def test_archive_files_are_read(name: str, options: dict[str, Any], read: Any, v: float | None) -> None:
     star = Source.read(HERE / name, **options)
     angstrom, flux = read(name)
     assert np.isfinite(star.flux_flam).all()

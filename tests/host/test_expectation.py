@@ -45,7 +45,9 @@ def quiet(sunlike: Source, mauve: Instrument) -> Expectation:
         ("B2IV", 3.03, {200.2: 2989, 250: 5373, 300: 6064, 400: 3657, 500: 1741, 600: 851, 699.7: 406}),
     ],
 )
-def test_published_rates(mauve: Instrument, name: str, magnitude: float, rates: dict[float, float]) -> None:
+def test_rates_equal_the_published_ones(
+    mauve: Instrument, name: str, magnitude: float, rates: dict[float, float]
+) -> None:
     x = expect(Source.from_library(name).at_magnitude(magnitude), mauve, exposure=5)
     for nm, rate in rates.items():
         assert np.interp(nm, x.wavelength_nm, x.net_source_dn / x.exposure_s) == pytest.approx(rate, rel=0.1)
@@ -63,7 +65,7 @@ def test_signal_is_linear_in_light(sunlike: Source, mauve: Instrument) -> None:
     assert not faint.sky_electrons.any()
 
 
-def test_default_sky(sunlike: Source, mauve: Instrument) -> None:
+def test_studies_and_functions_have_one_default_sky(sunlike: Source, mauve: Instrument) -> None:
     """`expect` and studies, and so the command line, have the same default."""
     (study,) = Case(Study()).expect(sunlike)
     np.testing.assert_array_equal(expect(sunlike, mauve, exposure=50).sky_electrons, study.sky_electrons)
@@ -105,7 +107,7 @@ def test_paper_signal_is_reported(sunlike: Source, mauve: Instrument) -> None:
     assert not of_kind(expect(sunlike, mauve, exposure=50, sky=sky).messages, "paper signal")
 
 
-def test_per_element(quiet: Expectation) -> None:
+def test_elements_contain_their_pixels(quiet: Expectation) -> None:
     snr, noise = quiet.snr_per_element(), quiet.noise_budget()["total"].value
     assert snr.size == quiet.element_wavelength_nm.size == quiet.element[-1] + 1 == 48
     for k, low in enumerate(200 + 10.5 * np.arange(48)):
@@ -116,7 +118,7 @@ def test_per_element(quiet: Expectation) -> None:
     assert set(np.diff(quiet.element).tolist()) == {0, 1}
 
 
-def test_noise_budget(quiet: Expectation) -> None:
+def test_noise_budget_adds_up_to_the_total(quiet: Expectation) -> None:
     budget = quiet.noise_budget()
     assert budget.colnames == ["wavelength", "source_photon", "zodiacal_photon", "dark", "read", "total"]
     assert budget["wavelength"].unit == u.nm
@@ -199,7 +201,7 @@ def test_faint_star_does_not_saturate(quiet: Expectation) -> None:
     assert quiet.longest_safe_frame_s > 60
 
 
-def test_provenance(quiet: Expectation, sunlike: Source, mauve: Instrument) -> None:
+def test_provenance_names_the_inputs(quiet: Expectation, sunlike: Source, mauve: Instrument) -> None:
     assert quiet.name == sunlike.name
     assert quiet.instrument == "mauve"
     assert quiet.provenance["source digest"] == sunlike.digest
@@ -210,14 +212,14 @@ def test_provenance(quiet: Expectation, sunlike: Source, mauve: Instrument) -> N
     assert all(isinstance(value, str) for value in quiet.provenance.values())
 
 
-def test_frozen(quiet: Expectation) -> None:
+def test_expectation_is_immutable(quiet: Expectation) -> None:
     with pytest.raises(FrozenInstanceError):
         quiet.n_frames = 3  # type: ignore[misc]
     with pytest.raises(ValueError, match="read-only"):
         quiet.dark_dn[0] = 0.0
 
 
-def test_survives_pickling(quiet: Expectation) -> None:
+def test_expectation_survives_pickling(quiet: Expectation) -> None:
     again = pickle.loads(pickle.dumps(quiet))
     np.testing.assert_array_equal(again.snr(), quiet.snr())
     assert again.provenance == quiet.provenance

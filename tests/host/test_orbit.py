@@ -42,7 +42,7 @@ def verification() -> list[tuple[str, str, list[list[float]]]]:
     return [(*tle, rows) for tle, rows in zip(tles, blocks, strict=True)]
 
 
-def test_verification_vectors() -> None:
+def test_positions_equal_those_of_the_sgp4_verification() -> None:
     """Of the satellites whose lines have right checksums: the gravity model and the reading of each field."""
     seen = 0
     for first, second, rows in verification():
@@ -91,7 +91,7 @@ def test_frames_agree_with_astropy(day: Track) -> None:
 
 
 @pytest.mark.long
-def test_check_values(orbit: Orbit, day: Track) -> None:
+def test_orbit_has_the_documented_values(orbit: Orbit, day: Track) -> None:
     """TIME.md, section 5."""
     from mauvecl.host.orbit.radiation import proton_map
     from mauvecl.host.orbit.visibility import in_shadow
@@ -116,7 +116,7 @@ def test_check_values(orbit: Orbit, day: Track) -> None:
     assert ends == pytest.approx([-71, 31, -55, -10], abs=2.0)  # cells are 2 deg wide
 
 
-def test_mean_orbit(orbit: Orbit) -> None:
+def test_mean_orbit_begins_at_the_satellite(orbit: Orbit) -> None:
     """It begins where SGP4 has the satellite, keeps its local time, and says what it is."""
     near = TimeGrid("2026-09-14T15:00", 0.1, 30.0)
     mean, exact = (Orbit(orbit.elements, kind).track(near) for kind in ("mean", "tle"))
@@ -188,6 +188,6 @@ def test_global_state_is_restored(orbit: Orbit) -> None:
     assert (iers.conf.auto_download, solar_system_ephemeris.get()) == before
 
 
-def test_directions() -> None:
+def test_direction_of_coordinates() -> None:
     assert direction(90.0, 0.0) == pytest.approx([0, 1, 0], abs=1e-15)
     assert direction(np.array([0.0, 10.0]), 90.0)[1] == pytest.approx([0, 0, 1], abs=1e-15)

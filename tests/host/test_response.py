@@ -73,7 +73,7 @@ def brute(instrument: Instrument, wavelength: Float, flux: Float, pixel: int, or
 
 
 @pytest.mark.parametrize(("top_hat", "fwhm"), KERNELS)
-def test_line_function(mauve: Instrument, top_hat: float, fwhm: float) -> None:
+def test_line_spread_equals_the_convolution(mauve: Instrument, top_hat: float, fwhm: float) -> None:
     line = LineSpread.of(mauve.with_(top_hat_width_nm=top_hat, gaussian_fwhm_nm=fwhm))
     x = np.array([-30.0, -7.0, -5.0, -0.3, 0.0, 1.0, 5.2, 11.0])
     np.testing.assert_allclose(line.density(x), line_function(x, top_hat, fwhm), rtol=1e-9, atol=1e-15)
@@ -133,7 +133,7 @@ def test_line_keeps_its_flux_and_position(mauve: Instrument, top_hat: float, fwh
     assert landed @ instrument.wavelength_nm / landed.sum() == pytest.approx(437.1, abs=1e-6 if fwhm > 1 else 0.02)
 
 
-def test_column_sums(mauve: Instrument) -> None:
+def test_response_conserves_light(mauve: Instrument) -> None:
     rng = np.random.default_rng(7)
     wavelength = np.sort(rng.uniform(170, 760, 900))
     matrix = response_matrix(mauve, wavelength)

@@ -75,7 +75,7 @@ def test_shape_of_the_table() -> None:
     assert np.isnan(zodiacal_table().brightness).sum() == 13
 
 
-def test_between_cells() -> None:
+def test_brightness_is_interpolated_between_cells() -> None:
     def at(longitude: float, latitude: float, lookup: Lookup = "bilinear") -> float:
         return zodiacal_brightness(HelioEcliptic(longitude, latitude, 90.0), lookup)
 
@@ -140,7 +140,7 @@ def test_no_network_access_and_no_global_state(monkeypatch: pytest.MonkeyPatch) 
     assert (iers.conf.auto_download, solar_system_ephemeris.get()) == before
 
 
-def test_fixed_brightness() -> None:
+def test_brightness_can_be_a_quantity() -> None:
     assert Sky.of_brightness(22.1).surface_brightness == 22.1
     assert Sky.of_brightness(22.1 * u.mag / u.arcsec**2) == Sky.of_brightness(22.1)
 

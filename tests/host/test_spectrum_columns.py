@@ -173,7 +173,7 @@ RIGHT = {
 
 
 @pytest.mark.parametrize("case", RIGHT)
-def test_read_right(tmp_path: Path, case: str) -> None:
+def test_columns_are_recognised(tmp_path: Path, case: str) -> None:
     star = read(tmp_path, RIGHT[case])
     assert is_right(star), star.messages
 

@@ -155,7 +155,7 @@ def test_fits_in_many_forms(tmp_path: Path, form: str) -> None:
     alike(tmp_path / "star.dat", rtol=1e-6 if form == "single precision" else 1e-9)
 
 
-def test_logarithmic_images(tmp_path: Path) -> None:
+def test_wavelengths_of_logarithmic_images_equal_those_of_astropy(tmp_path: Path) -> None:
     """Log-linear (IRAF's DC-FLAG) and CTYPE WAVE-LOG, checked against astropy's own WCS."""
     from astropy.wcs import WCS
 

@@ -125,7 +125,7 @@ def lamost_table(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("form", [lamost_image, lamost_table])
-def test_lamost(tmp_path: Path, form: Any) -> None:
+def test_lamost_files_are_read(tmp_path: Path, form: Any) -> None:
     star = Source.read(form(tmp_path), extend="K5V")
     measured = (star.wavelength_nm > 371) & (star.wavelength_nm < 700)
     np.testing.assert_allclose(star.flux_flam[measured], 1e15 * light(10 * star.wavelength_nm[measured]), rtol=1e-3)
@@ -224,7 +224,7 @@ def sdss(tmp_path: Path, exposures: bool) -> Path:
 
 
 @pytest.mark.parametrize("exposures", [False, True])
-def test_sdss_coadd(tmp_path: Path, exposures: bool) -> None:
+def test_sdss_coadds_are_read(tmp_path: Path, exposures: bool) -> None:
     path = sdss(tmp_path, exposures)
     read = read_spectrum(path)
     np.testing.assert_allclose(read.flux_flam, light(10 * read.wavelength_nm), rtol=1e-3)

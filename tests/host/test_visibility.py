@@ -53,7 +53,7 @@ def test_visible_share_of_a_circular_orbit(from_plane_deg: float, shares: tuple[
 
 
 @pytest.mark.parametrize("margin", [0.0, 10.0, 20.0])
-def test_continuous_viewing(margin: float) -> None:
+def test_targets_near_the_pole_are_always_visible(margin: float) -> None:
     """Always visible within 22.0 - x deg of the orbit's pole."""
     position, _ = circular(AXIS_KM, 0.0, 0.0, np.linspace(0, 2 * np.pi, 400, endpoint=False))
     from_pole = np.arange(0.0, 30.0, 0.05)
@@ -149,7 +149,7 @@ def test_fraction_allowed_by_each_limit(month: Visibility) -> None:
     assert Visibility.of(month.track, month.target, free).share == pytest.approx(1.0)
 
 
-def test_eclipse_rule(month: Visibility) -> None:
+def test_eclipse_rule_selects_times_in_shadow(month: Visibility) -> None:
     both, dark, light = (
         Visibility.of(month.track, month.target, Limits(eclipse=rule)).seen for rule in ("any", "only", "never")
     )
@@ -265,7 +265,7 @@ def _simbad(monkeypatch: pytest.MonkeyPatch, query_tap: Callable[[str], object])
         monkeypatch.setattr(SimbadClass, "query_tap", lambda _, query, **__: query_tap(query))
 
 
-def test_simbad(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_answer_of_simbad_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
     """Columns of its TAP service: degrees, mas; what it does not have is masked; blanks, quotes."""
     asked = []
 

@@ -26,7 +26,7 @@ def words(n: int) -> tuple[np.ndarray, np.ndarray]:
     return np.append(radius, extra[0]), np.append(angle, extra[1])
 
 
-def test_accuracy(probes: Probes) -> None:
+def test_error_of_normals_is_bounded(probes: Probes) -> None:
     radius, angle = words(2**16)
     z = probes.normal(radius, angle).astype(np.float64)
     # The word as float32 has it, 24 bits: what the kernel defines, not an error of its arithmetic.
@@ -53,7 +53,7 @@ def test_reference_has_the_same_bits(probes: Probes) -> None:
 
 
 @pytest.mark.long
-def test_distribution(probes: Probes) -> None:
+def test_draws_are_normally_distributed(probes: Probes) -> None:
     """Kolmogorov-Smirnov on 8e6 draws; fails by chance once in 1e6 runs of new words."""
     n = 2**22
     w = np.array(reference.words_at(np.arange(n // 2), 0, "noise", 0, 11))
@@ -68,7 +68,7 @@ def test_distribution(probes: Probes) -> None:
 
 @pytest.mark.long
 def test_every_word_is_finite(probes_fast: Probes) -> None:
-    """All 2**32 radius words, with angles at two ends of the sine's range; `test_accuracy` has all ends of both."""
+    """Try all 2**32 radius words with angles at two ends of the sine's range."""
     items, per_item = 2**14, 2**18
     for angle in (0, 2**31 - 1):
         ends = np.empty((items, 2, probes_fast.width), np.float32)

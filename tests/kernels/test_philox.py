@@ -14,7 +14,7 @@ Words = tuple[int, ...]
 
 
 @pytest.mark.parametrize(("counter", "key", "answer"), PHILOX_VECTORS)
-def test_known_answers(probes: Probes, counter: Words, key: Words, answer: Words) -> None:
+def test_philox_gives_the_known_answers(probes: Probes, counter: Words, key: Words, answer: Words) -> None:
     """Random123's, which the self-test keeps."""
     out = probes.philox(np.array([counter], np.uint32), np.array([key], np.uint32))[0]
     np.testing.assert_array_equal(out, [*answer, *answer])
@@ -44,7 +44,7 @@ def test_against_an_independent_implementation(probes: Probes) -> None:
         np.testing.assert_array_equal(words, oracle.random_raw(4).astype(np.uint32))
 
 
-def test_twin(probes: Probes) -> None:
+def test_device_and_numpy_give_equal_words(probes: Probes) -> None:
     counters, keys = random_counters(200)
     ours = probes.philox(counters, keys)[:, :4]
     for counter, key, words in zip(counters, keys, ours, strict=True):

@@ -18,7 +18,7 @@ MEANS = [0.0, 0.5, 5.0, 64.0, 2225.0, 22250.0, 222500.0]
 
 
 @pytest.mark.parametrize("mean", [*MEANS, 1e-9, 0.01, 1.0, 999.5, 1e6, 1e7])
-def test_realised_probabilities(mean: float) -> None:
+def test_alias_table_has_the_probabilities_of_scipy(mean: float) -> None:
     """The words of each outcome, counted exactly, are scipy's probabilities to one word in 2**32."""
     table = alias_table(mean)
     words = table.words_per_column()

@@ -97,7 +97,7 @@ def moments(x: np.ndarray, weight: np.ndarray) -> tuple[float, float, float, flo
 
 
 @pytest.mark.parametrize(("name", "prior"), PRIORS)
-def test_moments(probes: Probes, name: str, prior: Prior) -> None:
+def test_drawn_factors_have_the_moments_of_the_prior(probes: Probes, name: str, prior: Prior) -> None:
     """Every cell of the table integrated: no draws, no chance."""
     t, w = np.polynomial.legendre.leggauss(3)
     edges = np.append(0.0, nodes()[:-1])
@@ -116,7 +116,7 @@ CHANCES = [1e-9, 1e-7, 1e-5, 1e-3, 0.1]
 
 
 @pytest.mark.parametrize(("name", "prior"), PRIORS)
-def test_tails(probes: Probes, name: str, prior: Prior) -> None:
+def test_drawn_factors_have_the_tails_of_the_prior(probes: Probes, name: str, prior: Prior) -> None:
     """As much lies beyond the device's value as its word says, within 0.1 % and what float32 resolves of the spread."""
     found = factors(name, prior)
     for upper in (False, True):

@@ -74,7 +74,7 @@ def test_draws_are_uncorrelated(engine: Engine, name: str) -> None:
     assert np.abs(found).max() < 6.5
 
 
-def test_pairs_use_one_method() -> None:
+def test_pairs_of_pixels_use_one_method() -> None:
     """Check that no pair mixes tables with the expansion, and that pairs of one kind are drawn as alone."""
     scene = prepare([detector(MIXED, MIXED[::-1], photon_noise="poisson")], recipe="apart")
     for counts, mean in ((scene.dark_counts[:64], MIXED), (scene.photon_counts[0, :64], MIXED[::-1])):

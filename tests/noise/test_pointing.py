@@ -101,6 +101,6 @@ def test_a_stare_depends_on_its_number_and_the_seed_alone() -> None:
 
 
 @pytest.mark.parametrize(("key", "value"), [("rate_per_h", 0.0), ("depth", 1.5), ("duration_s", -1.0)])
-def test_impossible_values_are_refused(key: str, value: float) -> None:
+def test_impossible_values_raise(key: str, value: float) -> None:
     with refused(key, value=value):
         PointingDrifts(**{key: value})

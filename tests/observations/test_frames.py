@@ -19,7 +19,7 @@ FLUX = 1000 + RNG.normal(0, 5, 100)
 ERROR = np.full(100, 5.0)
 
 
-def test_unsorted_frames_are_sorted_and_the_remark_says_so() -> None:
+def test_unsorted_frames_are_sorted_with_a_remark() -> None:
     order = RNG.permutation(100)
     frames = Frames.of(TIME[order], FLUX[order], ERROR[order])
     np.testing.assert_array_equal(frames.flux, FLUX)

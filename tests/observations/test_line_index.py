@@ -53,7 +53,7 @@ def test_flux_equals_that_of_specutils() -> None:
     assert found.flux == pytest.approx(there, rel=1e-5)
 
 
-def test_many_spectra_are_measured_as_each_alone() -> None:
+def test_batch_of_spectra_equals_single_spectra() -> None:
     rng = np.random.default_rng(1)
     flux, error = 5.0 + rng.normal(0, 0.1, (4, NM.size)), rng.uniform(0.05, 0.2, (4, NM.size))
     error[2, 60] = np.nan

@@ -162,7 +162,7 @@ def judge(path: Path | str, mapping: FrameMapping | None, expected: Expected) ->
 
 @pytest.mark.parametrize("ending", FORMATS)
 @pytest.mark.parametrize("name", TABLES)
-def test_odd_tables_give_the_truth_or_one_sentence(name: str, ending: str, tmp_path: Path) -> None:
+def test_odd_tables_give_the_truth_or_an_error(name: str, ending: str, tmp_path: Path) -> None:
     columns, change, expected = TABLES[name]
     judge(table_file(columns, tmp_path, ending), FrameMapping(**(HOW | change)), expected)
 
@@ -211,7 +211,7 @@ TEXTS: dict[str, tuple[Callable[[str], bytes], Columns, Expected]] = {
 
 
 @pytest.mark.parametrize("name", TEXTS)
-def test_odd_texts_give_the_truth_or_one_sentence(name: str, tmp_path: Path) -> None:
+def test_odd_texts_give_the_truth_or_an_error(name: str, tmp_path: Path) -> None:
     change, how, expected = TEXTS[name]
     path = table_file(light_curve(), tmp_path, "csv")
     path.write_bytes(change(path.read_text()))
@@ -253,7 +253,7 @@ BYTES: dict[str, tuple[Callable[[bytes], bytes], Expected]] = {
 
 
 @pytest.mark.parametrize("name", BYTES)
-def test_damaged_fits_files_give_the_truth_or_one_sentence(name: str, tmp_path: Path) -> None:
+def test_damaged_fits_files_give_the_truth_or_an_error(name: str, tmp_path: Path) -> None:
     change, expected = BYTES[name]
     path = table_file(light_curve(), tmp_path, "fits")
     path.write_bytes(change(path.read_bytes()))
@@ -335,7 +335,7 @@ EXTENSIONS: dict[str, tuple[Callable[[], list[Any]], Columns | None, Expected]] 
 
 
 @pytest.mark.parametrize("name", EXTENSIONS)
-def test_odd_extensions_give_the_truth_or_one_sentence(name: str, tmp_path: Path) -> None:
+def test_odd_extensions_give_the_truth_or_an_error(name: str, tmp_path: Path) -> None:
     make, how, expected = EXTENSIONS[name]
     fits.HDUList([fits.PrimaryHDU(), *make()]).writeto(tmp_path / "a.fits")
     judge(tmp_path / "a.fits", None if how is None else FrameMapping(**how), expected)
@@ -527,18 +527,18 @@ def _shift(path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ODD_SPECTRA)
-def test_odd_spectra_give_the_truth_or_one_sentence(name: str, tmp_path: Path) -> None:
+def test_odd_spectra_give_the_truth_or_an_error(name: str, tmp_path: Path) -> None:
     write, expected = ODD_SPECTRA[name]
     judge(*write(tmp_path), expected)
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89HDF\r\n\x1a\n", b"\x89HDF\r\n\x1a\n" + b"\0" * 500])
-def test_damaged_hdf5_files_are_one_sentence(content: bytes, tmp_path: Path) -> None:
+def test_damaged_hdf5_files_raise(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "a.h5").write_bytes(content)
     judge(tmp_path / "a.h5", None, "file")
 
 
-def test_folders_that_are_no_store_are_one_sentence(tmp_path: Path) -> None:
+def test_folders_without_a_store_raise(tmp_path: Path) -> None:
     judge(tmp_path, None, "mapping")
     (tmp_path / "zarr.json").write_text("{")
     judge(tmp_path, None, "file")
@@ -548,7 +548,7 @@ def test_folders_that_are_no_store_are_one_sentence(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["no flux column", "one row", "time in parsec"])
-def test_the_command_ends_with_one_sentence(name: str, tmp_path: Path) -> None:
+def test_command_ends_with_a_message(name: str, tmp_path: Path) -> None:
     columns, change, _ = TABLES[name]
     path = table_file(columns, tmp_path, "csv")
     lines = [f"{key} = {value!r}".replace("'", '"') for key, value in (HOW | change).items()]

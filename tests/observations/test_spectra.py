@@ -159,7 +159,7 @@ def test_saturated_pixels_and_missing_errors_of_raw_frames_are_stated() -> None:
     assert ratio.mean() == pytest.approx(1.0, abs=0.005)
 
 
-def test_counts_with_and_without_bias_and_dark_current_are_told_apart() -> None:
+def test_counts_with_and_without_bias_and_dark_current_are_distinguished() -> None:
     """Relative sizes of flares depend on it: bias and dark current are a hundred times the light of this star."""
     rng = np.random.default_rng(312)
     quiet = model().quiet
@@ -224,7 +224,7 @@ def test_false_alarms_are_as_many_as_promised(threshold: float) -> None:
 
 
 @pytest.mark.long
-def test_flares_are_detected_as_often_as_their_signal_to_noise_says(rare: float) -> None:
+def test_detection_rate_follows_the_signal_to_noise(rare: float) -> None:
     """The share of flares of one size above the threshold; the binomial bound fails once in a thousand times.
 
     The statistic of the template of the flare's own shape is normal about its S/N; others of the bank only add.

@@ -96,7 +96,7 @@ def test_flares_of_the_paper_are_ordered(found: Detection) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("statistic", STATISTICS)
-def test_thresholds_invert(found: Detection, statistic: str) -> None:
+def test_threshold_inverts_false_alarm_probability(found: Detection, statistic: str) -> None:
     for fap in (0.5, 0.1, 1e-2, 1e-3, 1e-4):
         cut = found.threshold(fap, statistic)
         assert cut.low <= cut.value <= cut.high

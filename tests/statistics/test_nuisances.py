@@ -43,7 +43,7 @@ def setting(quiet: Expectation, sd: dict[str, float]) -> Setting:
         (("M3V", 9.0, 0.24), 46.5, (1.25, 17.0), (44.8, 45.1), 13.6),
     ],
 )
-def test_table_of_the_methods(
+def test_costs_of_unknowns_equal_those_computed_elsewhere(
     star: Any, known: float, dark: tuple[float, float], light: tuple[float, float], both: float
 ) -> None:
     """Numbers computed apart from this project, Vega at V = 0; to 1 %, or half a unit of the last digit of 0.23."""

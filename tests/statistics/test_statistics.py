@@ -110,7 +110,7 @@ def test_both_integrals_agree(spread: float) -> None:
         assert form.sf(value) == pytest.approx(bent if sigmas > 0 else 1 - bent, rel=1e-6, abs=1e-14)
 
 
-def test_effective_terms() -> None:
+def test_number_of_effective_terms() -> None:
     assert QuadraticForm(np.full(7, 2.5), np.ones(7)).effective_terms == pytest.approx(7.0)
     assert QuadraticForm(np.array([3.0, 1.0]), np.zeros(2)).effective_terms == pytest.approx(1.6)
 
