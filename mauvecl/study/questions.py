@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Help, Range
+from mauvecl.schema.fields import Flag, Help, Range, Slider, Widget
 from mauvecl.schema.physical import Positive, Probability, Wavelength
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Section
@@ -104,9 +104,28 @@ class LimitQuestion(Section):
     """Quantity whose limit is computed, and the detection probability at the limit."""
 
     of: Annotated[
-        Literal["magnitude", "amplitude", "exposure"], Help("Quantity whose limit is computed"), Flag("--of")
+        Literal["magnitude", "amplitude", "exposure"],
+        Help("Quantity whose limit is computed"),
+        Flag("--of"),
+        Widget(
+            label="Solve for",
+            hint="The smallest flare, the faintest star or the shortest exposure that is detected with the wanted "
+            "probability; all else is as entered. The tab Limit and map simulates it.",
+            group="Limit",
+            first="amplitude",
+        ),
     ] = "magnitude"
-    power: Annotated[Probability, Help("Wanted detection probability"), Flag("--power")] = 0.9
+    power: Annotated[
+        Probability,
+        Help("Wanted detection probability"),
+        Flag("--power"),
+        Widget(
+            label="Wanted probability",
+            hint="With which a flare is to be detected at the limit.",
+            group="Detection",
+            slider=Slider(0.5, 0.99, 0.01),
+        ),
+    ] = 0.9
 
 
 class Axis(Section):

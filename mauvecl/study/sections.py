@@ -283,9 +283,9 @@ class Observation(Section):
         Flag("--instrument"),
         Widget(
             label="Payload",
-            hint="mauve as its paper has it, or with the dark current counted in electrons.",
-            group="Detector",
-            place=1,
+            hint="mauve: as its paper has it, with dark counts that are Poisson in DN, the careful choice. "
+            "mauve-electrons: Poisson in electrons, as in physics; the documentation recommends it for planning.",
+            place=2,
             choices=("mauve", "mauve-electrons"),
         ),
     ] = "mauve"

@@ -16,7 +16,7 @@ from mauvecl.statistics.distributions import Gaussian, Mixture
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.study.cases import Case, Loader
 from mauvecl.study.messages import collect_messages
-from mauvecl.web.fields import star_words
+from mauvecl.web.fields import UNKNOWN, star_words
 from mauvecl.web.interpolated_form import InterpolatedForm
 
 if TYPE_CHECKING:
@@ -35,11 +35,9 @@ class ClosedForms:
 
     question: Question
     case: Case
-    odds: DetectionForms  # of the requested statistic, for Gaussian noise
-    chance: float  # of detection; NaN if the flare saturates every used pixel
 
     @classmethod
-    def of(cls, question: Question, folder: Path) -> ClosedForms:
+    def of(cls, question: Question, folder: Path, *, headline: bool = True) -> ClosedForms:
         """Answer a question.
 
         Parameters
@@ -47,27 +45,37 @@ class ClosedForms:
         question : Question
         folder : Path
             Folder to which an uploaded spectrum is written for the study.
+        headline : bool
+            Whether the chance of detection is asked, without which a star may be too bright for it.
 
         Raises
         ------
         InputError
             For incompatible values.
         """
-        q, study = question, question.study(folder)
-        uploaded = q.uploaded
+        uploaded = question.uploaded
         # An uploaded spectrum is not read from its file at every change.
-        loader = Loader(None if uploaded is None else lambda star: uploaded.at_magnitude(q.magnitude, q.band))
-        case = Case(study, loader=loader)
-        quiet, flare = case.expectations
-        one, setting = STATISTICS[q.statistic], case.setting(quiet, flare)
+        scaled = None if uploaded is None else lambda star: uploaded.at_magnitude(question.magnitude, question.band)
+        closed = cls(question, Case(question.study(folder), loader=Loader(scaled)))
+        if headline:
+            _ = closed.odds
+        return closed
+
+    @cached_property
+    def odds(self) -> DetectionForms:
+        """Closed form of the requested statistic, for Gaussian noise."""
+        one, setting = STATISTICS[self.question.statistic], self.case.setting(self.quiet, self.flare)
         if not setting.used.any():
-            raise InputError(
-                f"every pixel of {quiet.name} is saturated", "a fainter star", key="star", value=quiet.name
-            )
+            name = self.quiet.name
+            raise InputError(f"every pixel of {name} is saturated", "a fainter star", key="magnitude", value=name)
         one.check(setting)
-        odds = one.detection_forms(setting, flare, q.fap)
-        chance = float("nan") if flare.saturated[setting.used].all() else odds.probability
-        return cls(q, case, odds, chance)
+        return one.detection_forms(setting, self.flare, self.question.fap)
+
+    @cached_property
+    def chance(self) -> float:
+        """Probability of detection; NaN if the flare saturates every used pixel."""
+        used = self.case.setting(self.quiet, self.flare).used
+        return float("nan") if self.flare.saturated[used].all() else self.odds.probability
 
     @property
     def study(self) -> Study:
@@ -83,6 +91,18 @@ class ClosedForms:
     def flare(self) -> Expectation:
         """Expectation of the star with the flare."""
         return self.case.flares[0]
+
+    def assuming(self, unknown: str, *, instrument: str | None = None) -> ClosedForms:
+        """Return the answer to the question with another choice of what is unknown, or another payload."""
+        question = {"unknown": unknown, "instrument": instrument or self.question.instrument}
+        if question.items() <= self.question.values.items():
+            return self
+        study = self.study
+        case = self.case.with_sections(
+            nuisances=study.nuisances.model_copy(update={"usual": unknown == UNKNOWN[1]}),
+            observation=study.observation.model_copy(update={"instrument": question["instrument"]}),
+        )
+        return ClosedForms(replace(self.question, values={**self.question.values, **question}), case)
 
     @cached_property
     def light(self) -> tuple[Source, Source]:

@@ -265,7 +265,8 @@ _OWN = {
     "unknown": Field(
         "Unknown", UNKNOWN[0], Choice(UNKNOWN),
         "What differs from exposure to exposure and is not known: the usual are detector temperature, light lost and "
-        "sky. They are drawn, and the statistic is made blind to them.", group="Unknown", place=0,
+        "sky. They are drawn, and the statistic is made blind to them. The card shows both chances; this is for the "
+        "pictures, tables and simulations.", group="", place=3,
     ),
     "own_unknown": Field(
         "Own unknown spectrum", "", points,
@@ -303,6 +304,8 @@ ADVANCED = {
     name: _group(name)
     for name in ("Detection", "Flare's spectrum", "Detector", "Sky", "Unknown", "Visibility and plan", "Change")
 }
+#: Fields of the card.
+SOLVED = _group("Limit")
 #: Fields that ask for something under one sky only.
 ASKED_UNDER = {"sky_brightness": "brightness", "target": "target and time", "time": "target and time"}
 #: Questions to begin with; the amplitudes of the first two are the paper's smallest, the others are examples (assumed).

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 #: Answers of a question by name.
 Answers = dict[str, Any]
+#: Name of the detection with the other choice of what is unknown: the card shows both.
+OTHER = "detection otherwise"
 #: Cells along each axis of the page's map, and realisations per cell.
 MAP_STEPS, MAP_REALISATIONS = 8, 20_000
 #: Injected flares: numbers of sizes and half-widths, flares of each, and positions.
@@ -87,24 +89,42 @@ class Simulation:
         Makes the study that is asked from that of the page.
     completed : callable
         Adds to the answers what the page reads repeatedly.
+    others : dict
+        Further answers of the main verb by name, with what makes their study; a refused one is left out.
     """
 
     verbs: Mapping[str, str]
     asked: Callable[[Study], Study] = lambda study: study
     completed: Callable[[Answers], Answers] = lambda answers: answers
+    others: Mapping[str, Callable[[Study], Study]] = field(default_factory=dict)
 
     def __call__(self, study: Study, pool: Pool) -> Answers:
         """Return the answers by name."""
         asked = self.asked(study)
-        counted = [verb for verb in self.verbs.values() if VERBS[verb].counts == "realisations"]
-        if len(counted) > 1:
-            pool.expect(len(counted) * asked.run.realisations)
-        return self.completed({name: VERBS[verb].ask(asked, pool) for name, verb in self.verbs.items()})
+        main = next(iter(self.verbs.values()))
+        wanted = [(name, verb, asked) for name, verb in self.verbs.items()]
+        wanted += [(name, main, change(asked)) for name, change in self.others.items()]
+        counted = sum(VERBS[verb].counts == "realisations" for _, verb, _ in wanted)
+        if counted > 1:
+            pool.expect(counted * asked.run.realisations)
+        answers: Answers = {}
+        for name, verb, one in wanted:
+            try:
+                answers[name] = VERBS[verb].ask(one, pool)
+            except InputError:
+                if name not in self.others:
+                    raise
+        return self.completed(answers)
+
+
+def _other_unknowns(study: Study) -> Study:
+    """Return the study with the usual unknowns if it has none, or without."""
+    return _changed(study, nuisances={"usual": not study.nuisances.usual})
 
 
 #: Simulations that change the study or have another name than their verb.
 _OWN = {
-    "detection": Simulation({"detection": "detect", "snr": "snr"}),
+    "detection": Simulation({"detection": "detect", "snr": "snr"}, others={OTHER: _other_unknowns}),
     "map": Simulation({"map": "map"}, map_around),
     "measure": Simulation({"measure": "measure"}, fits),
     "completeness": Simulation({"completeness": "inject"}, completeness),

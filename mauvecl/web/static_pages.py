@@ -71,6 +71,7 @@ def front() -> bytes:
     from mauvecl.host.stars.star_names import all_names
     from mauvecl.web import fields
     from mauvecl.web.figures import DASHES, INKS
+    from mauvecl.web.headline import TITLES
     from mauvecl.web.state import SEEN
     from mauvecl.web.tabs import TABS
     from mauvecl.web.upload import MOST_UPLOADED
@@ -106,8 +107,8 @@ def front() -> bytes:
     lookup = TemplateLookup([str(_FOLDER)], default_filters=["h"], strict_undefined=True)
     template = lookup.get_template("page.html.mako")
     text = template.render(
-        fields=fields, tabs=TABS, version=VERSION, bibtex=BIBTEX.format(version=VERSION), digest=_digest(),
-        words=json.dumps(words).replace("<", "\\u003c"),
+        fields=fields, tabs=TABS, version=VERSION, bibtex=BIBTEX.format(version=VERSION), titles=TITLES,
+        words=json.dumps(words).replace("<", "\\u003c"), digest=_digest(),
     )  # fmt: skip
     return str(text).encode()
 

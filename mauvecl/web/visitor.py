@@ -26,6 +26,7 @@ from mauvecl.web.card import card
 from mauvecl.web.closed_forms import ClosedForms
 from mauvecl.web.downloads import as_file, asked_study, taken_along
 from mauvecl.web.fields import UPLOADED, UPLOADED_UNKNOWN
+from mauvecl.web.headline import other_payloads, solved
 from mauvecl.web.simulations import DRAWING, SIMULATIONS
 from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS
@@ -209,6 +210,16 @@ class Visitor(WebSocketHandler):
     async def _in_thread(work: Callable[[], Any]) -> Any:
         """Run a function in a thread."""
         return await asyncio.get_running_loop().run_in_executor(_closed_forms, work)
+
+    def _ask_solve(self, asked: dict[str, Any]) -> None:
+        """Send the limit of what the question solves for, and the chances with other payloads."""
+        n = asked["n"]
+        self._give(self._solve(n, self.state(asked["link"])), n=n, solved="")
+
+    async def _solve(self, n: int, state: State) -> None:
+        closed = await self._in_thread(partial(self.closed, state))
+        self.send(n=n, payloads=await self._in_thread(partial(other_payloads, closed)))
+        self.send(n=n, solved=await self._in_thread(partial(solved, closed)))
 
     def _ask_pinned(self, asked: dict[str, Any]) -> None:
         """Send the data of a pinned scenario for a tab's pictures."""

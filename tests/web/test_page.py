@@ -129,7 +129,7 @@ def enter(page: Page, label: str, value: str) -> None:
 def shown(page: Page) -> str:
     """Return the answer in the words of the card."""
     settled(page)
-    return page.locator("#card .message").inner_text()
+    return "\n".join(page.locator("#card :is(.message, .words)").all_inner_texts())
 
 
 def answerless(page: Page) -> None:

@@ -8,7 +8,7 @@ import {byId, element, every} from "./dom.js"
 export class Card {
   constructor() {
     this.box = byId("card")
-    this.message = this.box.querySelector(".message")
+    this.parts = [...every(".message, .below", this.box), byId("facts")]
     /** @type {Set<string>} */
     this.dismissed = new Set()
     this.unfolded = false
@@ -22,7 +22,7 @@ export class Card {
   // What is shown is no answer to what is entered.
   fade() {
     this.busy(true)
-    for (const part of [this.message, byId("facts"), ...every(".pictures, .rows")]) part.classList.add("dim")
+    for (const part of [...this.parts, ...every(".pictures, .rows")]) part.classList.add("dim")
   }
 
   /** The pictures of a tab are those of the answer; other tabs may still hold an earlier one's.
@@ -31,13 +31,33 @@ export class Card {
     for (const part of every(`#panel-${tab} :is(.pictures, .rows)`)) part.classList.remove("dim")
   }
 
+  /** The numbers, or the words that there are none; what is below stays where it is.
+   * @param {boolean} empty */
+  empty(empty) {
+    this.box.classList.toggle("none", empty)
+    byId("numbers").hidden = empty
+    byId("no-answer").hidden = !empty
+    byId("facts").classList.toggle("absent", empty)
+  }
+
+  /** The limit of what is solved for, and the chances with other payloads.
+   * @param {string | undefined} sentence
+   * @param {string | undefined} payloads */
+  solved(sentence, payloads) {
+    if (sentence !== undefined) byId("solved").textContent = sentence
+    if (payloads !== undefined) byId("payloads").textContent = payloads
+  }
+
   /** @param {Answer} answer */
   tell(answer) {
-    this.box.classList.remove("none")
-    this.box.style.minHeight = ""
-    for (const part of [this.message, byId("facts")]) part.classList.remove("dim")
-    byId("chance").textContent = answer.shown
-    byId("interval").textContent = answer.interval
+    this.empty(false)
+    for (const part of this.parts) part.classList.remove("dim")
+    for (const {unknown, shown, interval} of answer.numbers) {
+      const [number] = every(`#numbers [data-unknown="${unknown}"]`)
+      number.querySelector(".chance").textContent = shown
+      number.querySelector(".interval").textContent = interval
+      number.setAttribute("aria-pressed", String(unknown === answer.chosen))
+    }
     byId("words-of").textContent = answer.words
     byId("facts").replaceChildren(...answer.facts.flatMap(([name, value]) => [element("dt", name), element("dd", value)]))
     this.busy(false)
@@ -45,13 +65,10 @@ export class Card {
 
   /** @param {string} why */
   none(why) {
-    // What is below stays where it is.
-    this.box.style.minHeight = `${this.box.offsetHeight}px`
-    this.box.classList.add("none")
-    this.message.classList.remove("dim")
-    byId("chance").textContent = "No answer."
-    byId("interval").textContent = ""
+    this.empty(true)
+    for (const part of this.parts) part.classList.remove("dim")
     byId("words-of").textContent = why
+    this.solved("", "")
     this.ended("")
     this.busy(false)
   }

@@ -123,9 +123,26 @@ ${control(name)}
 <h2 id="answer-head" class="quiet">Answer</h2>
 <div id="card" class="card" aria-busy="true">
 <div class="message" aria-live="polite" aria-atomic="true">
-<p class="chance"><span id="chance">…</span></p>
-<p class="interval" id="interval">the answer is on its way</p>
-<p class="words" id="words-of"></p>
+<p class="chance" id="no-answer" hidden>No answer.</p>
+<div id="numbers" role="group" aria-label="Chance to detect the flare">
+% for choice, title in titles.items():
+<button type="button" class="odds" data-unknown="${choice}" aria-pressed="${"true" if choice == fields.FIELDS["unknown"].first else "false"}" title="Show the pictures and tables of this">
+<span class="chance"${' id="chance"' if loop.first else ""}>…</span>
+<span class="title">${title}</span>
+<span class="interval"></span>
+</button>
+% endfor
+</div>
+</div>
+<div class="rest">
+<div class="below">
+<p class="words" id="words-of">the answer is on its way</p>
+<div class="solve">
+% for name in fields.SOLVED:
+${control(name)}
+% endfor
+<p><output id="solved" for="f-of"></output> <span id="payloads" class="hint"></span></p>
+</div>
 </div>
 <dl id="facts"></dl>
 <div class="row run">
@@ -133,6 +150,7 @@ ${control(name)}
 <button type="button" id="cancel" disabled>Cancel</button>
 <progress id="progress" class="idle" max="1" value="0" aria-label="Simulation"></progress>
 <span id="status" role="status"></span>
+</div>
 </div>
 </div>
 <ul id="notices" aria-label="Notices"></ul>

@@ -23,6 +23,8 @@ import {Uploads} from "./uploads.js"
 const words = JSON.parse(byId("words").textContent)
 //: Milliseconds without a change after which one exposure is drawn.
 const DRAW_MS = 500
+//: Milliseconds without a change after which the limits are computed.
+const SOLVE_MS = 300
 //: Tabs that show a drawn exposure.
 const DRAWN = new Set(["detection", "spectrum"])
 
@@ -101,6 +103,7 @@ class Page {
   withdraw() {
     this.answer = null
     clearTimeout(this.soon)
+    clearTimeout(this.later)
     this.card.fade()
     this.offer()
   }
@@ -127,6 +130,8 @@ class Page {
       this.history = false
       this.compare.ran({...this.scenario(), at: new Date().toLocaleTimeString()})
     }
+    clearTimeout(this.later)
+    this.later = setTimeout(() => this.solve(), SOLVE_MS)
     this.simulations.next(answer.simulated)
   }
 
@@ -205,6 +210,15 @@ class Page {
     this.pictures.pin(tab, known, this.fields.entered)
   }
 
+  // What is solved for takes longer than the answer.
+  solve() {
+    const question = this.question
+    const n = this.live.ask("solve", {link: this.routing.link, tab: this.routing.seen.tab}, message => {
+      if (message.solved !== undefined) this.live.done(n)
+      if (question === this.question && this.answer) this.card.solved(message.solved, message.payloads)
+    })
+  }
+
   drawOne() {
     const question = this.question
     const n = this.live.ask("draw", {link: this.routing.link, tab: this.routing.seen.tab}, message => {
@@ -226,7 +240,10 @@ class Page {
   }
 
   scenario() {
-    const {shown, interval, facts, words: said} = this.answer
+    const {shown, interval, words: said} = this.answer
+    /** @type {[string, string][]} */
+    const facts = [...this.answer.facts]
+    for (const one of this.answer.numbers) facts.push([one.title, one.shown])
     const entered = {...this.fields.entered}
     return {link: this.routing.link, entered, files: this.uploads.of(entered), shown, interval, facts, words: said}
   }
@@ -276,6 +293,9 @@ class Page {
     byId("pin").onclick = () => {
       this.compare.pin(this.scenario())
       this.card.ended("Pinned: see the tab Compare.")
+    }
+    for (const number of every("#numbers [data-unknown]")) {
+      number.onclick = () => this.enter({unknown: number.dataset.unknown})
     }
     byId("afresh").onclick = () => this.enter({...words.fields})
     byId("preset").onchange = () => {

@@ -15,13 +15,14 @@
  * @typedef {{text: string, sources: Record<string, Columns>, props: Record<string, Record<string, any>>}} Drawn
  *
  * The answer to a question, as the card shows it; notes are sentences with their kind.
- * @typedef {{shown: string, interval: string, words: string, facts: [string, string][], notes: [string, string][],
+ * @typedef {{numbers: {unknown: string, title: string, shown: string, interval: string}[], chosen: string,
+ *   shown: string, interval: string, words: string, facts: [string, string][], notes: [string, string][],
  *   simulated: string[]}} Answer
  *
  * A message of the server: which entries it has depends on what was asked.
  * @typedef {{n: number, faults: Faults, stray: string, answer: Answer, refused: string, tab: string,
  *   pictures: Record<string, Drawn>, rows: string[][], draws: boolean, ended: string, kind: string, progress: number,
- *   message: string, lacks: string, entered: string, file: string, taken: any[],
+ *   message: string, lacks: string, entered: string, file: string, taken: any[], solved?: string, payloads?: string,
  *   pins: Record<string, Columns>, hello: string}} Message
  *
  * What the server says of a picture once.
