@@ -13,7 +13,7 @@ from mauvecl.answers.detection.unknown_cost import unknown_cost
 from mauvecl.answers.limits.search import LimitSearch
 from mauvecl.schema.errors import InputError
 from mauvecl.web.closed_forms import ClosedForms, between, percent, short
-from mauvecl.web.fields import FIELDS, UNKNOWN
+from mauvecl.web.fields import FIELDS, UNKNOWN, Choice
 from mauvecl.web.simulations import OTHER
 
 if TYPE_CHECKING:
@@ -128,8 +128,9 @@ def _limit(assumed: ClosedForms, known: float | None) -> float:
 
 def other_payloads(closed: ClosedForms) -> str:
     """Return a sentence on the chances with other payloads than the question's."""
-    told = []
-    for name in FIELDS["instrument"].read.options:
+    told, payloads = [], FIELDS["instrument"].read
+    assert isinstance(payloads, Choice)
+    for name in payloads.options:
         if name != closed.question.instrument:
             shown = []
             for unknown in UNKNOWN:
