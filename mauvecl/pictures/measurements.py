@@ -10,7 +10,7 @@ import numpy as np
 from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import COLOURS, NULL, headline, styled_picture
 from mauvecl.results.measurements.flare_model import FlareModel
-from mauvecl.results.measurements.reduction import variance_of
+from mauvecl.results.measurements.reduction import usable_variance
 from mauvecl.study.parts import First, note_of
 
 if TYPE_CHECKING:
@@ -42,12 +42,15 @@ def fits(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
         quiet, found = one.quiet, one.found
         mean, unknown = one.fitted_dn()
         kelvin = " and ".join(f"{x:.0f} K" for x in np.atleast_1d(np.exp(found.log_k[0])))
-        sums = [quiet.per_element(values) for values in (one.frame - unknown, mean, variance_of(quiet, mean)[0])]
-        nm, noise = quiet.element_wavelength_nm, np.sqrt(sums[2])
-        upper.errorbar(nm, sums[0], noise, fmt=".", color=NULL, label="exposure less star and unknowns")
-        upper.plot(nm, sums[1], color=COLOURS[0], label=f"fit: {kelvin}")
-        good = noise > 0
-        lower.plot(nm[good], (sums[0] - sums[1])[good] / noise[good], ".", color=COLOURS[0])
+        variance, used = usable_variance(quiet, mean, one.skipped_nm)
+        sums = [quiet.per_element(np.where(used, values, 0.0)) for values in (one.frame - unknown, mean, variance)]
+        # Resolution elements of which some pixels are not used are not shown.
+        whole = quiet.per_element(used.astype(np.float64)) == quiet.per_element(np.ones(used.size))
+        data, fit, variance = (np.where(whole, values, np.nan) for values in sums)
+        nm, noise = quiet.element_wavelength_nm, np.sqrt(variance)
+        upper.errorbar(nm, data, noise, fmt=".", color=NULL, label="exposure less star and unknowns")
+        upper.plot(nm, fit, color=COLOURS[0], label=f"fit: {kelvin}")
+        lower.plot(nm, (data - fit) / noise, ".", color=COLOURS[0])
         lower.axhline(0.0, color=NULL, linewidth=0.8)
         lower.set(xlabel="wavelength (nm)", ylabel="residual / noise")
         upper.set(title=one.name, ylabel="DN per resolution element")

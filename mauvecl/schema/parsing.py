@@ -88,6 +88,11 @@ def gaps(texts: Sequence[str], name: str) -> list[tuple[float, float]]:
     return [_pair(text, name, "two times in s, such as 1000:2000") for text in texts]
 
 
+def wavelengths(texts: Sequence[str], name: str) -> list[tuple[float, float]]:
+    """Read ranges of wavelengths such as 322:368."""
+    return [_pair(text, name, "two wavelengths in nm, such as 322:368") for text in texts]
+
+
 def declinations(text: str, name: str) -> tuple[float, float] | str:
     """Read a range of declinations such as -46.4:31.8, or none."""
     if text.strip().lower() == "none":

@@ -73,7 +73,8 @@ def _flare(study: Study, swept: set[str]) -> str:
     if f.geometry == "replaces" and f.photosphere_temperature_k is not None:
         replaces += f" of {f.photosphere_temperature_k:g} K"
     geometry = "added to the star" if f.geometry == "added" else replaces
-    return f"flares {temperature}, {geometry}, amplitudes in the {f.band} band"
+    size = "as bright as observed" if f.spectrum.as_observed else f"amplitudes in the {f.band} band"
+    return f"flares {temperature}, {geometry}, {size}"
 
 
 def _orbit(study: Study) -> str:

@@ -190,6 +190,18 @@ class Case:
         """Return the case with other sections of the study, such as ``flare``."""
         return replace(self, study=self.study.model_copy(update=sections))
 
+    def at_observed_brightness(self) -> Self:
+        """Return the case with the amplitude at which the flare has the flux of its file at the telescope."""
+        from mauvecl.host.stars.flare import added_light
+
+        flare, star = self.study.flare, self.source
+        light = added_light(
+            star.wavelength_nm, star.flux_flam, spectrum=flare.light(), band=flare.band, geometry=flare.geometry,
+            photosphere_temperature_k=flare.photosphere_temperature_k,
+        )  # fmt: skip
+        scaled = flare.spectrum.model_copy(update={"as_observed": False})
+        return self.with_sections(flare=flare.model_copy(update={"amplitudes": (1.0 / light.hot,), "spectrum": scaled}))
+
     @cached_property
     def one_frame(self) -> Self:
         """The same case with an exposure of a single frame."""
@@ -243,5 +255,6 @@ def cases(study: Study, *, swept: bool = True) -> list[Case]:
         cell = study.model_copy(update={"sweep": Sweep()})
         for quantity, value in values.items():
             cell = cell.at(quantity, value)
-        found += [Case(cell.model_copy(update={"star": (star,)}), values, loader) for star in cell.star]
+        stars = [Case(cell.model_copy(update={"star": (star,)}), values, loader) for star in cell.star]
+        found += [case.at_observed_brightness() for case in stars] if cell.flare.spectrum.as_observed else stars
     return found

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from mauvecl.host.stars.flare_spectra import FlareSpectrum
 
 #: Keys, other than `file`, that only apply to a spectrum from a file.
-FILE_KEYS = ("quiescent", "wavelength_unit", "flux_unit", "continue_at_k")
+FILE_KEYS = ("quiescent", "wavelength_unit", "flux_unit", "continue_at_k", "as_observed")
 #: Keys that do not apply to a spectrum from a file.
 BLACKBODY_KEYS = ("second_temperature_k", "second_area", "balmer_jump")
 #: Keys that hold paths, relative to the folder of the study file.
@@ -99,13 +99,18 @@ class FlareLight(Section):
         Help("Temperature of a blackbody that continues the flare's file beyond its ends"),
         Flag("--continue-at"),
     ] = None
+    as_observed: Annotated[
+        bool,
+        Help("Take the flare for as bright at the telescope as its file states, in place of amplitudes"),
+        Flag("--as-observed"),
+    ] = False
 
     @model_validator(mode="after")
     def _one_model(self) -> Self:
         given = [key for key in BLACKBODY_KEYS if getattr(self, key) is not None]
         if self.file is not None and given:
             raise InputError(f"a flare's spectrum has file and {given[0]}", "one of them", key="file", value=self.file)
-        own = [key for key in FILE_KEYS if getattr(self, key) is not None]
+        own = [key for key in FILE_KEYS if getattr(self, key)]
         if self.file is None and own:
             raise InputError(
                 f"a flare's spectrum has {own[0]} without a file",

@@ -8,7 +8,7 @@ from pydantic import model_validator
 
 from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Help, Range
+from mauvecl.schema.fields import Flag, Help, Range, Widget
 from mauvecl.schema.physical import Positive, Wavelength
 from mauvecl.schema.section import Section
 
@@ -35,10 +35,27 @@ class MeasureQuestion(Section):
     bands_nm: Annotated[
         tuple[tuple[Wavelength, Wavelength], ...], Help("Wavelength ranges for which the flux is reported")
     ] = ((200.0, 320.0), (200.0, 700.0))
+    skipped_nm: Annotated[
+        tuple[tuple[Wavelength, Wavelength], ...],
+        Help("Wavelengths that fits leave out, from:to", "as in 322:368"),
+        Flag("--skip", kind=list[str], read=parsing.wavelengths),
+        Widget(
+            label="Leave out wavelengths",
+            hint="Ranges in nm that fits do not use, such as 322:368, or 200:250, 322:368.",
+            group="Measurement",
+            unit="nm",
+        ),
+    ] = ()
     snr_per_bin: Annotated[
         Positive | None,
         Help("S/N of bins of frames in which the flares of the study's stare are measured against time"),
         Flag("--snr-per-bin"),
+        Widget(
+            label="S/N of bins",
+            hint="Simulated fits then also measure the flare of a stare of one orbit against time, in bins of frames "
+            "in which it reaches this S/N. Nothing: they do not.",
+            group="Measurement",
+        ),
     ] = None
     joint_fit: Annotated[
         bool,
@@ -46,6 +63,12 @@ class MeasureQuestion(Section):
             "Fit shape, temperature and, if it falls, cooling of the flare to all frames of the study's stare together"
         ),
         Flag("--joint-fit"),
+        Widget(
+            label="Joint fit",
+            hint="Simulated fits then also fit shape and spectrum of the flare to all frames of a stare of one orbit "
+            "together: its peak, half-width, amplitude and temperature.",
+            group="Measurement",
+        ),
     ] = False
 
     @property
@@ -60,9 +83,10 @@ class MeasureQuestion(Section):
 
             for name in self.lines:
                 EmissionLine.named(name)
-        for low, high in self.bands_nm:
-            if not 0 < low < high:
-                raise InputError.of("measure.bands_nm", (low, high), "ascending wavelengths", unit="nm")
+        for key in ("bands_nm", "skipped_nm"):
+            for low, high in getattr(self, key):
+                if not 0 < low < high:
+                    raise InputError.of(f"measure.{key}", (low, high), "ascending wavelengths", unit="nm")
         return self
 
 

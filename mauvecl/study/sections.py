@@ -252,6 +252,17 @@ class Flare(Section):
     ] = None
     spectrum: FlareLight = FlareLight()
 
+    def with_value(self, path: Sequence[str], value: Any) -> Self:
+        """Return a copy with another value; raises InputError for an amplitude of a flare as it was observed."""
+        if path[0] == "amplitudes" and self.spectrum.as_observed:
+            raise InputError(
+                f"amplitude = {value} has no effect on a flare that is as bright as observed",
+                "flare.spectrum.as_observed = false",
+                key="amplitude",
+                value=value,
+            )
+        return super().with_value(path, value)
+
     def light(self, temperature_k: float | None = None) -> FlareSpectrum:
         """Return the spectrum of a flare, by default at the study's temperature."""
         return self.spectrum.at_temperature(self.temperature_k if temperature_k is None else temperature_k)

@@ -230,6 +230,7 @@ class Study(Section):
         ]
         over = f", over {', '.join(swept)}" if swept else ""
         flares = ", ".join(f"{100 * amplitude:g} %" for amplitude in self.flare.amplitudes)
+        flares = "the observed brightness" if self.flare.spectrum.as_observed else flares
         return f"<Study of {', '.join(stars)}; flares of {flares}; {o.exposure_s:g} s on {o.instrument}{over}>"
 
     __str__ = __repr__

@@ -13,7 +13,7 @@ from pydantic.fields import FieldInfo
 from mauvecl.host.stars.catalogue import embedded
 from mauvecl.host.stars.star_names import spectrum_name
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Range, Slider, Unit, Widget, first, found, range_of, unit_of
+from mauvecl.schema.fields import Flag, Range, Slider, Unit, Widget, first, found, range_of, unit_of
 from mauvecl.schema.physical import LineFraction
 from mauvecl.schema.section import fields_of
 from mauvecl.schema.text import shortened
@@ -212,10 +212,19 @@ class Field:
     scale: float = 1.0
 
 
+def _text(value: Any) -> str:
+    """Return the text of a field for a value of its key."""
+    if value is None or value == ():
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
 def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
     """Return the field of a key from its metadata."""
     default = field.get_default()
-    text = "" if default is None else f"{default:g}" if isinstance(default, float) else str(default)
+    text = _text(default)
     unit = first(field, Unit) or Unit("")
     return Field(
         widget.label,
@@ -235,6 +244,12 @@ def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> C
     choices = widget.choices or (get_args(field.annotation) if get_origin(field.annotation) is Literal else ())
     if choices:
         return Choice(choices)
+    if field.annotation is bool:
+        return Choice(("no", "yes"), lambda text: text == "yes")
+    flag = first(field, Flag)
+    if flag is not None and flag.kind == list[str] and flag.read is not None:
+        read = flag.read
+        return lambda text: tuple(read([one for one in text.split(",") if one.strip()], widget.label))
     reach = first(field, Range)
     if reach is None:
         return str
@@ -302,7 +317,16 @@ def _group(name: str) -> tuple[str, ...]:
 ASKED = ("star", *(name for name in _group("") if name != "star"))
 ADVANCED = {
     name: _group(name)
-    for name in ("Detection", "Flare's spectrum", "Detector", "Sky", "Unknown", "Visibility and plan", "Change")
+    for name in (
+        "Detection",
+        "Flare's spectrum",
+        "Measurement",
+        "Detector",
+        "Sky",
+        "Unknown",
+        "Visibility and plan",
+        "Change",
+    )
 }
 #: Fields of the card.
 SOLVED = _group("Limit")

@@ -28,6 +28,8 @@ from mauvecl import (
     fit_cooling,
     measure_along,
 )  # fmt: skip
+from mauvecl.lightcurve.flares.shapes import shape_of
+from mauvecl.lightcurve.stares import cooling_fit
 
 MAUVE = Instrument.load("mauve")
 STEADY = Cooling(9000.0, 9000.0, 1.0)
@@ -218,6 +220,48 @@ def test_joint_fit_of_a_steady_flare_leaves_the_cooling_open() -> None:
     assert found.low[0, 0, 3] < 9000.0 < found.high[0, 0, 3]
 
 
+def noisy_frames(scale: float) -> np.ndarray:
+    """Return frames with the cooling flare times a factor, and normal noise."""
+    rng, x = np.random.default_rng(3), quiet()
+    lit, _ = lit_frames(FALLING, Stare.of(300.0))
+    added = np.array([scale * (one.recorded_dn - x.recorded_dn) for one in lit])
+    return x.recorded_dn + added + np.sqrt(x.variance_dn2) * rng.standard_normal(added.shape)
+
+
+@pytest.mark.parametrize("shape", ["davenport2014", "tovarmendoza2022"])
+def test_derivatives_of_joint_fits_agree_with_differences(shape: str) -> None:
+    nuisances = Nuisances.of(quiet(), {"dark": np.inf, "light": 0.02})
+    stare = Stare.of(300.0, throughput=Sinusoid(0.2, 300.0))
+    data = cooling_fit._data(noisy_frames(1.0), quiet(), model(), nuisances, stare, shape_of(shape), ())
+    theta = np.array([52.3, *np.log([41.0, 1.4, 13_000.0, 0.5, 70.0])])
+    whitening, steps = data.whitening(theta), np.diag([4e-4, *[1e-5] * 5])
+    moved = [(data.residuals(theta + step, whitening), data.residuals(theta - step, whitening)) for step in steps]
+    jacobian = data.jacobian(theta, whitening)
+    for k, (after, before) in enumerate(moved):
+        np.testing.assert_allclose(
+            jacobian[:, k], (after - before) / (2 * steps[k, k]), atol=1e-6 * abs(jacobian).max()
+        )
+    for one in cooling_fit._quantities(data, stare, cooling=True):
+        ends = np.array([[one.value(theta + sign * step, data) for step in steps] for sign in (1, -1)])
+        change = ends if one.place == 0 else np.log(ends)
+        np.testing.assert_allclose(one.slope(theta, data), (change[0] - change[1]) / (2 * np.diag(steps)), atol=1e-6)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("scale", [1.0, 0.1], ids=["bright", "faint"])
+def test_ends_of_joint_fits_agree_with_a_search(scale: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Newton's steps to the ends of intervals, and roots of chi-squared minimised at fixed quantities."""
+    frames = noisy_frames(scale)
+    fast = fit_cooling(frames, quiet(), model(), levels=(0.95,), **START)
+    monkeypatch.setattr(cooling_fit, "_newton_end", lambda *_: None)
+    slow = fit_cooling(frames, quiet(), model(), levels=(0.95,), **START)
+    for one, other in ((fast.low, slow.low), (fast.high, slow.high)):
+        finite = np.isfinite(one[0, 0])
+        np.testing.assert_array_equal(finite, np.isfinite(other[0, 0]))
+        assert finite.sum() >= 9
+        assert np.abs((one - other)[0, 0, finite] / fast.errors[0, finite]).max() < 0.003
+
+
 def test_impossible_joint_fits_raise() -> None:
     frames = np.tile(quiet().recorded_dn, (60, 1))
     with_jump = FlareModel.of(star(), MAUVE, quiet(), jump=True)
@@ -252,3 +296,15 @@ def test_bad_frames_raise() -> None:
             measure_along(frames, quiet(), model(), **how)
     with refused("n_frames", value=10):
         measure_along(one, replace(quiet(), n_frames=10), model())
+
+
+def test_skipped_wavelengths_change_no_fit_along_a_stare() -> None:
+    """Pixels at 300-350 nm hold nothing of the flare: fits without them, in bins and jointly, find it."""
+    lit, _ = lit_frames(STEADY, Stare.of(150.0))
+    nm, gap = quiet().wavelength_nm, (300.0, 350.0)
+    spoiled = np.array([np.where((nm >= gap[0]) & (nm <= gap[1]), 0.0, one.recorded_dn) for one in lit])
+    found = fit_cooling(spoiled, quiet(), model(), cooling=False, levels=(), skipped_nm=[gap], **START)
+    np.testing.assert_allclose(found.estimates[0, :4], [52.0, 40.0, 1.5, 9000.0], rtol=2e-3)
+    along = measure_along(spoiled, quiet(), model(), snr_per_bin=15.0, skipped_nm=[gap])
+    np.testing.assert_allclose(along.found.estimates[:, 0], 9000.0, rtol=2e-3)
+    assert abs(fit_cooling(spoiled, quiet(), model(), cooling=False, levels=(), **START).estimates[0, 3] - 9000) > 500

@@ -1,5 +1,7 @@
 """The great flare of AD Leo (1985) through Mauve: what a blackbody, a Balmer jump and the optical alone make of it.
 
+In Python, and by the command line, which takes the flare for as bright as it was observed.
+
 The spectra end at 444 nm, beyond which a blackbody of 9500 K continues the flare and a library spectrum the star;
 322-368 nm hold the seam of two instruments, a straight line over a gap, and blended Balmer lines, and are left out.
 """
@@ -10,8 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.table import Table
+from commands import ended, run
+from refusals import refused
 
-from mauvecl import Engine, FlareModel, Instrument, ObservedFlare, Source, expect, fit
+from mauvecl import Engine, FlareModel, Instrument, ObservedFlare, Source, Study, expect, fit
 
 DATA = Path(__file__).parent.parent / "data"
 FILES = {912: DATA / "spectra" / "ADLeo_912s.dat", 1497: DATA / "flares" / "ADLeo_1497s.dat"}
@@ -45,6 +50,55 @@ def test_blackbody_is_rejected_and_jump_is_measured(engine: Engine) -> None:
     assert jumps[912][0] > 1.3
     assert jumps[912] == pytest.approx([1.53, 1.68, 1.84], abs=0.05)
     assert jumps[1497][0] < jumps[1497][1] < jumps[1497][2]
+
+
+def ad_leo_words(seconds: int) -> tuple[str | Path, ...]:
+    """Return the command for the flare as it was observed, at the star's own brightness."""
+    star = ("--star", QUIET, "--wavelength-unit", "Angstrom", "--extend", "M3V")
+    flare = ("--flare-file", FILES[seconds], "--flare-quiescent", QUIET, "--flare-wavelength-unit", "Angstrom")
+    return ("measure", *star, *flare, "--continue-at", "9500", "--as-observed", "--no-pictures", "-o", "out")
+
+
+def test_command_line_measures_the_flare(tmp_path: Path) -> None:
+    """200 exposures of 50 s; of the good fits 1 % have p < 0.01, more than 40 % of them once in 1e40.
+
+    The spectra of `fit` are added on another grid, so that intervals agree to a few percent of an error.
+    """
+    words = (*ad_leo_words(912), "--fits", "200")
+    run(*words, "--model", "blackbody", "--model", "balmer", "--skip", "322:368", folder=tmp_path)
+    fits, table = (Table.read(tmp_path / "out" / f"{name}.ecsv") for name in ("fits", "measure"))
+    rejected = dict(zip(fits["model"], fits["rejected"], strict=True))
+    assert rejected["blackbody"] > 0.8
+    assert rejected["balmer"] < 0.5 * rejected["blackbody"]
+    (jump,) = (row for row in table if row["quantity"] == "jump")
+    assert [jump["low_95"], jump["perfect"], jump["high_95"]] == pytest.approx([1.53, 1.68, 1.84], abs=0.05)
+    run(*words, "--model", "blackbody", "--skip", "200:400", "--restart", folder=tmp_path)
+    table = Table.read(tmp_path / "out" / "measure.ecsv")
+    (optical,) = (row for row in table if row["quantity"] == "temperature")
+    assert optical["low_68"] - 100 < 9500.0 < optical["high_68"]
+    assert 8500 < optical["low_95"] < 9500.0 < optical["high_95"] < 10_700
+    # The flux of the file, integrated here.
+    nm, flaring = np.loadtxt(FILES[912], unpack=True, skiprows=2)[:2]
+    quiet_nm, quiet = np.loadtxt(QUIET, unpack=True, skiprows=2)[:2]
+    grid = np.linspace(2000.0, 3200.0, 20_001)
+    added = np.interp(grid, nm, flaring) - np.interp(grid, quiet_nm, quiet)
+    (flux,) = (row for row in table if row["quantity"] == "flux 200-320 nm")
+    assert flux["truth"] == pytest.approx(np.trapezoid(added, grid), rel=0.01)
+
+
+def test_flare_as_observed_has_no_other_amplitude(tmp_path: Path) -> None:
+    """A sweep over amplitudes, and a flare without a file, cannot be as bright as observed."""
+    code, _, told = ended(*ad_leo_words(912), "--sweep", "amplitude=0.1,0.2", folder=tmp_path)
+    assert code == 2
+    assert "amplitude" in told
+    with refused("flare.spectrum.as_observed"):
+        Study().with_settings(["flare.spectrum.as_observed=true"])
+
+
+def test_skipped_wavelengths_ascend() -> None:
+    for wrong in ("[[368, 322]]", "[[322, 322]]"):
+        with refused("measure.skipped_nm"):
+            Study().with_settings([f"measure.skipped_nm={wrong}"])
 
 
 def test_skipped_pixels_are_ignored() -> None:

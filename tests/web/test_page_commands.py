@@ -38,6 +38,7 @@ LINKS = (
     "&signal=paper&instrument=mauve-electrons",
     "?balmer_jump=2.5&lines=Mg+II%3D0.03,+280%3D0.01&see=AU+Mic",
     "?second_temperature_k=30000&second_area=0.1&visits=7",
+    "?joint_fit=yes&snr_per_bin=20&skipped_nm=200:250,322:368",
 )
 
 

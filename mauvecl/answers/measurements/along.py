@@ -99,24 +99,28 @@ def measured_stare(case: Case, engine: Engine | Pool) -> MeasuredStare:
     if asked.snr_per_bin is None:
         return MeasuredStare(*where, None, None, joint)
     try:
-        bins = measure_along(raw, quiet, model, unknown, snr_per_bin=asked.snr_per_bin, stare=stare)
+        bins = measure_along(raw, quiet, model, unknown, snr_per_bin=asked.snr_per_bin, stare=stare,
+                             skipped_nm=asked.skipped_nm)  # fmt: skip
     except InputError as error:
         sentence = f"No flare of {case.label} is measured along the stare: {error}."
         return MeasuredStare(*where, sentence, None, joint)
-    perfect = fit_bins(staring.mean_raw, quiet, model, unknown, stare, bins.first, bins.count)
+    perfect = fit_bins(
+        staring.mean_raw, quiet, model, unknown, stare, bins.first, bins.count, skipped_nm=asked.skipped_nm
+    )
     return MeasuredStare(*where, bins, perfect, joint)
 
 
 def _joint_fit(case: Case, raw: Float, unknown: Nuisances | None) -> JointFit:
     """Fit a blackbody to the one flare of a stare; the search for the best fit starts from the true flare."""
     staring, (event,), model = case.stare_expectation, case.events, model_of(case.one_frame)
-    quiet, stare = staring.quiet, staring.stare
+    quiet, stare, skipped = staring.quiet, staring.stare, case.study.measure.skipped_nm
     found = fit_cooling(
         raw, quiet, model, unknown, peak_s=event.peak_s, half_width_s=event.half_width_s, shape=event.form,
-        cooling=isinstance(event.temperature, Cooling), stare=stare,
+        cooling=isinstance(event.temperature, Cooling), stare=stare, skipped_nm=skipped,
     )  # fmt: skip
     true, fitted = (
-        cooling_course(one, found, raw, quiet, model, stare) for one in (event, cooling_event(found, event.form))
+        cooling_course(one, found, raw, quiet, model, stare, skipped)
+        for one in (event, cooling_event(found, event.form))
     )
     truth = true.values
     if not case.study.flare.is_blackbody:

@@ -13,7 +13,7 @@ from mauvecl.answers.answer import InCell
 from mauvecl.answers.measurements.truth import Truth
 from mauvecl.results.measurements.fit import Forecast, Measurement, fit, forecast
 from mauvecl.results.measurements.flare_model import FlareModel
-from mauvecl.results.measurements.reduction import Reduction, variance_of
+from mauvecl.results.measurements.reduction import Ranges, Reduction, usable_variance
 from mauvecl.results.measurements.two_temperatures import (
     TwoTemperatures,
     fit_two_temperatures,
@@ -45,6 +45,7 @@ class ExpectedMeasurement(InCell):
     quiet: Expectation
     unknown: Nuisances | None
     of_throughput: Float | None  # standard errors by the calibration of the throughput, which exposures share
+    skipped_nm: Ranges  # wavelength ranges that are not used
 
     @property
     def name(self) -> str:
@@ -54,7 +55,10 @@ class ExpectedMeasurement(InCell):
     def forecasts(self, factors: Float, unknown: Nuisances | None) -> list[Forecast]:
         """Return the expected errors for the flare times factors, with unknowns marginalised or all of them known."""
         log_k, linear = self.perfect.log_k[0], self.perfect.amplitudes[0]
-        return [forecast_model(self.quiet, self.fitted, log_k, factor * linear, unknown) for factor in factors]
+        return [
+            forecast_model(self.quiet, self.fitted, log_k, factor * linear, unknown, self.skipped_nm)
+            for factor in factors
+        ]
 
     def region(self, rise: float, n: int = 161) -> tuple[Float, Float, Float]:
         """Return the expected confidence region of temperature and amplitude, with everything else profiled.
@@ -74,7 +78,8 @@ class ExpectedMeasurement(InCell):
         """
         assert isinstance(self.fitted, FlareModel)
         best, linear = self.perfect.log_k[0], self.perfect.amplitudes[0]
-        reduction = Reduction.of(self.fitted, self.quiet, self.fitted.counts(np.exp(best), linear), self.unknown)
+        mean_dn = self.fitted.counts(np.exp(best), linear)
+        reduction = Reduction.of(self.fitted, self.quiet, mean_dn, self.unknown, self.skipped_nm)
         basis, _ = reduction.basis
         mean = linear[0] * reduction.spline(best) + linear[1:] @ reduction.fixed
         rest = mean - (mean @ basis.T) @ basis
@@ -104,21 +109,30 @@ class ExpectedMeasurement(InCell):
 
 
 def fit_model(
-    frames: Float, quiet: Expectation, model: FlareModel | TwoTemperatures, unknown: Nuisances | None
+    frames: Float,
+    quiet: Expectation,
+    model: FlareModel | TwoTemperatures,
+    unknown: Nuisances | None,
+    skipped_nm: Ranges = (),
 ) -> Measurement:
     """Fit a model of one or two temperatures to exposures."""
     if isinstance(model, TwoTemperatures):
-        return fit_two_temperatures(frames, quiet, model.single, unknown)
-    return fit(frames, quiet, model, unknown)
+        return fit_two_temperatures(frames, quiet, model.single, unknown, skipped_nm=skipped_nm)
+    return fit(frames, quiet, model, unknown, skipped_nm=skipped_nm)
 
 
 def forecast_model(
-    quiet: Expectation, model: FlareModel | TwoTemperatures, log_k: Float, linear: Float, unknown: Nuisances | None
+    quiet: Expectation,
+    model: FlareModel | TwoTemperatures,
+    log_k: Float,
+    linear: Float,
+    unknown: Nuisances | None,
+    skipped_nm: Ranges = (),
 ) -> Forecast:
     """Return the errors of a model of one or two temperatures, for parameters of a `Measurement`."""
     if isinstance(model, TwoTemperatures):
-        return forecast_two_temperatures(quiet, model.single, np.exp(log_k), linear, unknown)
-    return forecast(quiet, model, float(np.exp(log_k)), linear, unknown)
+        return forecast_two_temperatures(quiet, model.single, np.exp(log_k), linear, unknown, skipped_nm)
+    return forecast(quiet, model, float(np.exp(log_k)), linear, unknown, skipped_nm=skipped_nm)
 
 
 def model_of(case: Case, *, jump: bool = False, lines: tuple[str, ...] = ()) -> FlareModel:
@@ -160,28 +174,29 @@ def expected_measurements(
 ) -> list[ExpectedMeasurement]:
     """Forecast the measurement of a flare with each model, by default those of `models_of`."""
     quiet, light, unknown = case.quiet, case.study.flare.light(), case.unknowns()
-    band = case.study.flare.band
+    band, skipped = case.study.flare.band, case.study.measure.skipped_nm
     truth = Truth(case.star, case.source, case.flaring(amplitude), light, band, quiet.exposure_s)
     lit = flare.recorded_dn - quiet.recorded_dn
-    snr = matched_filter(quiet, flare, None, lit)[1], matched_filter(quiet, flare, unknown, lit)[1]
+    known_snr, snr = (matched_filter(quiet, flare, one, lit, skipped)[1] for one in (None, unknown))
     calibrated = throughput_cases(case)
     expected = []
     for name, model in (models or models_of(case)).items():
-        perfect = fit_model(flare.recorded_dn, quiet, model, unknown)
+        perfect = fit_model(flare.recorded_dn, quiet, model, unknown, skipped)
         known, ahead = (
-            forecast_model(quiet, model, perfect.log_k[0], perfect.amplitudes[0], u) for u in (None, unknown)
+            forecast_model(quiet, model, perfect.log_k[0], perfect.amplitudes[0], one, skipped)
+            for one in (None, unknown)
         )
         true = np.array([truth.value(quantity) for quantity in model.names])
         of_throughput = None
         if calibrated:
-            of_throughput = _errors_of_throughput(calibrated, amplitude, model, quiet, unknown, perfect)
+            of_throughput = _errors_of_throughput(calibrated, amplitude, model, quiet, unknown, skipped, perfect)
         expected.append(
             ExpectedMeasurement(
                 case.label,
                 case.at,
                 amplitude,
                 name,
-                snr,
+                (known_snr, snr),
                 true,
                 known,
                 ahead,
@@ -190,6 +205,7 @@ def expected_measurements(
                 quiet,
                 unknown,
                 of_throughput,
+                skipped,
             )
         )
     return expected
@@ -201,6 +217,7 @@ def _errors_of_throughput(
     model: FlareModel | TwoTemperatures,
     quiet: Expectation,
     unknown: Nuisances | None,
+    skipped_nm: Ranges,
     perfect: Measurement,
 ) -> Float:
     """Return the standard errors that the throughput's own errors cause, to first order, shape (n_derived,).
@@ -211,18 +228,22 @@ def _errors_of_throughput(
     for case in calibrated:
         (flare,) = case.expect(case.flaring(amplitude))
         exposure = quiet.recorded_dn + flare.recorded_dn - case.quiet.recorded_dn
-        moved.append(fit_model(exposure, quiet, model, unknown).estimates[0] - perfect.estimates[0])
+        moved.append(fit_model(exposure, quiet, model, unknown, skipped_nm).estimates[0] - perfect.estimates[0])
     return np.asarray(np.sqrt(np.sum(np.square(moved), axis=0)))
 
 
 def matched_filter(
-    quiet: Expectation, flare: Expectation, unknown: Nuisances | None, added_dn: Float | None = None
+    quiet: Expectation,
+    flare: Expectation,
+    unknown: Nuisances | None,
+    added_dn: Float | None = None,
+    skipped_nm: Ranges = (),
 ) -> tuple[Float, float]:
     """Return the weights of a matched filter of variance one, and its mean with the flare.
 
     The variance is that of the quiescent star, or of one with some light added.
     """
-    variance, used = variance_of(quiet, added_dn)
+    variance, used = usable_variance(quiet, added_dn, skipped_nm)
     delta = (flare.recorded_dn - quiet.recorded_dn) * used
     weights = np.divide(delta, variance, out=np.zeros_like(delta), where=used)
     if unknown:

@@ -19,7 +19,7 @@ from mauvecl.answers.measurements.along import JOINT_COLUMNS, MeasuredStare, mea
 from mauvecl.answers.measurements.expected import ExpectedMeasurement, expected_measurements, fit_model, matched_filter
 from mauvecl.lightcurve.stares.measured_bins import MeasuredBins
 from mauvecl.results.measurements.fit import LEVELS, Measurement
-from mauvecl.results.measurements.reduction import variance_of
+from mauvecl.results.measurements.reduction import usable_variance
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
@@ -63,7 +63,7 @@ class MeasuredFlare(ExpectedMeasurement):
         mean = self.fitted.counts(np.exp(self.found.log_k[0]), self.found.amplitudes[0])
         if self.unknown is None:
             return mean, np.zeros_like(mean)
-        variance, used = variance_of(self.quiet, mean)
+        variance, used = usable_variance(self.quiet, mean, self.skipped_nm)
         spectra = self.unknown.spectra * used
         weighted = np.divide(spectra, variance, out=np.zeros_like(spectra), where=used)
         information = np.diag(self.unknown.sd**-2.0) + weighted @ spectra.T
@@ -79,6 +79,11 @@ class MeasuredFlare(ExpectedMeasurement):
             "error_known": self.known.errors,
             "error": self.ahead.errors,
             "perfect": self.perfect.estimates[0],
+            **{
+                f"{side}_{100 * level:.0f}": getattr(self.perfect, side)[k, 0]
+                for k, level in enumerate(found.levels)
+                for side in ("low", "high")
+            },
             "median": np.median(found.estimates, axis=0),
             "bias": np.median(found.estimates, axis=0) - truth,
             "scatter": _scatter(found.estimates),
@@ -125,6 +130,10 @@ COLUMNS = (
     Column("error_known", "", "", "standard error in advance, everything known", "error, all known", ".4g"),
     Column("error", "", "", "standard error in advance, unknowns marginalised over", "error", ".4g"),
     Column("perfect", "", "", "estimate from an exposure without noise", "fit without noise", ".4g"),
+    Column("low_68", "", "", "lower end of the 68 % interval of that fit; infinite if there is none"),
+    Column("high_68", "", "", "its upper end"),
+    Column("low_95", "", "", "lower end of the 95 % interval of that fit", "95 % from", number(".4g")),
+    Column("high_95", "", "", "its upper end", "to", number(".4g")),
     Column("median", "", "", "median of the estimates"),
     Column("bias", "", "", "median of the estimates less the truth", "bias", number(".4g")),
     Column("scatter", "", "", "half of the central 68.27 % of the estimates", "scatter", ".4g"),
@@ -315,14 +324,16 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
     study, quiet = case.study, case.quiet
     expected = expected_measurements(case, amplitude, flare)
     models, unknown = [one.fitted for one in expected], expected[0].unknown
-    weights = matched_filter(quiet, flare, unknown)[0]
+    skipped = study.measure.skipped_nm
+    weights = matched_filter(quiet, flare, unknown, skipped_nm=skipped)[0]
 
     def fitted(start: int, count: int) -> Arrays:
         raw = engine.realise(flare, start=start, count=count, seed=study.run.seed, **case.draw_options)
         excess = raw - quiet.recorded_dn
         arrays: Arrays = {"first": excess[0], "detected": excess @ weights >= scipy.stats.norm.isf(study.run.fap)}
         for k, model in enumerate(models):
-            arrays |= {f"{k} {key}": value for key, value in fit_model(raw, quiet, model, unknown).arrays().items()}
+            found = fit_model(raw, quiet, model, unknown, skipped)
+            arrays |= {f"{k} {key}": value for key, value in found.arrays().items()}
         return arrays
 
     checkpoint = engine.checkpoint if isinstance(engine, Pool) else None

@@ -8,10 +8,9 @@ over.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import scipy
@@ -24,10 +23,10 @@ from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.measured_bins import checked_frames, known_strengths, less_known
 from mauvecl.results.measurements.fit import LEVELS, Measurement
 from mauvecl.results.measurements.profile import Profile
-from mauvecl.results.measurements.reduction import Reduction
+from mauvecl.results.measurements.reduction import Ranges, Reduction
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.physical import Duration, Moment, Probability
+from mauvecl.schema.physical import Duration, Moment, Probability, Wavelength
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -47,8 +46,9 @@ REFITS = 3
 REACH = 12.0
 #: Smallest standard error, relative or in s, of a parameter that the frames constrain.
 NO_STEP = 1e-9
-#: Relative step of numerical derivatives.
-DIFFERENCE = 1e-5
+#: Largest number of Newton's steps to the end of an interval, their largest length and that of the last one, relative
+#: to the rise of chi-squared, and the largest condition number of the scaled information.
+NEWTON_STEPS, LONGEST, CONVERGED, WORST_CONDITION = 20, 1.5, 1e-6, 1e10
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +66,10 @@ class _Data:
     gain: Float
     shape: Shape
 
+    def intrinsic(self, values: Float) -> Float:
+        """Return values of the frames that are proportional to the light, before the known losses of it."""
+        return np.asarray(values / np.where(self.light > 0, self.light, 1.0))
+
     @cached_property
     def spread(self) -> scipy.interpolate.CubicSpline:
         """Covariance that a blackbody of amplitude 1 adds, over log temperature."""
@@ -75,44 +79,108 @@ class _Data:
 
     def strengths(self, theta: Float) -> tuple[Float, Float]:
         """Return the amplitude and log temperature of each frame."""
-        peak, (width, amplitude, kelvin, end, fold) = theta[0], np.exp(theta[1:])
-        rise = amplitude * self.light * self.shape.mean_over(self.edges, peak, width)
-        # As that of `Cooling`, within the temperatures of the model.
-        end = min(end, 1.0)
-        cooled = end + (1.0 - end) * np.exp(-np.maximum(self.edges.mean(axis=1) - peak, 0.0) / fold)
-        return rise, np.clip(np.log(kelvin * cooled), self.model.log_k[0], self.model.log_k[-1])
+        rise = np.exp(theta[2]) * self.light * self.shape.mean_over(self.edges, theta[0], np.exp(theta[1]))
+        log_k = theta[3] + np.log(self._cooled(theta)[0])
+        return rise, np.clip(log_k, self.model.log_k[0], self.model.log_k[-1])
 
-    def mean(self, theta: Float) -> Float:
-        """Return the mean sums of the flare, shape (n_frame, n_sum)."""
+    def _cooled(self, theta: Float) -> tuple[Float, Float, float]:
+        """Return temperatures over that at the peak, as of `Cooling`, times since the peak, and the end."""
+        since = np.maximum(self.edges.mean(axis=1) - theta[0], 0.0)
+        end = min(float(np.exp(theta[4])), 1.0)
+        return end + (1.0 - end) * np.exp(-since / np.exp(theta[5])), since, end
+
+    def slopes(self, theta: Float) -> tuple[Float, Float]:
+        """Return the derivatives of `strengths` with respect to the parameters, each of shape (6, n_frame)."""
         rise, log_k = self.strengths(theta)
-        return np.asarray(rise[:, None] * self.reduction.spline(log_k))
+        width, amplitude, fold = np.exp(theta[[1, 2, 5]])
+        tau, span = (self.edges - theta[0]) / width, np.diff(self.edges, axis=1)[:, 0]
+        at, factor = self.shape.at(tau), amplitude * self.light / span
+        of_rise, of_log_k = np.zeros((2, len(PARAMETERS), rise.size))
+        of_rise[0], of_rise[1] = factor * (at[:, 0] - at[:, 1]), rise - factor * width * np.diff(at * tau, axis=1)[:, 0]
+        of_rise[2] = rise
+        cooled, since, end = self._cooled(theta)
+        falling = (cooled - end) / cooled
+        of_log_k[0], of_log_k[3], of_log_k[5] = (since > 0.0) * falling / fold, 1.0, falling * since / fold
+        if theta[4] < 0.0:
+            of_log_k[4] = end / cooled * (1.0 - (cooled - end) / (1.0 - end))
+        inside = (log_k > self.model.log_k[0]) & (log_k < self.model.log_k[-1])
+        return of_rise, of_log_k * inside
 
-    def whitening(self, theta: Float | None) -> tuple[Float, Float]:
-        """Return inverse Cholesky factors of the frames' covariances, and an orthonormal basis of unknown levels."""
+    def whitening(self, theta: Float | None) -> _Whitening:
+        """Return the whitening of residuals for the covariances of a flare, or of frames without one."""
         covariance = self.quiet_covariance
         if theta is not None:
             rise, log_k = self.strengths(theta)
             covariance = covariance + rise[:, None, None] * self.spread(log_k)
         inverse = np.linalg.inv(np.linalg.cholesky(covariance))
         if not len(self.unknown):
-            return inverse, np.zeros((0, self.sums.size))
+            return _Whitening(inverse, np.zeros((0, self.sums.size)), np.zeros(0))
         spectra = np.einsum("tij,uj->tiu", inverse, self.unknown).reshape(self.sums.size, -1)
         # The prior acts as one more datum, which is not among the residuals because its mean is zero.
         scale = np.linalg.cholesky(spectra.T @ spectra + np.diag(self.prior**-2.0))
-        return inverse, np.linalg.solve(scale, spectra.T)
-
-    def residuals(self, theta: Float, whitening: tuple[Float, Float]) -> Float:
-        """Return residuals whose squares add up to chi-squared with the unknown levels marginalised over."""
-        inverse, basis = whitening
-        left = np.einsum("tij,tj->ti", inverse, self.sums - self.mean(theta)).ravel()
-        if not len(basis):
-            return np.asarray(left)
+        basis = np.linalg.solve(scale, spectra.T)
         # I - B^T B = (I - B^T K B)^2, with K from the eigenvalues of B B^T.
         values, vectors = np.linalg.eigh(basis @ basis.T)
         kept = values > 1e-12
         directions = vectors[:, kept].T @ basis / np.sqrt(values[kept])[:, None]
-        shrink = 1.0 - np.sqrt(np.maximum(1.0 - values[kept], 0.0))
-        return np.asarray(left - (shrink * (directions @ left)) @ directions)
+        return _Whitening(inverse, directions, 1.0 - np.sqrt(np.maximum(1.0 - values[kept], 0.0)))
+
+    def residuals(self, theta: Float, whitening: _Whitening) -> Float:
+        """Return residuals whose squares add up to chi-squared with the unknown levels marginalised over."""
+        rise, log_k = self.strengths(theta)
+        return np.asarray(whitening.of((self.sums - rise[:, None] * self.reduction.spline(log_k))[None])[0])
+
+    def jacobian(self, theta: Float, whitening: _Whitening) -> Float:
+        """Return the derivatives of `residuals` with respect to the parameters, shape (n, 6)."""
+        (rise, log_k), (of_rise, of_log_k) = self.strengths(theta), self.slopes(theta)
+        hot, slope = self.reduction.spline(log_k), self.reduction.spline(log_k, 1)
+        return np.asarray(-whitening.of(of_rise[..., None] * hot + (rise * of_log_k)[..., None] * slope).T)
+
+
+@dataclass(frozen=True, eq=False)
+class _Whitening:
+    """Inverse Cholesky factors of the frames' covariances, and how much directions of unknown levels shrink."""
+
+    inverse: Float  # shape (n_frame, n_sum, n_sum)
+    directions: Float  # orthonormal, shape (n_unknown, n_frame n_sum)
+    shrink: Float
+
+    def of(self, values: Float) -> Float:
+        """Return whitened sums, shape (n, n_frame n_sum), of sums (n, n_frame, n_sum)."""
+        plain = np.einsum("tij,ntj->nti", self.inverse, values, optimize=True).reshape(len(values), -1)
+        return np.asarray(plain - (self.shrink * (plain @ self.directions.T)) @ self.directions)
+
+
+@dataclass(frozen=True)
+class _Quantity:
+    """Quantity that a joint fit reports."""
+
+    name: str
+    unit: str
+    place: int  # parameter that is varied to hold the quantity fixed: its own, or the amplitude
+    spline: scipy.interpolate.CubicSpline | None = None  # light per amplitude over log temperature
+    factor: float = 1.0
+
+    def value(self, theta: Float, data: _Data) -> float:
+        """Return the quantity of some parameters."""
+        if self.spline is not None:
+            rise, log_k = data.strengths(theta)
+            return self.factor * float(np.sum(data.intrinsic(rise) * self.spline(log_k)[:, 0]))
+        if self.place == 0:
+            return float(theta[0])
+        # The temperature at the end is relative to that at the peak.
+        return float(np.exp(theta[self.place] + (theta[3] if self.place == 4 else 0.0)))
+
+    def slope(self, theta: Float, data: _Data) -> Float:
+        """Return the derivatives of the quantity's logarithm, or of the peak time, shape (6,)."""
+        if self.spline is None:
+            found = np.zeros(len(PARAMETERS))
+            found[[self.place, 3] if self.place == 4 else self.place] = 1.0
+            return found
+        (rise, log_k), (of_rise, of_log_k) = data.strengths(theta), data.slopes(theta)
+        light, change = self.spline(log_k)[:, 0], self.spline(log_k, 1)[:, 0]
+        total = float(np.sum(data.intrinsic(rise) * light))
+        return np.asarray(data.intrinsic(of_rise * light + rise * of_log_k * change).sum(axis=1) / total)
 
 
 class CoolingCourse(NamedTuple):
@@ -137,6 +205,7 @@ def fit_cooling(
     cooling: bool = True,
     stare: Stare | None = None,
     levels: Sequence[Probability] = LEVELS,
+    skipped_nm: Sequence[tuple[Wavelength, Wavelength]] = (),
 ) -> Measurement:
     """Fit the shape of one flare and a blackbody whose temperature falls to all frames of a stare together.
 
@@ -159,6 +228,8 @@ def fit_cooling(
         Times and known conditions of the frames; frames without gaps and changes by default.
     levels : sequence of float
         Nominal coverage of the intervals, by profile likelihood.
+    skipped_nm : sequence of tuple
+        Wavelength ranges of pixels that are not used.
 
     Returns
     -------
@@ -175,7 +246,7 @@ def fit_cooling(
     if len(model.linear) > 1:
         raise InputError(f"a model of {', '.join(model.linear)}", "a blackbody alone", key="model", value=model.linear)
     raw, stare = checked_frames(frames, quiet, stare)
-    data = _data(raw, quiet, model, nuisances, stare, shape_of(shape))
+    data = _data(raw, quiet, model, nuisances, stare, shape_of(shape), skipped_nm)
     free = np.arange(len(PARAMETERS) if cooling else 4)
     low, high = _limits(model, stare)
     theta = np.clip(_start(data, peak_s, half_width_s, cooling), low, high)
@@ -185,33 +256,34 @@ def fit_cooling(
         whitening = data.whitening(theta)
     theta = _solve(data, whitening, theta, free, low, high)
 
-    def chi2_of(theta: Float) -> float:
-        return float(np.sum(data.residuals(theta, whitening) ** 2))
-
-    best = chi2_of(theta)
-    jacobian = _derivative(lambda x: data.residuals(x, whitening), theta, free)
+    best = float(np.sum(data.residuals(theta, whitening) ** 2))
+    jacobian = data.jacobian(theta, whitening)[:, free]
     covariance = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
     quantities = _quantities(data, stare, cooling)
-    slopes = _derivative(lambda x: np.array([value(x) for _, _, value, _ in quantities]), theta, free)
+    estimates = np.array([one.value(theta, data) for one in quantities])
+    scale = np.array([1.0 if one.place == 0 else value for one, value in zip(quantities, estimates, strict=True)])
+    slopes = scale[:, None] * np.array([one.slope(theta, data) for one in quantities])[:, free]
     spread = slopes @ covariance @ slopes.T
-    estimates = np.array([float(value(theta)) for _, _, value, _ in quantities])
     ends = np.full((2, len(levels), len(quantities)), np.nan)
-    names = [name for name, *_ in quantities]
-    for q, (name, _, value, place) in enumerate(quantities):
-        if name.startswith("energy"):
-            fluence = names.index(name.replace("energy", "fluence"))
+    names = [one.name for one in quantities]
+    for q, one in enumerate(quantities):
+        if one.name.startswith("energy"):
+            fluence = names.index(one.name.replace("energy", "fluence"))
             ends[:, :, q] = estimates[q] / estimates[fluence] * ends[:, :, fluence]
             continue
         for side, sign in enumerate((-1.0, 1.0)):
             for k, level in enumerate(levels):
-                allowed = best + float(scipy.stats.chi2.isf(1.0 - level, 1))
-                step = sign * float(np.sqrt(spread[q, q])) / max(abs(float(value(theta))) if place else 1.0, 1e-300)
-                ends[side, k, q] = _end(data, whitening, theta, free, (low, high), value, place, step, allowed)
+                limit = best + float(scipy.stats.chi2.isf(1.0 - level, 1))
+                end = _newton_end(data, whitening, theta, free, (low, high), one, sign, best, limit)
+                if end is None:
+                    step = sign * float(np.sqrt(spread[q, q])) / max(abs(scale[q]), 1e-300)
+                    end = _end(data, whitening, theta, free, (low, high), one, step, limit)
+                ends[side, k, q] = end
     dof = data.sums.size - free.size - int(np.isinf(data.prior).sum())
     empty = np.full(theta.shape, -np.inf)
     none = float(np.sum(data.residuals(np.where(np.arange(theta.size) == 2, empty, theta), whitening) ** 2))
     return Measurement(
-        tuple(names), tuple(q[1] for q in quantities), (-np.inf,) + (0.0,) * (len(quantities) - 1),
+        tuple(names), tuple(one.unit for one in quantities), (-np.inf,) + (0.0,) * (len(quantities) - 1),
         estimates[None], spread[None], tuple(levels), ends[0][:, None], ends[1][:, None], np.array([best]),
         np.array([float(scipy.stats.chi2.sf(best, dof))]), dof, np.array([np.sqrt(max(none - best, 0.0))]),
         theta[3:4], np.exp(theta[2:3])[None],
@@ -219,16 +291,22 @@ def fit_cooling(
 
 
 def cooling_course(
-    event: Event, found: Measurement, frames: Float, quiet: Expectation, model: FlareModel, stare: Stare
+    event: Event,
+    found: Measurement,
+    frames: Float,
+    quiet: Expectation,
+    model: FlareModel,
+    stare: Stare,
+    skipped_nm: Ranges = (),
 ) -> CoolingCourse:
     """Return what a flare is in the quantities of a fit, and in each frame; parameters as for `fit_cooling`."""
-    data = _data(frames, quiet, model, None, stare, event.form)
+    data = _data(frames, quiet, model, None, stare, event.form, skipped_nm)
     cooling = event.temperature
     if not isinstance(cooling, Cooling):
         cooling = Cooling(cooling, cooling, stare.frame_s)
     logs = np.log([event.half_width_s, event.amplitude, cooling.peak_k, cooling.end_k / cooling.peak_k, cooling.fold_s])
     theta = np.array([event.peak_s, *logs])
-    values = {name: value(theta) for name, _, value, _ in _quantities(data, stare, cooling=True)}
+    values = {one.name: one.value(theta, data) for one in _quantities(data, stare, cooling=True)}
     rise, log_k = data.strengths(theta)
     used = (data.reduction.variance > 0).astype(np.float64)
     return CoolingCourse(
@@ -249,10 +327,16 @@ def cooling_event(found: Measurement, shape: Shape) -> Event:
 
 
 def _data(
-    raw: Float, quiet: Expectation, model: FlareModel, nuisances: Nuisances | None, stare: Stare, shape: Shape
+    raw: Float,
+    quiet: Expectation,
+    model: FlareModel,
+    nuisances: Nuisances | None,
+    stare: Stare,
+    shape: Shape,
+    skipped_nm: Ranges,
 ) -> _Data:
     # The unknowns are parameters of the stare, so the weights of single frames do not remove them.
-    reduction = Reduction.of(model, quiet)
+    reduction = Reduction.of(model, quiet, skipped_nm=skipped_nm)
     weights, strengths = reduction.weights, known_strengths(stare, quiet)
     sums = less_known(raw, quiet, strengths, weights)
     constant, each = Components(quiet, np.zeros((0, weights.shape[1])), weights).sum_cumulants(2)
@@ -288,80 +372,95 @@ def _limits(model: FlareModel, stare: Stare) -> tuple[Float, Float]:
     return low, high
 
 
-def _solve(
-    data: _Data, whitening: tuple[Float, Float], theta: Float, free: NDArray[np.intp], low: Float, high: Float
-) -> Float:
+def _solve(data: _Data, whitening: _Whitening, theta: Float, free: NDArray[np.intp], low: Float, high: Float) -> Float:
     """Return the least-squares parameters; fixed ones are unchanged."""
     scale = np.where(free == 0, np.exp(theta[1]), 1.0)
 
-    def residuals(values: Float) -> Float:
+    def with_free(values: Float) -> Float:
         there = theta.copy()
         there[free] = values
-        return data.residuals(there, whitening)
+        return there
 
-    start = np.clip(theta[free], low[free] + 1e-9, high[free] - 1e-9)
-    found = scipy.optimize.least_squares(residuals, start, bounds=(low[free], high[free]), x_scale=scale)
-    best = theta.copy()
-    best[free] = found.x
-    return best
+    def residuals(values: Float) -> Float:
+        return data.residuals(with_free(values), whitening)
+
+    def jacobian(values: Float) -> Float:
+        return data.jacobian(with_free(values), whitening)[:, free]
+
+    found = scipy.optimize.least_squares(
+        residuals,
+        np.clip(theta[free], low[free] + 1e-9, high[free] - 1e-9),
+        jacobian,
+        bounds=(low[free], high[free]),
+        x_scale=scale,
+    )
+    return with_free(found.x)
 
 
-def _derivative(function: Callable[[Float], Float], theta: Float, free: NDArray[np.intp]) -> Float:
-    """Return the derivatives of a function with respect to the free parameters, shape (n, n_free)."""
-    columns = []
-    for k in free:
-        step = np.zeros(theta.size)
-        step[k] = DIFFERENCE * (np.exp(theta[1]) if k == 0 else 1.0)
-        columns.append((function(theta + step) - function(theta - step)) / (2 * step[k]))
-    return np.column_stack(columns)
-
-
-def _quantities(data: _Data, stare: Stare, cooling: bool) -> list[tuple[str, str, Callable[[Float], float], int]]:
-    """Return for each quantity its name, unit, function of the parameters, and the parameter that sets it."""
-    found: list[tuple[str, str, Callable[[Float], float], int]] = [
-        ("peak time", "s", lambda x: float(x[0]), 0),
-        ("half width", "s", lambda x: float(np.exp(x[1])), 1),
-        ("amplitude", "", lambda x: float(np.exp(x[2])), 2),
-        ("temperature", "K", lambda x: float(np.exp(x[3])), 3),
-    ]
+def _quantities(data: _Data, stare: Stare, cooling: bool) -> list[_Quantity]:
+    """Return what a fit reports."""
+    found = [
+        _Quantity("peak time", "s", 0), _Quantity("half width", "s", 1), _Quantity("amplitude", "", 2),
+        _Quantity("temperature", "K", 3),
+    ]  # fmt: skip
     if cooling:
-        found += [
-            ("end temperature", "K", lambda x: float(np.exp(x[3] + x[4])), 4),
-            ("cooling time", "s", lambda x: float(np.exp(x[5])), 5),
-        ]
+        found += [_Quantity("end temperature", "K", 4), _Quantity("cooling time", "s", 5)]
     for one, spline in zip(data.model.derived, data.model.splines, strict=True):
         kind, _, band = one.name.partition(" ")
-        if kind not in ("flux", "energy") or spline is None:
-            continue
-
-        def total(
-            theta: Float, spline: Any = spline, factor: float = stare.frame_s if kind == "flux" else 1.0
-        ) -> float:
-            rise, log_k = data.strengths(theta)
-            return factor * float(np.sum(rise / np.where(data.light > 0, data.light, 1.0) * spline(log_k)[:, 0]))
-
-        name, unit = (f"fluence {band}", "erg / cm2") if kind == "flux" else (one.name, one.unit)
-        found.append((name, unit, total, 2))
+        if kind == "flux":
+            found.append(_Quantity(f"fluence {band}", "erg / cm2", 2, spline, stare.frame_s))
+        elif kind == "energy":
+            found.append(_Quantity(one.name, one.unit, 2, spline))
     return found
+
+
+def _newton_end(
+    data: _Data,
+    whitening: _Whitening,
+    theta: Float,
+    free: NDArray[np.intp],
+    limits: tuple[Float, Float],
+    quantity: _Quantity,
+    sign: float,
+    best: float,
+    allowed: float,
+) -> float | None:
+    """Return the end of a profile interval on one side, or None if Newton's steps do not find it within the limits.
+
+    Each step goes to where the quantity is extreme on the surface of equal chi-squared, of linearised residuals.
+    """
+    there = theta.copy()
+    for _ in range(NEWTON_STEPS):
+        residuals, jacobian = data.residuals(there, whitening), data.jacobian(there, whitening)[:, free]
+        information, slope = jacobian.T @ jacobian, quantity.slope(there, data)[free]
+        if not np.linalg.cond(information * np.outer(*2 * [np.diag(information) ** -0.5])) < WORST_CONDITION:
+            return None
+        back, along = np.linalg.solve(information, np.column_stack([-(residuals @ jacobian), slope])).T
+        room = allowed - float(residuals @ residuals + residuals @ jacobian @ back)
+        step = back + sign * np.sqrt(max(room, 0.0) / (slope @ along)) * along
+        moved = float(np.sum((jacobian @ step) ** 2)) / (allowed - best)
+        there[free] += step * min(1.0, LONGEST / np.sqrt(moved))
+        if not ((limits[0] <= there) & (there <= limits[1]))[free].all():
+            return None
+        if moved < CONVERGED:
+            return quantity.value(there, data)
+    return None
 
 
 def _end(
     data: _Data,
-    whitening: tuple[Float, Float],
+    whitening: _Whitening,
     theta: Float,
     free: NDArray[np.intp],
     limits: tuple[Float, Float],
-    value: Callable[[Float], float],
-    place: int,
+    quantity: _Quantity,
     step: float,
     allowed: float,
 ) -> float:
-    """Return the end of a profile interval on one side; infinite if chi-squared does not rise that far.
-
-    The parameter `place` holds the quantity fixed: it is the quantity, or the amplitude if that is proportional to it.
-    """
+    """Return the end of a profile interval on one side; infinite if chi-squared does not rise that far."""
+    place = quantity.place
     rest = free[free != place]
-    centre, there = value(theta), theta
+    centre, there = quantity.value(theta, data), theta
 
     def held(log_factor: float, theta: Float) -> Float:
         """Return parameters with a changed quantity: by a difference for the peak, otherwise by a factor."""
@@ -372,7 +471,7 @@ def _end(
         elif place == 4:
             moved[4] = np.log(target) - moved[3]
         else:
-            moved[place] += np.log(target / value(moved))
+            moved[place] += np.log(target / quantity.value(moved, data))
         return moved
 
     @cache  # a root is between values that have different signs, though refits start elsewhere

@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.results.measurements.fit import LEVELS, Measurement, fit
-from mauvecl.results.measurements.reduction import Reduction
+from mauvecl.results.measurements.reduction import Ranges, Reduction
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range
-from mauvecl.schema.physical import Probability
+from mauvecl.schema.physical import Probability, Wavelength
 from mauvecl.schema.tables import Column, table_of
 
 if TYPE_CHECKING:
@@ -115,6 +115,7 @@ def measure_along(
     snr_per_bin: Annotated[float, Range(0, open_low=True)] = 20.0,
     stare: Stare | None = None,
     levels: Sequence[Probability] = LEVELS,
+    skipped_nm: Sequence[tuple[Wavelength, Wavelength]] = (),
 ) -> MeasuredBins:
     """Measure a flare against time, in bins of consecutive frames in which it reaches an S/N.
 
@@ -140,6 +141,8 @@ def measure_along(
         over gaps.
     levels : sequence of float
         Nominal coverage of the intervals.
+    skipped_nm : sequence of tuple
+        Wavelength ranges of pixels that are not used.
 
     Raises
     ------
@@ -149,11 +152,11 @@ def measure_along(
     raw, stare = checked_frames(frames, quiet, stare)
     if not 0.0 < snr_per_bin < np.inf:
         raise InputError.of("snr_per_bin", snr_per_bin, "a number above 0")
-    bins = _bins(raw, quiet, model, nuisances, known_strengths(stare, quiet), stare, snr_per_bin)
+    bins = _bins(raw, quiet, model, nuisances, known_strengths(stare, quiet), stare, snr_per_bin, skipped_nm)
     if not bins:
         raise InputError.of("snr_per_bin", snr_per_bin, "an S/N that a bin of the stare reaches")
     first, end = np.array(bins).T
-    return fit_bins(raw, quiet, model, nuisances, stare, first, end - first, levels)
+    return fit_bins(raw, quiet, model, nuisances, stare, first, end - first, levels, skipped_nm)
 
 
 def checked_frames(frames: ArrayLike, quiet: Expectation, stare: Stare | None) -> tuple[Float, Stare]:
@@ -187,6 +190,7 @@ def fit_bins(
     first: NDArray[np.intp],
     count: NDArray[np.intp],
     levels: Sequence[float] = LEVELS,
+    skipped_nm: Ranges = (),
 ) -> MeasuredBins:
     """Fit bins of frames; parameters as for `measure_along`, with the first frames of bins and their numbers."""
     known, end = known_strengths(stare, quiet), first + count
@@ -204,7 +208,7 @@ def fit_bins(
         )  # fmt: skip
         unknown = None if nuisances is None else replace(nuisances, spectra=n * nuisances.spectra)
         added = np.array([raw[first[k] : end[k]].sum(axis=0) for k in rows])
-        parts.append(fit(added, stacked, model.stacked(n, light), unknown, levels=levels))
+        parts.append(fit(added, stacked, model.stacked(n, light), unknown, levels=levels, skipped_nm=skipped_nm))
     order = np.argsort(np.concatenate(list(alike.values())))
     found = Measurement.joined(parts).rows(order)
     return MeasuredBins(first, count, stare.start_s[first], stare.start_s[end - 1] + stare.frame_s, found)
@@ -230,9 +234,10 @@ def _bins(
     known: Float,
     stare: Stare,
     snr: float,
+    skipped_nm: Ranges,
 ) -> list[tuple[int, int]]:
     """Return first frames and ends of the shortest runs of frames in which a matched filter reaches an S/N."""
-    reduction = Reduction.of(model, quiet, None, nuisances)
+    reduction = Reduction.of(model, quiet, None, nuisances, skipped_nm)
     sums = less_known(raw, quiet, known, reduction.weights)
     total = np.vstack([np.zeros(sums.shape[1]), np.cumsum(sums, axis=0)])
     shapes = reduction.hot[::EVERY] / np.linalg.norm(reduction.hot[::EVERY], axis=1)[:, None]

@@ -208,10 +208,10 @@ def fit(
     >>> [round(float(x), 2) for x in found.estimates[0, :2]]
     [9000.0, 0.5]
     """
-    exposures, left_out = checked_exposures(frames, expectation, levels, skipped_nm)
+    exposures = checked_exposures(frames, expectation, levels)
 
     def reduction_of(added_dn: Float | None) -> Reduction:
-        return Reduction.of(model, expectation, added_dn, nuisances, left_out)
+        return Reduction.of(model, expectation, added_dn, nuisances, skipped_nm)
 
     log_k, linear = _pilot(exposures, model, reduction_of(None))
     parts: list[tuple[NDArray[np.intp], dict[str, Any]]] = []
@@ -236,10 +236,8 @@ def fit(
     return Measurement(model.names, model.units, model.bounds, levels=tuple(levels), dof=int(dof.min()), **joined)
 
 
-def checked_exposures(
-    frames: ArrayLike, expectation: Expectation, levels: Sequence[float], skipped_nm: Sequence[tuple[float, float]]
-) -> tuple[Exposures, NDArray[np.bool_]]:
-    """Return exposures, and the pixels that are not used; raises InputError as `fit` does."""
+def checked_exposures(frames: ArrayLike, expectation: Expectation, levels: Sequence[float]) -> Exposures:
+    """Return exposures; raises InputError as `fit` does."""
     raw = np.atleast_2d(np.asarray(frames))
     if raw.ndim != 2 or not len(raw) or raw.shape[1] != expectation.wavelength_nm.size:
         raise InputError(
@@ -252,11 +250,7 @@ def checked_exposures(
         raise InputError("frames hold undefined values", "finite numbers", key="frames")
     if not levels:
         raise InputError.of("levels", levels, "at least one probability")
-    nm = expectation.wavelength_nm
-    left_out = np.zeros(nm.size, np.bool_)
-    for low, high in skipped_nm:
-        left_out |= (nm >= low) & (nm <= high)
-    return Exposures(raw, expectation.recorded_dn), left_out
+    return Exposures(raw, expectation.recorded_dn)
 
 
 def _pilot(exposures: Exposures, model: FlareModel, reduction: Reduction) -> tuple[Float, Float]:
@@ -399,6 +393,8 @@ def forecast(
     temperature_k: Temperature,
     amplitudes: Sequence[float] | Float,
     nuisances: Nuisances | None = None,
+    *,
+    skipped_nm: Sequence[tuple[Wavelength, Wavelength]] = (),
 ) -> Forecast:
     """Forecast the errors of the measurement of a flare from the Fisher information of one exposure.
 
@@ -411,6 +407,8 @@ def forecast(
         Flare, as for `FlareModel.counts`.
     nuisances : Nuisances, optional
         Unknown amplitudes of known spectra.
+    skipped_nm : sequence of tuple
+        Wavelength ranges of pixels that are not used.
 
     Raises
     ------
@@ -419,7 +417,7 @@ def forecast(
     """
     counts = model.counts(temperature_k, amplitudes)
     log_k, linear = np.array([np.log(temperature_k)]), np.asarray(amplitudes, np.float64)[None]
-    variance, used = usable_variance(expectation, counts)
+    variance, used = usable_variance(expectation, counts, skipped_nm)
     slope = linear[0, 0] * model.hot_spline(log_k[0], 1)
     rows = np.vstack([model.hot_spline(log_k[0]), model.fixed, slope, counts]) * used
     plain = np.divide(rows, variance, out=np.zeros_like(rows), where=used) @ rows.T

@@ -7,7 +7,7 @@ spectra (generalised least squares).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from mauvecl.results.measurements.flare_model import FlareModel
 
 Float = NDArray[np.float64]
+Ranges = Sequence[tuple[float, float]]
 
 #: The spectra of every `EVERY`-th node of the model span the directions.
 EVERY = 4
@@ -98,7 +99,7 @@ class Reduction(MeanSums):
         quiet: Expectation,
         added_dn: Float | None = None,
         nuisances: Nuisances | None = None,
-        left_out: NDArray[np.bool_] | None = None,
+        skipped_nm: Ranges = (),
     ) -> Self:
         """Compute the reduction for exposures with the variance of a given flare.
 
@@ -109,15 +110,15 @@ class Reduction(MeanSums):
         added_dn : ndarray, shape (n_pixel,), optional
             Mean DN of the flare; none by default.
         nuisances : Nuisances, optional
-        left_out : ndarray of bool, shape (n_pixel,), optional
-            Pixels that are not used, in addition to saturated ones.
+        skipped_nm : sequence of tuple
+            Wavelength ranges of pixels that are not used, in addition to saturated ones.
 
         Raises
         ------
         InputError
             If every pixel saturates, or the flare is degenerate with the unknowns.
         """
-        variance, used = usable_variance(quiet, added_dn, left_out)
+        variance, used = usable_variance(quiet, added_dn, skipped_nm)
         inverse = np.divide(1.0, variance, out=np.zeros_like(variance), where=used)
         rows = nuisances.rows(variance, nuisances.spectra * used) if nuisances else np.zeros((0, variance.size))
         spanning = np.vstack([model.hot[::EVERY], model.fixed]) * used
@@ -194,15 +195,23 @@ def variance_of(quiet: Expectation, added_dn: Float | None = None) -> tuple[Floa
 
 
 def usable_variance(
-    quiet: Expectation, added_dn: Float | None = None, left_out: NDArray[np.bool_] | None = None
+    quiet: Expectation, added_dn: Float | None = None, skipped_nm: Ranges = ()
 ) -> tuple[Float, NDArray[np.bool_]]:
-    """Return `variance_of` without some pixels; raises InputError if no pixel remains."""
+    """Return `variance_of` without skipped pixels; raises InputError if no pixel remains."""
     variance, used = variance_of(quiet, added_dn)
-    if left_out is not None:
-        used = used & ~left_out
+    used = used & ~skipped_pixels(quiet, skipped_nm)
     if not used.any():
         raise InputError(f"every pixel of {quiet.name} saturates or is left out", "some that count", key="skipped_nm")
     return np.where(used, variance, 0.0), used
+
+
+def skipped_pixels(quiet: Expectation, skipped_nm: Ranges) -> NDArray[np.bool_]:
+    """Return which pixels lie in wavelength ranges that are not used, shape (n_pixel,)."""
+    nm = quiet.wavelength_nm
+    skipped = np.zeros(nm.size, np.bool_)
+    for low, high in skipped_nm:
+        skipped |= (nm >= low) & (nm <= high)
+    return skipped
 
 
 def check_distinct(kept: Float, whole: Float, nuisances: Nuisances | None) -> None:

@@ -18,7 +18,7 @@ from mauvecl.results.measurements.fit import LEVELS, Forecast, Measurement, chec
 from mauvecl.results.measurements.flare_model import Derived, FlareModel, derived_values
 from mauvecl.results.measurements.nonnegative import BoundedProfile, bounded_intervals
 from mauvecl.results.measurements.profile import BestFit
-from mauvecl.results.measurements.reduction import Reduction
+from mauvecl.results.measurements.reduction import Ranges, Reduction
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import Probability, Wavelength
@@ -104,10 +104,10 @@ def fit_two_temperatures(
     if any(one.ratio is not None for one in model.derived):
         raise InputError("a model with a Balmer jump", "blackbodies, with lines or without", key="model")
     single = fit(frames, expectation, model, nuisances, levels=levels, skipped_nm=skipped_nm)
-    exposures, left_out = checked_exposures(frames, expectation, levels, skipped_nm)
+    exposures = checked_exposures(frames, expectation, levels)
 
     def reduction_of(added_dn: Float | None) -> Reduction:
-        return Reduction.of(model, expectation, added_dn, nuisances, left_out)
+        return Reduction.of(model, expectation, added_dn, nuisances, skipped_nm)
 
     allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
     parts, order, whole = [], [], TwoTemperatures(model)
@@ -135,13 +135,14 @@ def forecast_two_temperatures(
     temperatures_k: Float,
     amplitudes: Float,
     nuisances: Nuisances | None = None,
+    skipped_nm: Ranges = (),
 ) -> Forecast:
     """Return the errors with which a flare of two temperatures will be measured, as `forecast`.
 
     Undefined where one of the blackbodies adds no light.
     """
     whole, log_k, linear = TwoTemperatures(model), np.log(temperatures_k), np.asarray(amplitudes, np.float64)[None]
-    reduction = Reduction.of(model, expectation, whole.counts(temperatures_k, linear[0]), nuisances)
+    reduction = Reduction.of(model, expectation, whole.counts(temperatures_k, linear[0]), nuisances, skipped_nm)
     values = derived_values(with_second(model, float(log_k[1])), log_k[:1], linear)
     values = np.insert(values, -1, temperatures_k[1], axis=1)
     sums = linear[0] @ np.vstack([reduction.spline(log_k), reduction.fixed])

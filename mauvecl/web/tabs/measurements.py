@@ -32,6 +32,8 @@ ASSUMED = {
 RISE_95 = 5.99
 #: Factors on the amplitude at which errors are computed.
 FACTORS = np.geomspace(0.1, 10.0, 9)
+#: Half-widths before and after the peak of a flare in a stare that are shown.
+NEAR = 8.0
 #: Largest number of simulated fits that are shown.
 MOST_DOTS = 500
 
@@ -128,6 +130,49 @@ class Region(Picture):
         return PictureData(text, sources)
 
 
+class Course(Picture):
+    """Temperature along a simulated stare."""
+
+    name, title = "course", "Temperature of the flare along a stare"
+
+    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
+        canvas = Canvas(ink, "time from the start of the stare (s)", "temperature (K)", logs | {"y"})
+        canvas.band("bins", "bins of frames: 95 % interval", "star", alpha=0.3)
+        canvas.dots("estimates", "bins of frames", "star")
+        canvas.line("true", "simulated flare", "total", line_dash="dashed")
+        canvas.line("joint", "joint fit", "flare", line_width=2)
+        return canvas
+
+    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
+        sources: dict[str, Any] = {name: {"x": [], "y": []} for name in ("estimates", "true", "joint")}
+        sources["bins"] = {"x": [], "low": [], "high": []}
+        stares = answers["measure"].stares if "measure" in answers else []
+        if not stares:
+            text = "No stare is measured yet: choose a joint fit or the S/N of bins, and simulate fits."
+            return PictureData(text, sources)
+        (one,), words = stares, []
+        if one.joint is not None:
+            (event,), stare = one.events, one.staring.stare
+            near = np.abs(stare.middle_s - event.peak_s) < NEAR * event.half_width_s
+            for name, course in (("true", one.joint.true), ("joint", one.joint.fitted)):
+                sources[name] = {"x": stare.middle_s[near], "y": course.kelvin[near]}
+            found = one.joint.found
+            each = zip(found.names[:4], found.units, found.estimates[0], found.errors[0], strict=False)
+            words += [f"{name} {short(best)} +- {short(error)} {unit}".strip() for name, unit, best, error in each]
+        if isinstance(one.drawn, str):
+            words.append(one.drawn)
+        elif one.drawn is not None:
+            bins = one.drawn
+            x, kelvin = (bins.start_s + bins.end_s) / 2, bins.found.estimates[:, 0]
+            ends = [
+                np.where(np.isfinite(end), end, kelvin) for end in (bins.found.low[-1, :, 0], bins.found.high[-1, :, 0])
+            ]
+            sources["estimates"] = {"x": x, "y": kelvin}
+            sources["bins"] = dict(zip(("x", "low", "high"), (x, *ends), strict=True))
+            words.append(f"{x.size} bins of frames")
+        return PictureData(f"One simulated stare: {'; '.join(words)}.", sources)
+
+
 class Measurement(Tab):
     """Measurement of the flare's spectrum."""
 
@@ -136,7 +181,7 @@ class Measurement(Tab):
         "What is measured of the flare once it is detected: its temperature, size and light, with errors in closed "
         "form; simulated fits count how often their intervals hold the truth."
     )
-    pictures = (Errors(), Region())
+    pictures = (Errors(), Region(), Course())
     simulations = {"measure": "Simulate fits"}  # noqa: RUF012
     files = {"measure": "measure", "fits": "measure"}  # noqa: RUF012
 
