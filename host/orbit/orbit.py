@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -104,9 +104,11 @@ class Orbit:
         return []
 
     def track(self, times: TimeGrid) -> Track:
-        """Propagate the orbit to the times of a plan; raises InputError if SGP4 fails at one of them."""
-        midnight, days = times.julian
-        return Track(times, *self.states(midnight, days, self.resolved(times)))
+        """Propagate the orbit to the times of a plan; raises InputError if SGP4 fails at one of them.
+
+        The last track is kept, since a year of minutes takes a second and a hundred MB.
+        """
+        return _track(self, times)
 
     def states(
         self, midnight: NDArray[np.float64], days: NDArray[np.float64], kind: Literal["tle", "mean"]
@@ -146,6 +148,12 @@ class Orbit:
         return circular(e.axis_km, e.satellite.inclo, node, along)
 
 
+@lru_cache(maxsize=1)
+def _track(orbit: Orbit, times: TimeGrid) -> Track:
+    midnight, days = times.julian
+    return Track(orbit, times, *orbit.states(midnight, days, orbit.resolved(times)))
+
+
 def circular(
     axis_km: float, inclination_rad: float, node_rad: NDArray[np.float64] | float, along_rad: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -166,6 +174,7 @@ def circular(
 class Track:
     """The satellite's positions at the times of a plan."""
 
+    orbit: Orbit
     times: TimeGrid
     # Position and velocity in SGP4's frame (true equator, mean equinox of date), shape (n, 3).
     of_date_km: NDArray[np.float64]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,8 +13,9 @@ from . import constraints
 from .constraints import Flags
 from .earth import Vectors
 from .observing_limits import Limits
-from .orbit import Track
+from .orbit import Orbit, Track
 from .radiation import proton_map
+from .time_grid import TimeGrid
 
 #: A limit as a function of a slice of steps that returns which targets are allowed, shape (steps or 1, k or 1).
 Rule = Callable[[slice], Flags]
@@ -38,9 +39,14 @@ class Windows:
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """Visibility of targets at the times of a plan."""
+    """Visibility of targets at the times of a plan.
 
-    track: Track
+    The positions of a year take a hundred times the memory of what is seen: they are computed again where they are
+    needed, so that answers can be kept.
+    """
+
+    orbit: Orbit
+    grid: TimeGrid
     target: Vectors  # unit vectors, shape (k, 3)
     limits: Limits
     seen: Flags  # shape (n, k), without windows that are too short
@@ -62,7 +68,13 @@ class Visibility:
             kept[name] = count / n
         if limits.shortest_s > 0:
             _drop_short(seen, track.times.step_s, limits.shortest_s)
-        return cls(track, target, limits, seen, kept)
+        # The track's own grid holds its times as arrays.
+        return cls(track.orbit, replace(track.times), target, limits, seen, kept)
+
+    @property
+    def track(self) -> Track:
+        """Positions at the times of the plan."""
+        return self.orbit.track(self.grid)
 
     @cached_property
     def shadow(self) -> Flags:

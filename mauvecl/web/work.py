@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import threading
 import time
 from collections.abc import Callable
@@ -46,6 +47,14 @@ def _engine(progress: Callable[[int, int], None]) -> Engine:
     return engine
 
 
+def release_memory() -> None:
+    """Free what simulations leave: arrays in reference cycles, which Python finds late, and pages that malloc keeps."""
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+
+
 @dataclass(eq=False)
 class Job:
     """Simulation for a visitor.
@@ -70,6 +79,12 @@ class Job:
         self.future: Future[Any] = _threads.submit(self._run)
 
     def _run(self) -> Any:
+        try:
+            return self._run_cancellable()
+        finally:
+            release_memory()
+
+    def _run_cancellable(self) -> Any:
         if self.drawing:
             return self._asked()
         with self._lock:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import bz2
 import contextlib
+import gc
 import gzip
 import io
 import json
@@ -16,6 +17,8 @@ import resource
 import socket
 import tempfile
 import threading
+import types
+import weakref
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -38,6 +41,7 @@ from mauvecl.cli.app import app
 from mauvecl.host.stars import catalogue
 from mauvecl.noise.scene import prepare
 from mauvecl.results.requests.hypotheses import Hypotheses
+from mauvecl.runs.pool import LocalWorkers, Pool
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.study.study import Study
@@ -956,3 +960,45 @@ def test_tab_of_a_verb_follows_from_its_row() -> None:
     assert set(headings) <= set(shown)
     assert len(cells) == len(all_cells) == 2
     assert made.rows(None, {}) == []  # type: ignore[arg-type]
+
+
+# Memory
+
+
+def arrays_of(thing: object) -> int:
+    """Return the bytes of all arrays that an object keeps alive, modules and classes left out."""
+    seen, waiting, total = {id(thing)}, [thing], 0
+    while waiting:
+        one = waiting.pop()
+        if isinstance(one, np.ndarray) and one.base is None:
+            total += one.nbytes
+        for other in gc.get_referents(one):
+            if id(other) not in seen and not isinstance(other, (type, types.ModuleType, types.FunctionType)):
+                seen.add(id(other))
+                waiting.append(other)
+    return total
+
+
+@pytest.mark.parametrize("kind", ["visible", "plan"])
+def test_kept_answer_is_small(kind: str) -> None:
+    """The positions of a year, 110 MB, once stayed with every plan that a visitor's connection kept."""
+    state = State()
+    state.enter({"see": "AU Mic", "star": "M3V"})
+    with tempfile.TemporaryDirectory() as folder:
+        study = ClosedForms.of(state.question(), Path(folder)).study
+        answer = visitor.SIMULATIONS[kind](study, Pool(LocalWorkers([None])))[kind]
+    assert arrays_of(answer) < 20e6
+
+
+def test_cached_curves_release_their_question() -> None:
+    """Caches of the limit keep curves, not the questions they were computed from."""
+    state = State()
+    state.enter({"fap": "0.0123"})
+    with tempfile.TemporaryDirectory() as folder:
+        closed = ClosedForms.of(state.question(), Path(folder))
+    drawn = limit.Curve().drawn(closed, {}), limit.Map().drawn(closed, {})
+    left = weakref.ref(closed)
+    del closed
+    gc.collect()
+    assert left() is None
+    assert all(one.sources for one in drawn)

@@ -47,7 +47,14 @@ class _Kept:
     """Question identified by the values on which its map or curve depends."""
 
     def __init__(self, closed: ClosedForms, *more: float) -> None:
-        self.closed, self.key = closed, (*_key(closed), *more)
+        self._closed: ClosedForms | None = closed
+        self.key = (*_key(closed), *more)
+
+    def take(self) -> ClosedForms:
+        """Return the closed forms once: a key that a cache keeps must not keep them, which have tens of MB."""
+        closed, self._closed = self._closed, None
+        assert closed is not None
+        return closed
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Kept) and self.key == other.key
@@ -65,8 +72,10 @@ def probits(p: Float) -> Float:
 def _curve(kept: _Kept) -> tuple[Float, Float]:
     """Return magnitudes and probabilities, with more points where these change."""
 
+    closed = kept.take()
+
     def exact(magnitudes: Float) -> list[float]:
-        each = (odds(kept.closed, magnitude, np.ones(1)) for magnitude in magnitudes)
+        each = (odds(closed, magnitude, np.ones(1)) for magnitude in magnitudes)
         return [one[0].probability if one else 0.0 for one in each]
 
     x = np.linspace(*MAGNITUDES, FIRST)
@@ -89,13 +98,14 @@ def _map(kept: _Kept) -> tuple[Float, Float, Float]:
     statistic and of its spread, the threshold and the skewness. A gamma distribution of these moments (Pearson's type
     III) is within 0.05 of the closed forms where they are steepest.
     """
+    closed = kept.take()
     (columns, rows), (low, high) = STEPS, np.log10(PERCENTS)
     x, y = np.linspace(*MAGNITUDES, columns), np.linspace(low, high, rows)
     # A saturated star has no detectable flare.
     known = np.zeros((4, rows, columns))
     known[0], known[2] = -30.0, 3.0
     for i, magnitude in enumerate(x):
-        for j, one in enumerate(odds(kept.closed, magnitude, 10**y / kept.closed.question.amplitude_percent)):
+        for j, one in enumerate(odds(closed, magnitude, 10**y / closed.question.amplitude_percent)):
             unit, seen = one.null.std, one.flaring
             part, cut = max(seen.mean - one.null.mean, 1e-9 * unit) / unit, (one.threshold - one.null.mean) / unit
             known[:, j, i] = np.log(part), np.log(seen.std / unit), cut, seen.third / seen.std**3
