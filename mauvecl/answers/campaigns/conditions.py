@@ -38,11 +38,11 @@ class OrbitConditions:
     hits_per_cm2_s: Float  # shape (n_time,)
 
     @classmethod
-    def along(cls, track: Track, thermal: Thermal | None = None, particles: Particles | None = None) -> OrbitConditions:
-        """Compute the conditions along an orbit, by default with the assumed models."""
+    def along(cls, track: Track) -> OrbitConditions:
+        """Compute the conditions along an orbit with the assumed models."""
         light = sunlight(track.position_km, track.bodies.sun, track.bodies.sun_km)
-        temperature = (thermal or Thermal()).temperature_c(light, track.times.step_s)
-        return cls(temperature, (particles or Particles()).rate_per_cm2_s(track))
+        temperature = Thermal().temperature_c(light, track.times.step_s)
+        return cls(temperature, Particles().rate_per_cm2_s(track))
 
     def of(self, visibility: Visibility, k: int, orbit_s: float) -> Conditions | None:
         """Return the conditions of target `k`, or None if it is never visible."""

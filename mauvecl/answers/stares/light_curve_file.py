@@ -19,17 +19,27 @@ if TYPE_CHECKING:
     from astropy.io import fits
 
     from mauvecl.answers.stares.star_stare import StarStare
-    from mauvecl.study.study import Study
+    from mauvecl.study.sections import SkyLight
 
 #: Start of a stare whose study names no time: 2026-01-01, MJD. Any would do.
 NO_TIME_MJD = 61_041
 
 
-def light_curve_file(study: Study, one: StarStare) -> bytes:
-    """Return the FITS file of a star in a cell of a study's sweep."""
+def light_curve_file(one: StarStare, sky: SkyLight, *, seed: int, number: int) -> bytes:
+    """Return the FITS file of a star's stare.
+
+    Parameters
+    ----------
+    one : StarStare
+    sky : SkyLight
+        The study's section with position and time.
+    seed : int
+    number : int
+        Number of the stare.
+    """
     from astropy.io import fits
 
-    when = study.sky.time
+    when = sky.time
     first, comment = (NO_TIME_MJD, "arbitrary: no time was named") if when is None else (_mjd(when), "start of stare")
     primary = fits.PrimaryHDU()
     named: tuple[tuple[str, str | float, str], ...] = (
@@ -38,14 +48,14 @@ def light_curve_file(study: Study, one: StarStare) -> bytes:
         ("INSTRUME", one.staring.quiet.instrument, ""),
         ("CCD-TEMP", one.staring.quiet.conditions["temperature_c"], "[Celsius] detector, where nothing heats it"),
         ("CREATOR", f"mauvecl {VERSION}", ""),
-        ("SEED", str(study.run.seed), "of the draws"),
-        ("STARENO", study.stare.number, "number of the stare"),
+        ("SEED", str(seed), "of the draws"),
+        ("STARENO", number, "number of the stare"),
     )
     for key, value, text in named:
         primary.header[key] = (value, text)
-    if study.sky.target is not None:
+    if sky.target is not None:
         with offline():
-            place = parse_position(study.sky.target).icrs
+            place = parse_position(sky.target).icrs
         primary.header["RADESYS"] = "ICRS"
         primary.header["RA_OBJ"], primary.header["DEC_OBJ"] = (place.ra.deg, "[deg]"), (place.dec.deg, "[deg]")
     hdus = fits.HDUList([primary, _table(one), _intervals(one), *_spectra(one)])

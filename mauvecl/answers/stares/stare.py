@@ -284,8 +284,9 @@ class StareAnswer(Answer):
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:
         """A FITS file of each star and cell: light curve, good time intervals, dynamic spectrum."""
-        stares = enumerate(self.stares, 1)
-        return {f"light-curve-{n}.fits": partial(light_curve_file, self.study, one) for n, one in stares}
+        study = self.study
+        of = partial(light_curve_file, sky=study.sky, seed=study.run.seed, number=study.stare.number)
+        return {f"light-curve-{n}.fits": partial(of, one) for n, one in enumerate(self.stares, 1)}
 
     @property
     def inputs(self) -> list[Expectation]:
