@@ -90,6 +90,11 @@ def read_bytes(path: Path, what: str) -> bytes:
     return content
 
 
+def packed(start: bytes) -> bool:
+    """Return whether content is compressed by gzip, bzip2 or xz, by its first bytes."""
+    return start.startswith((b"\x1f\x8b", b"BZh", b"\xfd7zXZ\x00"))
+
+
 def unpacked(content: bytes, what: str) -> bytes:
     """Unpack content that is compressed by gzip, bzip2 or xz; return other content unchanged.
 

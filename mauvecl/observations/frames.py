@@ -152,6 +152,8 @@ class Frames:
         if not cadence > 0 or (step < MIN_STEP * cadence).any():
             row = int(np.argmin(step))
             least = f"frames that are at least {MIN_STEP:g} of the median step of {cadence:g} s apart"
+            if not cadence > 0:
+                least = "a time of its own for each frame"
             raise _bad(name, "time", f"{step[row]:g} s from one frame to the next", least)
         if exposure is None:
             exposure = np.full(n, cadence)

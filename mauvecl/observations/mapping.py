@@ -8,6 +8,7 @@ from typing import Literal, Self
 from pydantic import model_validator
 
 from mauvecl.host.files.parsing import read_text, toml
+from mauvecl.observations.time_system import SCALES, scale_of
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import Exposure
 from mauvecl.schema.records import Record
@@ -94,6 +95,12 @@ class FrameMapping(Record):
     table: str | None = None
     files: str | None = None
     name: str | None = None
+
+    @model_validator(mode="after")
+    def _known_scale(self) -> Self:
+        if self.scale and scale_of(self.scale) not in SCALES.values():
+            raise InputError.of("scale", self.scale, f"one of {', '.join(sorted(set(SCALES.values())))}")
+        return self
 
     @model_validator(mode="after")
     def _one_exposure(self) -> Self:

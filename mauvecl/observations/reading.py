@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.files.parsing import parsing
-from mauvecl.host.files.size_limits import limit_bytes, open_regular, read_bytes, unpacked
+from mauvecl.host.files.size_limits import limit_bytes, open_regular, packed, read_bytes, unpacked
 from mauvecl.host.files.text_table import text_table
 from mauvecl.host.spectra.air import vacuum_from_air
 from mauvecl.host.spectra.fits_files import check_sums
@@ -22,6 +22,7 @@ from mauvecl.host.spectra.text import text_of
 from mauvecl.observations.fits_frames import FitsFile, open_fits
 from mauvecl.observations.folder_frames import FolderFile, keywords_of
 from mauvecl.observations.frames import Frames
+from mauvecl.observations.large_tables import LARGE, open_large
 from mauvecl.observations.long_tables import spectra_of_rows
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.observations.reduction import Light, PixelStatistics, weighted_sums, whole_or_reduced
@@ -40,14 +41,14 @@ FORMATS = "FITS, HDF5, ECSV, CSV, a Zarr store or a folder of spectra"
 #: of lightkurve's and AltaiPony's tables.
 KNOWN = {
     "time": ("time",),
-    "flux": ("pdcsap_flux", "flux", "sap_flux"),
-    "error": ("pdcsap_flux_err", "flux_err", "sap_flux_err", "flux_error", "error"),
+    "flux": ("flux", "pdcsap_flux", "sap_flux"),
     "quality": ("quality", "sap_quality"),
     "temperature": ("temperature",),
 }
 #: Part of a frame that times refer to.
 PARTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
 SIGNATURES = {b"SIMPLE  =": "FITS", b"\x89HDF\r\n": "HDF5"}
+ECSV = b"# %ECSV"
 
 
 @validated
@@ -202,6 +203,13 @@ def _opened(path: Path, what: str, name: str | None, mapping: FrameMapping | Non
         raw.seek(0)
         file: IO[bytes] = raw
         content: bytes | None = None
+        commas = ".csv" in path.suffixes[-2:]
+        if (commas or start.startswith(ECSV)) and not packed(start) and raw.seek(0, io.SEEK_END) > LARGE:
+            raw.seek(0)
+            with open_large(raw, what, commas, FORMATS) as table:
+                yield table
+            return
+        raw.seek(0)
         if not any(start.startswith(mark) for mark in SIGNATURES):
             content = unpacked(read_bytes(path, "file"), what)
             start, file = content[:16], io.BytesIO(content)
@@ -224,9 +232,9 @@ def _opened(path: Path, what: str, name: str | None, mapping: FrameMapping | Non
                 raise error.within(what) from error
             if not text.strip():
                 raise InputError(f"{what} is empty", FORMATS, key="file")
-            table = TableFile(text_table(text, what, ".csv" in path.suffixes[-2:], FORMATS), what)
-            table.header |= keywords_of([line for line in text.splitlines() if line[:1] in "#%!;"])
-            yield _filled(table)
+            small = TableFile(text_table(text, what, commas, FORMATS), what)
+            small.header |= keywords_of([line for line in text.splitlines() if line[:1] in "#%!;"])
+            yield _filled(small)
 
 
 def _filled(file: FrameFile) -> FrameFile:
@@ -252,6 +260,9 @@ def _recognised(file: FrameFile) -> FrameMapping:
     """Return the mapping of a file whose columns have known names."""
     lower = {name.lower(): name for name in file.names}
     columns = {key: next((lower[n] for n in names if n in lower), None) for key, names in KNOWN.items()}
+    flux = (columns["flux"] or "").lower()
+    # Errors of another flux would be wrong ones.
+    columns["error"] = next((lower[n] for n in (f"{flux}_err", f"{flux}_error", "error") if n in lower), None)
     if columns["time"] is None or columns["flux"] is None:
         raise InputError(
             f"{file.what} has the columns {shortened(', '.join(file.names), 300)}",

@@ -11,7 +11,8 @@ from astropy.table import Table
 
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.mapping import FrameMapping
-from mauvecl.observations.reading import read_frames
+from mauvecl.observations.reading import frames_of, read_frames
+from tests.refusals import refused
 
 RNG = np.random.default_rng(29)
 TIME = np.arange(100) * 20.0
@@ -83,3 +84,20 @@ def test_light_curves_of_tess_and_kepler_need_no_mapping(tmp_path: Path) -> None
     assert frames.reference_mjd == pytest.approx(58_499.5)
     np.testing.assert_allclose(frames.flux, FLUX, rtol=1e-6)
     assert np.flatnonzero(frames.faults).tolist() == [9]
+
+
+def test_the_errors_are_those_of_the_chosen_flux() -> None:
+    """A light curve that lightkurve exports has its own flux next to those of the mission."""
+    ones = np.ones(30)
+    columns = {"time": np.arange(30.0), "pdcsap_flux": 2 * ones, "pdcsap_flux_err": 3 * ones, "flux": ones}
+    frames = frames_of(Table(columns, units={"time": "s"}))
+    assert frames.flux.tolist() == ones.tolist()
+    assert frames.error is None
+    frames = frames_of(Table({name: columns[name] for name in columns if name != "flux"}, units={"time": "s"}))
+    assert frames.error is not None
+    assert (frames.flux[0], frames.error[0]) == (2.0, 3.0)
+
+
+def test_an_unknown_time_scale_of_a_mapping_is_refused() -> None:
+    with refused("scale", "martian"):
+        FrameMapping(time="time", flux="flux", scale="martian")

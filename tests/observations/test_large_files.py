@@ -12,7 +12,9 @@ import pytest
 from astropy.io import fits
 from layouts import LAYOUTS, Truth
 
+from mauvecl.observations.mapping import FrameMapping
 from mauvecl.observations.reading import read_frames, reduce_frames
+from mauvecl.schema.errors import InputError
 
 FRAMES, PIXELS = 65_536, 1024
 #: The address space may grow by this while a file of 256 MiB is read.
@@ -23,6 +25,7 @@ CHILD = """
 import resource, sys
 import astropy.io.fits, astropy.table, astropy.time, scipy.special
 import numpy as np
+from mauvecl.observations.mapping import FrameMapping
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.observations.reading import read_frames, reduce_frames
 pages = int(open("/proc/self/statm").read().split()[0])
@@ -130,3 +133,84 @@ def test_pieces_give_what_the_whole_gives(tmp_path: Path, monkeypatch: pytest.Mo
     np.testing.assert_allclose(pixels.scatter[6:], np.sqrt(np.nanmean(steps[:, 6:] ** 2, axis=0) / 2))
     assert pixels.stated is not None
     np.testing.assert_allclose(pixels.stated[6:], np.sqrt((np.delete(truth.error, 7, axis=0)[:, 6:] ** 2).mean(axis=0)))
+
+
+CSV_CHILD = """
+import resource, sys
+import astropy.table, astropy.time, scipy.special
+import numpy as np
+from mauvecl.observations.mapping import FrameMapping
+from mauvecl.observations.reading import read_frames
+how = dict(time="time", flux="flux_*", wavelength="names", wavelength_unit="nm")
+read_frames({small!r}, FrameMapping(time_unit="s", **how))
+pages = int(open("/proc/self/statm").read().split()[0])
+limit = pages * resource.getpagesize() + {margin} * 2**20
+resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+frames = read_frames({path!r}, FrameMapping(**how))
+np.savez({out!r}, white=frames.flux, time=frames.time_s)
+"""
+
+
+def _csv(path: Path, n: int) -> None:
+    """Write a table with a date and 512 columns of light in each row."""
+    start = np.datetime64("2026-03-01T00:00:00")
+    with path.open("w") as file:
+        file.write(",".join(["time", *(f"flux_{200 + k}" for k in range(512))]) + "\n")
+        for row in range(n):
+            light = ",".join(map(str, (PATTERN[row] + np.arange(512)).tolist()))
+            file.write(f"{start + np.timedelta64(5 * row, 's')},{light}\n")
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs the size of a process as Linux states it")
+def test_a_csv_table_larger_than_memory_is_read_in_pieces(tmp_path: Path) -> None:
+    n, margin = 36_000, 64
+    path, small, out = tmp_path / "large.csv", tmp_path / "small.csv", tmp_path / "out.npz"
+    _csv(path, n)
+    small.write_text("time,flux_200\n" + "\n".join(f"{k},1" for k in range(30)) + "\n")
+    assert path.stat().st_size > margin * 2**20
+    code = CSV_CHILD.format(margin=margin, path=str(path), small=str(small), out=str(out))
+    limits = {"MAUVECL_LARGEST_CONTENT_MIB": "16", "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | limits, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    found = np.load(out)
+    np.testing.assert_allclose(found["white"], 512 * PATTERN[:n] + np.arange(512).sum())
+    np.testing.assert_allclose(found["time"], np.arange(n) * 5.0, atol=1e-3)
+
+
+CELLS = [f"{k},{1000 + k % 7},{'' if k == 33 else 5}" for k in range(60)]
+TABLES = {
+    "plain": ["time,flux,error", *CELLS],
+    "names in a comment": ["# OBJECT = GJ 65", "# time,flux,error", *CELLS],
+    "semicolons": ["time;flux;error", *(row.replace(",", ";") for row in CELLS)],
+    "tabs": ["time\tflux\terror", *(row.replace(",", "\t") for row in CELLS)],
+    "dates": ["time,flux,error", *(f"2026-03-01T00:{k:02d}:00,{1000 + k % 7},5" for k in range(60))],
+    "text among numbers": ["time,flux,error", *CELLS[:-5], "55,bad,5", *CELLS[-4:]],
+    "short row": ["time,flux,error", *CELLS[:-5], "55,1000", *CELLS[-4:]],
+    "long row": ["time,flux,error", *CELLS[:-5], "55,1000,5,6", *CELLS[-4:]],
+    "decimal commas": ["time;flux;error", *(f"{k},5;1000,0;5" for k in range(60))],
+    "no rows": ["time,flux,error"],
+}
+REFUSED = {"text among numbers": "in row 56", "short row": "2 cells in row 56", "long row": "4 cells in row 56",
+           "decimal commas": "'0,5' in row 1", "no rows": "has no rows"}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_tables_in_pieces_are_those_read_whole(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("\n".join(TABLES[name]) + "\n")
+    mapping = FrameMapping(time="time", time_unit=None if name == "dates" else "s", flux="flux", error="error")
+    for large, piece in ((2**40, 2**20), (0, 200)):
+        monkeypatch.setattr("mauvecl.observations.reading.LARGE", large)
+        monkeypatch.setattr("mauvecl.observations.large_tables.PIECE", piece)
+        if name in REFUSED:
+            with pytest.raises(InputError, match=REFUSED[name]):
+                read_frames(path, mapping)
+            continue
+        frames = read_frames(path, mapping)
+        assert frames.flux.tolist() == [1000 + k % 7 for k in range(60)]
+        assert frames.name == ("GJ 65" if "comment" in name else "table")
+        assert frames.error is not None
+        assert np.isnan(frames.error).sum() == (name != "dates")
