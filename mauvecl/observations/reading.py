@@ -166,7 +166,7 @@ def reduce_frames(
 def _frame_file(
     path: str | Path, mapping: FrameMapping | str | Path | None
 ) -> Iterator[tuple[FrameFile, FrameMapping, str]]:
-    """Open what a path names, and return where its quantities are and its name without its ending."""
+    """Open a file, folder or store, and return its quantities and its name without extension."""
     place, words = without_columns(path)
     given = FrameMapping.read(mapping) if isinstance(mapping, str | Path) else mapping
     name = words[0] if words else None if given is None or given.hdu is None else str(given.hdu)

@@ -63,7 +63,7 @@ def _calendars(plt: Any, answer: VisibleAnswer) -> Any:
 
 
 def _rows(plt: Any, answer: VisibleAnswer) -> Any:
-    """Plot targets down and days across."""
+    """Plot targets as rows and days as columns."""
     n = len(answer.targets)
     figure, axis = plt.subplots(figsize=(7.4, min(0.16 * n + 1.4, 20.0)))
     hours = np.array([answer.visibility.by_day(k) for k in range(n)])

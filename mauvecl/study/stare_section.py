@@ -123,7 +123,7 @@ class StareQuestion(Section):
 
 
 class EventChoice(Section):
-    """A flare as a study gives it: by one of several sizes, and with the study's values where it has none of its own.
+    """A flare of a study, with one of several measures of size; other values are the study's by default.
 
     At most one of `amplitude`, `peak`, `equivalent_duration_s` and `energy_erg` is given. The flare that follows, an
     `Event`, depends on the case: an energy needs the star's size, and sweeps change the study's values.

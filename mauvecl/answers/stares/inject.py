@@ -165,7 +165,7 @@ class StarCompleteness(InCell):
 
     @property
     def messages(self) -> list[str]:
-        """Where drawn stares alarm more or less often than normal noise, and where flares saturate."""
+        """Messages on stares whose false-alarm rate differs from that of normal noise, and on saturated flares."""
         messages: list[str] = []
         if not np.isnan(self.simulated.value) and not self.simulated.low <= self.asked <= self.simulated.high:
             text = (

@@ -13,7 +13,7 @@ from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 if TYPE_CHECKING:
     from mauvecl.web.closed_forms import ClosedForms
 
-#: Ends of the pictures, erg: they stay, whatever is asked.
+#: Ends of the axes, erg, the same for all questions.
 ENERGIES = (1e28, 1e37)
 
 
