@@ -979,6 +979,17 @@ def test_kept_answer_is_small(kind: str) -> None:
     assert arrays_of(answer) < 20e6
 
 
+def test_plan_of_a_hidden_target_says_so() -> None:
+    """Proxima Centauri lies outside the declinations that are observed; its plan has no energies to draw."""
+    state = State()
+    state.enter({"see": "Proxima Cen", "star": "M3V"})
+    with tempfile.TemporaryDirectory() as folder:
+        closed = ClosedForms.of(state.question(), Path(folder))
+        answers = visitor.SIMULATIONS["plan"](closed.study, Pool(LocalWorkers([None])))
+        shown = visitor.shown("plan", closed, answers)
+    assert "Proxima Cen is never seen" in shown["pictures"]["expected"]["text"]
+
+
 def test_cached_curves_release_their_question() -> None:
     """Caches of the limit keep curves, not the questions they were computed from."""
     state = State()

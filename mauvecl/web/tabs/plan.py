@@ -71,6 +71,9 @@ class Expected(Picture):
             return PictureData("Nothing is planned yet.", {name: {"x": [], "y": []} for name in ("all", "found")})
         (row,) = answers["plan"].table
         energy, recovered, above = _columns(answers)
+        if not energy.size:
+            text = f"{row['target']} is never seen within the limits on Earth, Sun, Moon and radiation."
+            return PictureData(text, {name: {"x": [], "y": []} for name in ("all", "found")})
         # Each step of the rate is recovered as at its middle.
         parts = (above[:-1] - above[1:]) * (recovered[:-1] + recovered[1:]) / 2
         flares = np.append(np.cumsum(parts[::-1])[::-1], 0.0) + above[-1] * recovered[-1]
