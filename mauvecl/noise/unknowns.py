@@ -181,16 +181,26 @@ class InstrumentValue(Unknown):
 
 @dataclass(frozen=True, kw_only=True)
 class ThroughputMode(InstrumentValue):
-    """Unknown amplitude of a mode of a calibrated throughput; `number` counts from 0."""
+    """Unknown amplitude of a mode of a calibration.
+
+    Attributes
+    ----------
+    number : int
+        Counted from 0.
+    others : mapping of float
+        Changes of the logarithm of other values than the throughput for an amplitude of one, by name.
+    """
 
     number: int
+    others: Mapping[str, float]
 
     def changes(self, nominal: Instrument, value: float) -> dict[str, Any]:
         """Return the changes of an instrument that set a value, of which those of other modes are kept."""
         set_before = nominal.throughput_amplitudes
         amplitudes = [*set_before, *[0.0] * (self.number + 1 - len(set_before))]
-        amplitudes[self.number] = value
-        return {"throughput_amplitudes": tuple(amplitudes)}
+        value, amplitudes[self.number] = value - amplitudes[self.number], value
+        others = {name: getattr(nominal, name) * math.exp(step * value) for name, step in self.others.items()}
+        return {"throughput_amplitudes": tuple(amplitudes)} | others
 
 
 Row = TypeVar("Row", bound=Unknown)
@@ -355,8 +365,8 @@ INSTRUMENT_VALUES = _by_name(
 )
 
 
-#: Largest number of modes of a calibrated throughput that are unknown; later ones are smaller.
-MAX_MODES = 6
+#: Largest number of modes of a calibration that are unknown: of the light in eight bands and seven other values.
+MAX_MODES = 15
 #: Prior of the amplitude of a mode, which has unit variance by definition.
 MODE_PRIOR = Normal(0.0, 1.0, -5.0, 5.0)
 
@@ -367,19 +377,17 @@ def values_of(instrument: Instrument) -> dict[str, InstrumentValue]:
     These are `INSTRUMENT_VALUES`. If the throughput is calibrated, its modes replace those that change the throughput,
     and values that were fitted as well are known.
     """
-    if instrument.throughput_errors is None:
+    errors = instrument.throughput_errors
+    if errors is None:
         return dict(INSTRUMENT_VALUES)
-    fitted = {name for name, source in instrument.sources.items() if source.startswith("C: fitted")}
-    kept = {name: row for name, row in INSTRUMENT_VALUES.items() if not row.of_throughput and name not in fitted}
-    modes = range(min(len(instrument.throughput_errors.modes), MAX_MODES))
-    return kept | _by_name(
-        *(
-            ThroughputMode(
-                name=f"throughput_{k + 1}", label=f"calibrated throughput, mode {k + 1}", prior=MODE_PRIOR, number=k
-            )
-            for k in modes
-        )
-    )
+    known = {name for name, source in instrument.sources.items() if source.startswith("C: fitted")} | set(errors.values)
+    kept = {name: row for name, row in INSTRUMENT_VALUES.items() if not row.of_throughput and name not in known}
+    modes = []
+    for k in range(min(len(errors.modes), MAX_MODES)):
+        others = {name: steps[k] for name, steps in errors.values.items() if k < len(steps) and steps[k]}
+        label = f"calibration, mode {k + 1}"
+        modes.append(ThroughputMode(name=f"throughput_{k + 1}", label=label, prior=MODE_PRIOR, number=k, others=others))
+    return kept | _by_name(*modes)
 
 
 def default_processes(temperature_c: float) -> dict[str, Prior]:

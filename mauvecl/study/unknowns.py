@@ -88,9 +88,28 @@ def drawn(study: Study) -> DrawnStudies:
 
 
 def throughput_cases(case: Case) -> list[Case]:
-    """Return the case with each mode of its calibrated throughput at one standard deviation; empty if it has none."""
-    modes = (row for row in values_of(case.instrument).values() if isinstance(row, ThroughputMode))
-    return [replace(case, study=case.study.with_instrument(mode.changes(case.instrument, 1.0))) for mode in modes]
+    """Return the case with each mode of its calibration at one standard deviation; empty if it has none.
+
+    The sign of a mode is arbitrary; it is chosen so that the same pixels lie in the output range.
+
+    Raises
+    ------
+    InputError
+        If the wavelengths are not known well enough for that.
+    """
+    moved, pixels = [], case.instrument.read_pixels
+    for mode in values_of(case.instrument).values():
+        if isinstance(mode, ThroughputMode):
+            signs = (replace(case, study=case.study.with_instrument(mode.changes(case.instrument, x))) for x in (1, -1))
+            same = next((one for one in signs if one.instrument.read_pixels == pixels), None)
+            if same is None:
+                raise InputError(
+                    "an error of the calibrated wavelengths changes the pixels of the output range",
+                    "an output range that ends further from a pixel",
+                    key="observation.instrument",
+                )
+            moved.append(same)
+    return moved
 
 
 def _unknown_priors(study: Study, nominal: Instrument) -> dict[str, Prior]:

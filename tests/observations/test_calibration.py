@@ -16,9 +16,10 @@ from refusals import refused
 from mauvecl import Frames, Instrument, Sky, Source, Study, calibrate, expect, plan
 from mauvecl.answers.limits.assumptions import assumptions
 from mauvecl.answers.measurements.expected import expected_measurements
-from mauvecl.answers.observations.calibrate import CalibrateAnswer
+from mauvecl.answers.observations.calibrate import MODE_BANDS, CalibrateAnswer
 from mauvecl.host.instrument.curve import Curve
-from mauvecl.host.instrument.throughput_errors import ThroughputErrors
+from mauvecl.host.instrument.throughput_errors import CALIBRATED, ThroughputErrors
+from mauvecl.noise.unknowns import MAX_MODES
 from mauvecl.observations.calibration.dark import fit_dark
 from mauvecl.observations.calibration.exposures import CalibrationFrames
 from mauvecl.observations.calibration.photon_transfer import NoiseModel, fit_photon_transfer, measured_variance
@@ -229,11 +230,12 @@ def test_unknowns_of_a_calibrated_instrument_are_its_modes(answer: CalibrateAnsw
     fitted = answer.instrument
     log = np.log([fitted.with_(**one.observation.changes).throughput(nm) for one in draws.studies])
     assert fitted.throughput_errors is not None
-    modes = fitted.throughput_errors.at(nm)[:6]
+    modes = fitted.throughput_errors.at(nm)[:MAX_MODES]
+    assert MODE_BANDS + len(CALIBRATED) == MAX_MODES
     np.testing.assert_allclose(log.std(axis=0), np.sqrt((modes**2).sum(axis=0)), rtol=4 * np.sqrt(0.5 / 256))
     np.testing.assert_allclose(np.exp(log.mean(axis=0)), fitted.throughput(nm), rtol=2e-3)
     named = [one.name for one in assumptions(fitted)]
-    assert "calibrated throughput, mode 1" in named
+    assert "calibration, mode 1" in named
     assert "light loss" not in named
 
 

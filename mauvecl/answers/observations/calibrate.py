@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
 from mauvecl.host.expectation import expect
 from mauvecl.host.instrument.paths import shipped_names
-from mauvecl.host.instrument.throughput_errors import MODE, ThroughputErrors
+from mauvecl.host.instrument.throughput_errors import CALIBRATED, MODE, ThroughputErrors
 from mauvecl.observations.calibration.dark import DarkFit, assumed_dark, fit_dark
 from mauvecl.observations.calibration.exposures import CalibrationFrames
 from mauvecl.observations.calibration.photon_transfer import (
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
 SAME_TEMPERATURE_C = 0.05
 #: Knots of the written throughput factor, nm apart.
 KNOT_NM = 2.0
+#: Bands of equal width whose light the first modes of the throughput's errors determine.
+MODE_BANDS = 8
 #: Probability of chi-squared below which a fit is reported as bad.
 REJECTED = 0.01
 
@@ -200,7 +203,7 @@ class CalibrateAnswer(Answer):
         """One row per pixel: fitted and nominal throughput."""
         f = self.throughput
         nominal, ratio = self.nominal.throughput(f.wavelength_nm), np.exp(f.log_factor)
-        counts = np.sqrt(np.maximum(f.error**2 - (self.transfer.gain_error / self.transfer.noise.gain) ** 2, 0.0))
+        counts = np.sqrt(np.maximum(f.error**2 - self.transfer.relative_gain_error**2, 0.0))
         fitted = ratio * nominal
         row = {"wavelength_nm": f.wavelength_nm, "throughput": fitted, "error": fitted * f.error, "nominal": nominal,
                "ratio": ratio, "relative_error": f.error, "relative_error_counts": counts}  # fmt: skip
@@ -261,6 +264,11 @@ class CalibrateAnswer(Answer):
                 f"The stars disagree: their spectra are taken to be wrong by {100 * error:.2g} % at each of "
                 f"{ERROR_KNOTS} wavelengths."
             )
+        if self.throughput.structure > 0:
+            lines.append(
+                "The throughput has structure finer than the spline follows, of "
+                f"{100 * self.throughput.structure:.2g} %: every pixel has a factor of its own."
+            )
         if self.study.calibrate.light_error == 0:
             lines.append("Losses by pointing are taken to be alike in all observations (calibrate.light_error).")
         for row in self.fits:
@@ -306,7 +314,9 @@ class CalibrateAnswer(Answer):
             f"C: {self.source}",
         )
         modes = np.array([errors[name] for name in errors.colnames[1:]])
-        changes["throughput_errors"] = ThroughputErrors(errors["wavelength"].to_value("nm"), modes, f"C: {self.source}")
+        changes["throughput_errors"] = ThroughputErrors(
+            errors["wavelength"].to_value("nm"), modes, f"C: {self.source}", errors.meta["values"]
+        )
         columns = {name: np.asarray(pixels[name].value if hasattr(pixels[name], "value") else pixels[name])
                    for name in pixels.colnames[1:]}  # fmt: skip
         changes["pixel_map"] = PixelMap(**columns, source=f"C: {self.source}")
@@ -324,10 +334,10 @@ class CalibrateAnswer(Answer):
         return f"The throughput is {self.source}; median standard error {error:.2g} %."
 
     @property
-    def changes(self) -> dict[str, float | str]:
+    def changes(self) -> dict[str, Any]:
         """Plain values of the fitted instrument by name."""
         n, d, t, f = self.nominal, self.dark, self.transfer, self.throughput
-        found: dict[str, float | str] = {}
+        found: dict[str, Any] = {}
         if "dark current" not in d.assumed:
             found["dark_slope_per_c"] = d.slope_per_c
             found["dark_scale_dn_per_s"] = float(np.mean(d.level_dn_per_s) * np.exp(-d.slope_per_c * d.reference_c))
@@ -363,7 +373,9 @@ class CalibrateAnswer(Answer):
         low, high = self.nominal.curves_nm
         factor = np.interp(knots, centres, fitted / self.nominal.throughput(np.clip(centres, low, high)))
         at = np.searchsorted(nm, knots).clip(0, nm.size - 1)
-        errors = ThroughputErrors.of_covariance(knots, self.throughput.covariance[np.ix_(at, at)], f"C: {self.source}")
+        errors = ThroughputErrors.of_covariance(
+            knots, self._covariance(at), f"C: {self.source}", names=tuple(CALIBRATED), sums=self._light(at)
+        )
         modes = {f"{MODE}{k}": mode for k, mode in enumerate(errors.modes, 1)}
         pixels: dict[str, Any] = {"pixel": np.arange(self.nominal.pixels)}
         part = self.nominal.read_pixels
@@ -386,10 +398,62 @@ class CalibrateAnswer(Answer):
                 (wavelength, Column("factor")), [{"wavelength": knots, "factor": factor}], **origin
             ),
             "throughput-errors": table_of(
-                (wavelength, *map(Column, modes)), [{"wavelength": knots, **modes}], **origin
+                (wavelength, *map(Column, modes)),
+                [{"wavelength": knots, **modes}],
+                **origin,
+                values={name: list(steps) for name, steps in errors.values.items()},
             ),
             "pixel-map": table_of(columns, [pixels], **origin),
         }
+
+    def _light(self, at: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the light of some pixels in each of `MODE_BANDS` bands, shape (MODE_BANDS, n)."""
+        fitted = np.asarray(self.throughput_table["throughput"])[at]
+        band = at * MODE_BANDS // self.throughput.wavelength_nm.size
+        return np.asarray(fitted * (band == np.arange(MODE_BANDS)[:, None]))
+
+    def _covariance(self, at: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the covariance of log throughput at some pixels and of the logarithms of the values in `CALIBRATED`.
+
+        Counts determine the product of gain and throughput. Frames without light give the sum of dark counts and bias,
+        and of the variances of dark and read noise, so that an error of the bias changes dark current and read noise.
+        The throughput of a pixel is known better than its wavelength.
+        """
+        f, t, d, n, now = self.throughput, self.transfer, self.dark, self.nominal, self.changes
+        count, m = at.size, len(f.joint) - f.wavelength_nm.size
+        place = {name: count + k for k, name in enumerate(CALIBRATED)}
+        of_light = np.eye(count + len(CALIBRATED), count + m)
+        of_light[count:] = 0.0
+        if m >= 2:
+            half = np.ptp(f.wavelength_nm) / 2
+            slope = np.gradient(np.log(np.asarray(self.throughput_table["throughput"])), f.wavelength_nm)[at]
+            of_light[:count, count] = -slope
+            of_light[:count, count + 1] = -slope * (f.wavelength_nm[at] - f.wavelength_nm.mean()) / half
+            first = (n.pixel_zero_nm - f.wavelength_nm.mean()) / half
+            of_light[place["pixel_zero_nm"], count : count + 2] = np.array([1.0, first]) / now["pixel_zero_nm"]
+            of_light[place["dispersion_nm_per_pixel"], count + 1] = (
+                n.dispersion_nm_per_pixel / half / now["dispersion_nm_per_pixel"]
+            )
+        if m == 4:
+            of_light[place["gaussian_fwhm_nm"], count + 2] = n.gaussian_fwhm_nm / now["gaussian_fwhm_nm"]
+        chosen = np.concatenate([at, np.arange(f.wavelength_nm.size, len(f.joint))])
+        joint = f.joint[np.ix_(chosen, chosen)]
+        joint[:count, :count] -= t.relative_gain_error**2
+        covariance = of_light @ joint @ of_light.T
+        of_transfer = np.zeros((len(covariance), 2))
+        of_transfer[:count, 1] = -1 / t.noise.gain
+        of_transfer[place["conversion_uv_per_electron"], 1] = 1 / t.noise.gain
+        read = 0.0 if "read noise" in t.assumed else 0.5 / t.read_noise_dn**2
+        of_transfer[place["read_noise_dn"], 0] = read
+        covariance += of_transfer @ t.covariance @ of_transfer.T
+        if "dark current" not in d.assumed:
+            of_dark = np.zeros((len(covariance), 3))
+            of_dark[place["read_noise_dn"], 0] = read * t.noise.dark_factor
+            # From the logarithm of the level at the reference to that at 0 deg C.
+            of_dark[place["dark_scale_dn_per_s"], 1:] = 1 / d.level_dn_per_s.mean(), -d.reference_c
+            of_dark[place["dark_slope_per_c"], 2] = 1 / d.slope_per_c
+            covariance += of_dark @ d.shared @ of_dark.T
+        return covariance
 
     def instrument_toml(self) -> bytes:
         """Return the content of the instrument file."""
@@ -453,7 +517,7 @@ def calibrate(
     transfer = fit_photon_transfer(_variances(observations, dark, nominal), nominal)
     if without:
         dark = fit_dark(without, nominal, transfer.noise)
-        error = float(dark.bias_error.mean())
+        error = float(np.sqrt(dark.shared[0, 0]))
         transfer = fit_photon_transfer(_variances(observations, dark, nominal), nominal, error)
     throughput = fit_throughput(
         stars, nominal, dark, transfer, knots=asked.knots, sky=study.sky.sky(), order=study.observation.order,

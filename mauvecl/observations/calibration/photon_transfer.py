@@ -22,6 +22,9 @@ ITERATIONS = 20
 TELLS = 3.84
 #: Smallest S/N of the gain with which it is reported.
 MIN_SNR = 5.0
+#: Relative error of a gain that is not measured: the root mean square deviation of 20 to 25 uV per electron, the values
+#: that are quoted of the detector, from the nominal 20.
+ASSUMED_ERROR = 0.14
 
 
 @dataclass(frozen=True)
@@ -70,8 +73,10 @@ class PhotonTransfer:
     Attributes
     ----------
     noise : NoiseModel
-    gain_error, read_noise_error : float
-        Standard errors, DN per electron and DN.
+    covariance : ndarray, shape (2, 2)
+        Of read variance and gain, for known dark counts; of an assumed gain by `ASSUMED_ERROR`.
+    read_noise_error : float
+        Standard error, DN, with that of the dark counts.
     dark_unit : {"DN", "electrons"}
     dark_unit_chi2 : float
         Chi-squared with dark counts in DN, less that with electrons.
@@ -84,7 +89,7 @@ class PhotonTransfer:
     """
 
     noise: NoiseModel
-    gain_error: float
+    covariance: Float
     read_noise_error: float
     dark_unit: Literal["DN", "electrons"]
     dark_unit_chi2: float
@@ -99,6 +104,16 @@ class PhotonTransfer:
     def read_noise_dn(self) -> float:
         """Read noise without the rounding, DN."""
         return float(np.sqrt(max(self.noise.read_variance - ROUNDING, 0.0)))
+
+    @property
+    def gain_error(self) -> float:
+        """Standard error of the gain, DN per electron."""
+        return float(np.sqrt(self.covariance[1, 1]))
+
+    @property
+    def relative_gain_error(self) -> float:
+        """Standard error of the gain over its value."""
+        return self.gain_error / self.noise.gain
 
     @property
     def p_value(self) -> float:
@@ -165,12 +180,13 @@ def fit_photon_transfer(
     errors = np.sqrt(np.diag(covariance))
     if not gain > MIN_SNR * errors[1]:
         before, unknown = NoiseModel.nominal(nominal), ("gain", "read noise", "unit of the dark counts")
-        model = before.variance(light, dark)
-        return PhotonTransfer(before, 0.0, 0.0, nominal.dark_unit, better, np.nan, 0, light, variance, model, unknown)
+        model, assumed_error = before.variance(light, dark), np.diag([0.0, (ASSUMED_ERROR * before.gain) ** 2])
+        return PhotonTransfer(before, assumed_error, 0.0, nominal.dark_unit, better, np.nan, 0, light, variance, model,
+                              unknown)  # fmt: skip
     read = max(float(read), ROUNDING)
     noise = NoiseModel(read, float(gain) if unit == "electrons" else 1.0, float(gain))
     read_error = np.hypot(errors[0], noise.dark_factor * dark_error_dn) / (2 * np.sqrt(max(read - ROUNDING, errors[0])))
-    return PhotonTransfer(noise, float(errors[1]), float(read_error), unit, float(better), float(chi2),
+    return PhotonTransfer(noise, covariance, float(read_error), unit, float(better), float(chi2),
                           variance.size - 2, light, variance, model, tuple(assumed))  # fmt: skip
 
 

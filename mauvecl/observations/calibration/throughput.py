@@ -1,8 +1,13 @@
 """Throughput, wavelength zero point and line width from the spectra of standard stars.
 
 The logarithm of the throughput over the nominal one is a cubic B-spline. Its second derivative has a normal prior whose
-width follows from the data by restricted maximum likelihood; the posterior covariance then covers a smooth truth with
-its nominal probability on average over wavelength (Wahba 1983; Nychka 1988, doi 10.1080/01621459.1988.10478711).
+width follows from the data by restricted maximum likelihood. The posterior covariance consists of noise and of the bias
+that this prior expects of the smoothing (Wahba 1983; Nychka 1988, doi 10.1080/01621459.1988.10478711). A throughput
+smoother than the prior has less of it, so that the expected bias is scaled to that of the fitted curve; intervals then
+hold the truth with their nominal probability on average over wavelength.
+
+If all stars deviate alike from the spline, the throughput has structure that it does not follow. Each pixel then has a
+factor of its own, whose spread follows from the data.
 """
 
 from __future__ import annotations
@@ -60,7 +65,9 @@ class ThroughputFit:
     wavelength_nm : ndarray, shape (n_pixel,)
     log_factor : ndarray, shape (n_pixel,)
         Logarithm of the throughput over the nominal one.
-    covariance : ndarray, shape (n_pixel, n_pixel)
+    joint : ndarray, shape (n_pixel + n_shape, n_pixel + n_shape)
+        Covariance of `log_factor` and, if they are fitted, of shift and stretch in nm and of the relative width and its
+        change.
     shift_nm, stretch_nm : Value or None
         Wavelength of a feature less the nominal one in the middle of the spectrum, and its change to either end.
     fwhm_nm, fwhm_change_nm : Value or None
@@ -74,13 +81,15 @@ class ThroughputFit:
         Weight of the squared second derivative.
     spectrum_error : float
         Relative error of the stars' spectra at each of `ERROR_KNOTS` knots.
+    structure : float
+        Relative standard deviation of the pixels about the spline; 0 if it follows the throughput.
     assumed : tuple of str
         Quantities that these stars do not determine.
     """
 
     wavelength_nm: Float
     log_factor: Float
-    covariance: Float
+    joint: Float
     shift_nm: Value | None
     stretch_nm: Value | None
     fwhm_nm: Value | None
@@ -90,12 +99,13 @@ class ThroughputFit:
     dof: float
     smoothing: float
     spectrum_error: float
+    structure: float
     assumed: tuple[str, ...]
 
     @property
     def error(self) -> Float:
         """Standard error of `log_factor`, shape (n_pixel,)."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
+        return np.asarray(np.sqrt(np.diag(self.joint)[: self.wavelength_nm.size]))
 
     @property
     def p_value(self) -> float:
@@ -161,6 +171,32 @@ class _Linearised:
         """Return chi-squared, and the values less the effective number of parameters."""
         left = self.values - self.design @ found
         return float(left @ left), float(np.any(self.design != 0, axis=1).sum() - np.sum(covariance * self.normal))
+
+    def scaled(self, found: Float, covariance: Float, smoothing: float, basis: Float) -> Float:
+        """Return the covariance with the smoothing's bias as large as that of the fitted curve, on average over pixels.
+
+        Parameters
+        ----------
+        found, covariance : ndarray
+            From `solved`.
+        smoothing : float
+        basis : ndarray, shape (n_pixel, n_coefficient)
+        """
+        n = len(self.penalty)
+        pull = np.zeros_like(covariance)
+        pull[:, :n] = smoothing * covariance[:, :n] @ self.penalty
+        noise = covariance - pull @ covariance
+        variance = _diagonal(basis, covariance[:n, :n])
+
+        def mean(values: Float) -> float:
+            return float(np.mean(_diagonal(basis, values[:n, :n]) / variance))
+
+        bias = basis @ (pull @ found)[:n]
+        of_noise, expected = mean(pull @ noise @ pull.T), mean(pull @ noise)
+        if not expected > of_noise:
+            return covariance
+        scale = (float(np.mean(bias**2 / variance)) - of_noise) / (expected - of_noise)
+        return np.asarray(noise + max(scale, 0.0) * pull @ covariance)
 
     @cached_property
     def normal(self) -> Float:
@@ -361,29 +397,31 @@ def fit_throughput(
     several = len(stars) > 1
     error = spectrum_error if spectrum_error is not None else 0.0
     best = _iterated(model, error)
-    chi2, dof = best.linear.goodness(best.found, best.covariance)
-    m = model.n_shape
-    if several and spectrum_error is None and scipy.stats.chi2.sf(chi2, dof) < REJECTED:
+    m, n = model.n_shape, model.basis.shape[1]
+    if several and spectrum_error is None and best.pixels(model).disagree:
         trial = _iterated(model, ONE_STAR_ERROR)
         error = trial.linear.error_of(trial.linear.prior == ONE_STAR_ERROR, trial.smoothing)
         best = _iterated(model, error)
-        chi2, dof = best.linear.goodness(best.found, best.covariance)
-    n = model.basis.shape[1]
+    pixels = best.pixels(model)
     if (np.abs(best.found[n : n + m]) > LIMITS[:m]).any():
         raise InputError(
             "the spectra of the stars do not match a wavelength scale and line width near the nominal ones",
             f"shifts up to {LIMITS[0]:g} nm and widths within {100 * LIMITS[2]:g} %",
             key="observations",
         )
-    curve = model.basis @ best.covariance[:n, :n] @ model.basis.T
+    covariance = best.linear.scaled(best.found, best.covariance, best.smoothing, model.basis)
+    onto = scipy.linalg.block_diag(model.basis, np.eye(m))
+    joint = onto @ covariance[: n + m, : n + m] @ onto.T
+    curve = joint[: nm.size, : nm.size]
+    curve += np.diag(pixels.variance)
     if not several and spectrum_error is None:
         # One star cannot tell errors of its spectrum from the throughput.
         error = ONE_STAR_ERROR
-        curve = curve + error**2 * _linear_basis(nm) @ _linear_basis(nm).T
+        curve += error**2 * _linear_basis(nm) @ _linear_basis(nm).T
     # Counts determine the product of gain and throughput.
-    curve = curve + (transfer.gain_error / transfer.noise.gain) ** 2
-    log_factor, shape = model.basis @ best.found[:n], best.found[n : n + m]
-    errors = np.sqrt(np.diag(best.covariance))[n : n + m]
+    curve += transfer.relative_gain_error**2
+    log_factor, shape = model.basis @ best.found[:n] + pixels.log_factor, best.found[n : n + m]
+    errors = np.sqrt(np.diag(covariance))[n : n + m]
     scale = [1.0, 1.0, nominal.gaussian_fwhm_nm, nominal.gaussian_fwhm_nm]
     values = [Value(scale[k] * float(shape[k] + (k == 2)), scale[k] * float(errors[k])) for k in range(m)]
     light = np.array([model.light_dn(one, log_factor, shape) for one in stars])
@@ -393,8 +431,32 @@ def fit_throughput(
                *(() if several else ("errors of the star's spectrum",))]  # fmt: skip
     padded: list[Value | None] = [*values, *[None] * (4 - m)]
     shift, stretch, width, change = padded
-    return ThroughputFit(nm, log_factor, curve, shift, stretch, width, change, residual, chi2, dof, best.smoothing,
-                         error, tuple(assumed))  # fmt: skip
+    return ThroughputFit(nm, log_factor, joint, shift, stretch, width, change, residual, pixels.chi2, pixels.dof,
+                         best.smoothing, error, pixels.structure, tuple(assumed))  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Pixels:
+    """Factors of single pixels on the throughput that the spline leaves.
+
+    Attributes
+    ----------
+    log_factor, variance : ndarray, shape (n_pixel,)
+        0 if the spline follows the throughput.
+    structure : float
+        Relative standard deviation of the factors.
+    disagree : bool
+        True if the stars differ from each other.
+    chi2, dof : float
+        Of the fit with these factors.
+    """
+
+    log_factor: Float
+    variance: Float
+    structure: float
+    disagree: bool
+    chi2: float
+    dof: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -403,6 +465,28 @@ class _Solution:
     smoothing: float
     found: Float
     covariance: Float
+
+    def pixels(self, model: ThroughputModel) -> _Pixels:
+        """Divide the residuals into those that all stars share, and those by which they differ."""
+        n_star, n_pixel = model.observed_dn.shape
+        left = (self.linear.values - self.linear.design @ self.found).reshape(n_star, n_pixel)
+        # The columns of the spline sum to one.
+        whole = self.linear.design[:, : model.basis.shape[1]].sum(axis=1).reshape(n_star, n_pixel)
+        information = np.sum(whole**2, axis=0)
+        used = information > 0
+        shared = np.divide(np.sum(whole * left, axis=0), information, out=np.zeros(n_pixel), where=used)
+        chi2, dof = self.linear.goodness(self.found, self.covariance)
+        of_shared = float(np.sum(shared**2 * information))
+        dof_shared = dof - model.usable.sum() + used.sum()
+        disagree = n_star > 1 and scipy.stats.chi2.sf(chi2 - of_shared, dof - dof_shared) < REJECTED
+        if model.order != "paper" or scipy.stats.chi2.sf(of_shared, dof_shared) >= REJECTED:
+            nothing = np.zeros(n_pixel)
+            return _Pixels(nothing, nothing, 0.0, disagree, chi2, dof)
+        variance = (of_shared - dof_shared) / float(np.sum(information))
+        kept = variance * information / (1 + variance * information)
+        chi2 -= float(np.sum(shared**2 * information * kept * (2 - kept)))
+        return _Pixels(np.log1p(kept * shared), variance * (1 - kept), float(np.sqrt(variance)), disagree, chi2,
+                       dof - float(kept.sum()))  # fmt: skip
 
 
 def _iterated(model: ThroughputModel, error: float) -> _Solution:
@@ -432,6 +516,11 @@ def _basis(nm: Float, knots: int) -> tuple[Float, Float]:
     second = BSpline(full, np.eye(knots + 3), 3).derivative(2)(nodes.ravel())
     weight = np.repeat(half, 2, axis=1).ravel()
     return design, np.asarray((second * weight[:, None]).T @ second)
+
+
+def _diagonal(basis: Float, covariance: Float) -> Float:
+    """Return the variance of a curve at the pixels from the covariance of its coefficients, shape (n_pixel,)."""
+    return np.asarray(np.einsum("pi,pi->p", basis @ covariance, basis))
 
 
 def _linear_basis(nm: Float) -> Float:
