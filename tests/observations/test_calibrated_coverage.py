@@ -162,7 +162,7 @@ def test_fitted_values_and_throughput_vary_together(tmp_path: Path) -> None:
     """Modes: counts per photon keep their own error, of which that of the gain, ten times as large, is no part."""
     found = answer_of(STARS[:2], truth(), 9)
     found.write(tmp_path)
-    (case,) = cases(Study().with_settings([f"observation.instrument={tmp_path / 'instrument.toml'}"]))
+    (case,) = cases(with_(["star=[{library='G2V', magnitude=7.4}]"], tmp_path / "instrument.toml"))
     middle, moved = case.instrument, [one.instrument for one in throughput_cases(case)]
     nm = np.array([450.0])
 
@@ -181,7 +181,7 @@ def test_fitted_values_and_throughput_vary_together(tmp_path: Path) -> None:
     table = found.throughput_table
     stated = np.interp(450.0, table["wavelength"].value, np.asarray(table["relative_error_counts"]))
     # Of the modes of the curve, the largest are kept.
-    assert 0.5 * stated < own < 1.01 * stated
+    assert 0.3 * stated < own < 1.01 * stated
     # Dark current and read noise: frames without light fix the sum of their variances.
     dark = middle.dark_scale_dn_per_s * np.exp(middle.dark_slope_per_c * found.dark.reference_c)
     of_dark = [one.dark_scale_dn_per_s * np.exp(one.dark_slope_per_c * found.dark.reference_c) / dark for one in moved]

@@ -58,18 +58,24 @@ class Index:
 
 
 #: Indices by name. The bands are an assumption of this project: published ones, of 0.1 to 3 nm, lie within Mauve's line
-#: function of 13.3 nm, so that the band is 16 nm about the lines and each continuum 10 to 12 nm beyond.
+#: function of 13.3 nm, so that the band is 16 nm about the lines and each continuum 12 nm beyond.
+#: The published windows of Ca II and H alpha were compared with the table of ACTIN 2, that of H beta with lists of Lick
+#: indices; the papers themselves were not read. Of Mg II no stellar definition at low resolution could be verified.
 INDICES = {
     one.name: one
     for one in (
         Index("Mg II", (272.0, 288.0), ((258.0, 270.0), (290.0, 302.0)),
-              "278.5-281.5 nm above a straight continuum, for the 0.6 nm of IUE (observations.line_index.MG_II_NM)"),
+              "none verified; for the 0.6 nm of IUE this project takes 278.5-281.5 nm above a straight continuum "
+              "(observations.line_index.MG_II_NM, an assumption)"),
         Index("Ca II", (387.0, 403.0), ((373.0, 385.0), (405.0, 417.0)),
-              "Mount Wilson S: triangles of 0.109 nm at H and K over 2 nm at 390.1 and 400.1 nm (Duncan et al. 1991)"),
+              "Mount Wilson S: triangles of 0.109 nm (FWHM) at 393.366 and 396.847 nm over 2 nm at 390.107 and 400.107 nm "
+              "(Duncan et al. 1991, ApJS 76, 383)"),
         Index("H beta", (478.0, 494.0), ((464.0, 476.0), (496.0, 508.0)),
-              "Lick: 484.79-487.66 nm (Worthey et al. 1994)"),
+              "Lick: 484.788-487.663 nm, continua 482.788-484.788 and 487.663-489.163 nm (Worthey et al. 1994; "
+              "Trager et al. 1998, ApJS 116, 1)"),
         Index("H alpha", (648.0, 664.0), ((634.0, 646.0), (666.0, 678.0)),
-              "0.16 nm at 656.28 nm over 1.1 nm at 655.09 and 0.9 nm at 658.03 nm (Gomes da Silva et al. 2011)"),
+              "0.16 nm at 656.281 nm over 1.075 nm at 655.087 and 0.875 nm at 658.031 nm "
+              "(Gomes da Silva et al. 2011, arXiv:1109.0321)"),
     )
 }  # fmt: skip
 
