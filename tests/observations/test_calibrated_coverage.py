@@ -159,7 +159,7 @@ def test_answers_with_fitted_instruments_have_their_errors(tmp_path: Path) -> No
 
 
 def test_fitted_values_and_throughput_vary_together(tmp_path: Path) -> None:
-    """Modes: counts per photon keep their own error, of which that of the gain, ten times as large, is no part."""
+    """Modes, which lose 1e-4 of the variances: counts per photon have their own error, without that of the gain."""
     found = answer_of(STARS[:2], truth(), 9)
     found.write(tmp_path)
     (case,) = cases(with_(["star=[{library='G2V', magnitude=7.4}]"], tmp_path / "instrument.toml"))
@@ -175,7 +175,7 @@ def test_fitted_values_and_throughput_vary_together(tmp_path: Path) -> None:
         ("read noise", "read_noise_dn"),
         ("dark slope", "dark_slope_per_c"),
     ):
-        assert spread(of) == pytest.approx(values[name], rel=1e-6)
+        assert spread(of) == pytest.approx(values[name], rel=1e-3)
     counts = [one.throughput(nm)[0] * one.gain_dn_per_electron for one in moved]
     own = np.linalg.norm(np.log(np.divide(counts, middle.throughput(nm)[0] * middle.gain_dn_per_electron)))
     table = found.throughput_table
@@ -186,4 +186,4 @@ def test_fitted_values_and_throughput_vary_together(tmp_path: Path) -> None:
     dark = middle.dark_scale_dn_per_s * np.exp(middle.dark_slope_per_c * found.dark.reference_c)
     of_dark = [one.dark_scale_dn_per_s * np.exp(one.dark_slope_per_c * found.dark.reference_c) / dark for one in moved]
     level = float(np.linalg.norm(np.log(of_dark)))
-    assert level == pytest.approx(values["dark current"], rel=1e-6)
+    assert level == pytest.approx(values["dark current"], rel=1e-3)

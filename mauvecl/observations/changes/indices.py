@@ -68,8 +68,8 @@ INDICES = {
               "none verified; for the 0.6 nm of IUE this project takes 278.5-281.5 nm above a straight continuum "
               "(observations.line_index.MG_II_NM, an assumption)"),
         Index("Ca II", (387.0, 403.0), ((373.0, 385.0), (405.0, 417.0)),
-              "Mount Wilson S: triangles of 0.109 nm (FWHM) at 393.366 and 396.847 nm over 2 nm at 390.107 and 400.107 nm "
-              "(Duncan et al. 1991, ApJS 76, 383)"),
+              "Mount Wilson S: triangles of 0.109 nm (FWHM) at 393.366 and 396.847 nm over 2 nm at 390.107 and "
+              "400.107 nm (Duncan et al. 1991, ApJS 76, 383)"),
         Index("H beta", (478.0, 494.0), ((464.0, 476.0), (496.0, 508.0)),
               "Lick: 484.788-487.663 nm, continua 482.788-484.788 and 487.663-489.163 nm (Worthey et al. 1994; "
               "Trager et al. 1998, ApJS 116, 1)"),
