@@ -453,7 +453,7 @@ class CalibrateAnswer(Answer):
             of_dark[place["dark_scale_dn_per_s"], 1:] = 1 / d.level_dn_per_s.mean(), -d.reference_c
             of_dark[place["dark_slope_per_c"], 2] = 1 / d.slope_per_c
             covariance += of_dark @ d.shared @ of_dark.T
-        return covariance
+        return np.asarray(covariance)
 
     def instrument_toml(self) -> bytes:
         """Return the content of the instrument file."""
