@@ -107,7 +107,7 @@ def _unknowns(study: Study, uses: Collection[Use]) -> str:
     parts += [f"marginalised: {', '.join(named)}"] if named else []
     if study.unknowns.draws and "values" in uses:
         parts.append(f"{study.unknowns.draws} draws of the instrument's unknowns")
-    return "; ".join(parts) or "everything known"
+    return "; ".join(parts) or "everything known but the noise"
 
 
 def unused_unknowns(study: Study, uses: Collection[Use]) -> list[str]:

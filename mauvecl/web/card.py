@@ -11,6 +11,8 @@ from mauvecl.web.tabs.tab import Answers
 
 #: Part of the message about the throughput, which the page shows once.
 NOMINAL = "The throughput is nominal"
+#: Part of the message about the chance with unknowns, which the card shows.
+BOTH = "Everything but the noise is taken as known"
 #: Answers whose messages are shown, since they include those of the others.
 TOLD = ("detection", "measure", "completeness", "visible", "plan")
 
@@ -59,4 +61,4 @@ def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
 
 def _messages(closed: ClosedForms, answers: Answers) -> list[str]:
     of_answers = [m for name in TOLD if name in answers for m in answers[name].messages]
-    return [m for m in dict.fromkeys([*of_answers, *closed.messages]) if not m.startswith(NOMINAL)]
+    return [m for m in dict.fromkeys([*of_answers, *closed.messages]) if not m.startswith((NOMINAL, BOTH))]

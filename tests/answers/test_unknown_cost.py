@@ -15,6 +15,7 @@ from commands import ended, run
 from refusals import refused
 from scenes import instrument
 
+from mauvecl.answers.detection.chance_with_unknowns import chance_with_unknowns
 from mauvecl.answers.detection.detect import detect
 from mauvecl.answers.detection.maps import detection_map
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
@@ -264,3 +265,25 @@ def test_table_has_a_picture(tmp_path: Path) -> None:
         assert power(np.array([snr]), 1e-3)[0] == pytest.approx(0.9)
     assert found.plot(tmp_path / "unknowns.png") == tmp_path / "unknowns.png"
     assert [path.name for path in found.write(tmp_path)] == ["unknowns.ecsv", "study.toml"]
+
+
+def test_chance_with_unknowns_is_that_of_their_study() -> None:
+    """The sentence of `detect` holds the closed forms of the table for both studies, of the most uncertain flare."""
+    stars = [{"library": "M3V", "magnitude": 9.0}]
+    run = {"realisations": 10_000, "fap": 0.02, "statistics": ["matched"]}
+    data = {"star": stars, "flare": {"amplitudes": [0.0001, 0.02, 3.0]}, "run": run}
+    chances, sentences = [], []
+    for usual in (False, True):
+        answer = detect(Study.build(data | {"nuisances": {"usual": usual}}, "test"))
+        chances.append(f"{100 * answer.table['closed_form_probability'][1]:.1f} %")
+        sentences += of_kind(answer.messages, "chance with unknowns")
+    # An answer with unknowns has them in its table.
+    (sentence,) = sentences
+    assert "flare of 2 %" in sentence
+    assert f"with a chance of {chances[0]}, with the usual unknowns of {chances[1]}" in sentence
+
+
+def test_saturated_star_has_no_chance_with_unknowns() -> None:
+    star = {"library": "G2V", "magnitude": -6.0}
+    study = Study.build({"star": [star], "flare": {"amplitudes": [0.1]}}, "test")
+    assert chance_with_unknowns(cases(study)) == []

@@ -18,13 +18,13 @@ from mauvecl.study.study import Study
 USUAL = "instrument mauve, detector at 21 deg C; sky of V = 22.1 mag/arcsec2; "
 FLARE = "flares of 10000 K, added to the star, amplitudes in the Kepler band; "
 ORBIT = "orbit of embedded elements; least angles: Earth's limb 25 deg, Sun 46 deg, Moon 25 deg"
-REST = "everything known; seed 1"
+REST = "everything known but the noise; seed 1"
 #: What each verb states about the default study.
 STATED = {
     "simulate": USUAL + REST,
     "snr": USUAL + REST,
     "exposure": USUAL[:-2],
-    "change": USUAL + "everything known",
+    "change": USUAL + "everything known but the noise",
     "calibrate": USUAL[:-2],
     "analyse": "flares of the shape davenport2014; noise as measured; seed 1",
     "visible": ORBIT,

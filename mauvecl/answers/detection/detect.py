@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from mauvecl.answers.answer import Answer, InCell
+from mauvecl.answers.detection.chance_with_unknowns import chance_with_unknowns
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
 from mauvecl.answers.neighbour_list import share_columns
 from mauvecl.results.detection import departures
@@ -270,6 +271,7 @@ def detect(
         for a, flare in zip(case.amplitudes, case.flares, strict=True)
     ]
     last = [*_few_terms(stars), *marginal_lines(study.nuisances), *cost_lines(unknown, study.nuisances)]
+    last += chance_with_unknowns(prepared)
     answer.messages = list(dict.fromkeys([*messages, *campaigns, *costs, *last]))
     answer.paper = paper
     return answer

@@ -1,0 +1,47 @@
+"""Chance of detection with the usual unknowns, next to answers that take everything but the noise as known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from mauvecl.schema.messages import Message
+from mauvecl.statistics.linear import Matched
+from mauvecl.study.cases import Case
+from mauvecl.study.nuisances import NuisanceChoice
+
+#: Largest number of flares of which the most uncertain is looked for.
+MAX_FLARES = 100
+
+
+def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
+    """Return a sentence on the chance with and without the usual unknowns, or none if the study has unknowns.
+
+    It is that of the flare whose chance is nearest to one half: others are seen, or lost, whatever is unknown.
+    """
+    study = prepared[0].study
+    if study.nuisances != NuisanceChoice() or study.run.comparison().estimated:
+        return []
+    flares = [(case, flare) for case in prepared for flare in range(len(case.amplitudes))][:MAX_FLARES]
+    known = {item: chance for item in flares if (chance := _chance(*item)) is not None}
+    if not known:
+        return []
+    case, flare = min(known, key=lambda item: abs(known[item] - 0.5))
+    unknown = _chance(case.with_sections(nuisances=NuisanceChoice(usual=True)), flare)
+    if unknown is None:
+        return []
+    of = f"{case.label}, flare of {100 * case.amplitudes[flare]:g} %"
+    text = (
+        f"Everything but the noise is taken as known: {of} is then detected by the matched statistic with a chance of "
+        f"{100 * known[case, flare]:.1f} %, with the usual unknowns of {100 * unknown:.1f} % (closed forms; "
+        "`nuisances.usual` draws them)."
+    )
+    return [Message(text, "chance with unknowns")]
+
+
+def _chance(case: Case, flare: int) -> float | None:
+    """Return the closed-form chance of a flare by the matched statistic, or None if everything saturates."""
+    peak = case.flares[flare]
+    setting = case.setting(case.quiet, peak)
+    if not setting.used.any() or peak.saturated[setting.used].all():
+        return None
+    return Matched().detection_forms(setting, peak, case.study.run.fap).probability
