@@ -433,7 +433,11 @@ def _newton_end(
     for _ in range(NEWTON_STEPS):
         residuals, jacobian = data.residuals(there, whitening), data.jacobian(there, whitening)[:, free]
         information, slope = jacobian.T @ jacobian, quantity.slope(there, data)[free]
-        if not np.linalg.cond(information * np.outer(*2 * [np.diag(information) ** -0.5])) < WORST_CONDITION:
+        scale = np.sqrt(np.diag(information))
+        # A flare that does not cool leaves the cooling time without any effect.
+        if not ((scale > 0.0) & (scale < np.inf)).all():
+            return None
+        if not np.linalg.cond(information / np.outer(scale, scale)) < WORST_CONDITION:
             return None
         back, along = np.linalg.solve(information, np.column_stack([-(residuals @ jacobian), slope])).T
         room = allowed - float(residuals @ residuals + residuals @ jacobian @ back)
@@ -464,14 +468,13 @@ def _end(
 
     def held(log_factor: float, theta: Float) -> Float:
         """Return parameters with a changed quantity: by a difference for the peak, otherwise by a factor."""
-        target = centre + log_factor if place == 0 else centre * np.exp(log_factor)
         moved = theta.copy()
         if place == 0:
-            moved[0] = target
+            moved[0] = centre + log_factor
         elif place == 4:
-            moved[4] = np.log(target) - moved[3]
+            moved[4] = np.log(centre) + log_factor - moved[3]
         else:
-            moved[place] += np.log(target / quantity.value(moved, data))
+            moved[place] += np.log(centre / quantity.value(moved, data)) + log_factor
         return moved
 
     @cache  # a root is between values that have different signs, though refits start elsewhere

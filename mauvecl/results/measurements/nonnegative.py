@@ -29,6 +29,16 @@ Float = NDArray[np.float64]
 ROUNDING = 1e-9
 
 
+def _inverse(matrix: Float) -> Float:
+    """Return the inverse of a matrix; most have one element, for which the general way takes ten times as long."""
+    return 1.0 / matrix if len(matrix) == 1 else np.asarray(np.linalg.inv(matrix))
+
+
+def _product(matrix: Float, values: Float) -> Float:
+    """Return the product of a matrix (k, k) with values (k, ...)."""
+    return matrix[0, 0] * values if len(matrix) == 1 else np.tensordot(matrix, values, 1)
+
+
 @dataclass(frozen=True, eq=False)
 class Products:
     """Inner products of components and sums at temperatures (n, ...), or (1, ...) if common to all frames."""
@@ -42,8 +52,8 @@ class Products:
     def face(self, some: tuple[int, ...], hot: bool) -> Face:
         """Fit some of the fixed components and, if `hot`, the blackbody, without bounds."""
         which = list(some)
-        inverse = np.asarray(np.linalg.inv(self.gram[np.ix_(which, which)]), np.float64)
-        alone, share = (np.tensordot(inverse, each[which], 1) for each in (self.fixed, self.cross))
+        inverse = _inverse(self.gram[which][:, which])
+        alone, share = (_product(inverse, each[which]) for each in (self.fixed, self.cross))
         gain = np.sum(self.fixed[which] * alone, axis=0)
         power = self.power - np.sum(self.cross[which] * share, axis=0)
         if not hot:
@@ -84,7 +94,7 @@ class Face:
         The factors of the quantity have the shape (n_linear, n, ...).
         """
         own = factors[1:][list(self.some)]
-        others = np.tensordot(self.inverse, own, 1)
+        others = _product(self.inverse, own)
         variance = np.sum(own * others, axis=0)
         if self.amplitude is None:
             return None, others, variance
@@ -135,15 +145,19 @@ class BoundedProfile(Profile):
 
     def gain(self, log_k: Float) -> Float:
         """Return the decrease of chi-squared by a flare of temperatures (n, ...)."""
-        return self._best_of(log_k)[0]
+        gain = np.zeros((len(self.sums), *log_k.shape[1:]))
+        for face in self.solutions(log_k):
+            np.copyto(gain, face.gain, where=(face.gain > gain) & face.positive(face.amplitude, face.others))
+        return gain
 
     def gain_at_nodes(self, every: int = 1) -> Float:
         """Return `gain` at each `every`-th temperature of the model, shape (n, n_node)."""
         return self.gain(self.nodes[None, ::every])
 
-    def amplitudes(self, log_k: Float) -> Float:
-        """Return the best amplitudes at temperatures (n,), shape (n, n_linear)."""
-        return np.ascontiguousarray(self._best_of(log_k)[1].T)
+    def solution(self, log_k: Float) -> BestFit:
+        """Return the best fits at temperatures (n,)."""
+        gain, amplitudes = self._best_of(log_k)
+        return BestFit(log_k, np.ascontiguousarray(amplitudes.T), gain)
 
 
 def with_bounds(reduction: Reduction, sums: Float, best: BestFit) -> BestFit:

@@ -137,12 +137,14 @@ class Profile:
             reached = self.gain(vertex)
             x = np.where(reached >= g.max(axis=1), vertex, three)
             step /= NARROWER
-        return BestFit(x, self.amplitudes(x), self.gain(x))
+        return self.solution(x)
 
-    def amplitudes(self, log_k: Float) -> Float:
-        """Return the best amplitudes at temperatures (n,), shape (n, n_linear)."""
-        amplitude, _, hot = self.parts(log_k)
-        return self.linear(log_k, np.maximum(amplitude, 0.0), hot)
+    def solution(self, log_k: Float) -> BestFit:
+        """Return the best fits at temperatures (n,)."""
+        amplitude, variance, hot = self.parts(log_k)
+        positive = np.maximum(amplitude, 0.0)
+        gain = np.einsum("nk,nk->n", self.along, self.along) + positive**2 / variance
+        return BestFit(log_k, self.linear(log_k, positive, hot), gain)
 
     def ends(self, best: BestFit, at_nodes: Float, allowed: float) -> tuple[Float, Float]:
         """Return the log temperatures at which chi-squared has risen by `allowed`, low and high, each (n,).
