@@ -252,6 +252,7 @@ def test_intervals_of_temperature_and_energy_cover(threshold: float) -> None:
     """68 % intervals of flares of S/N 20-100 cover 68 to 90 %; each binomial bound fails once in a thousand times.
 
     They allow for drifts as large as the noise of the surroundings may hide; here nothing drifts: they are wide.
+    Without that allowance, 73 and 68 % of 150 hold the truth, but with drifts of 5 % an hour 53 and 52 % of 100.
     """
     rng = np.random.default_rng(310)
     number, inside = 100, {"temperature": 0, "energy bolometric": 0}
