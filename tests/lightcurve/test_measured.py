@@ -17,7 +17,6 @@ from mauvecl import (
     Event,
     Expectation,
     FlareModel,
-    InputError,
     Instrument,
     Nuisances,
     Sinusoid,
@@ -282,9 +281,8 @@ def test_impossible_joint_fits_raise() -> None:
         (model(), START | {"half_width_s": 0.0}, "half_width_s"),
         (model(), START | {"levels": (2.0,)}, "levels"),
     ):
-        with pytest.raises(InputError) as error:
+        with refused(key):
             fit_cooling(frames, quiet(), used, **how)
-        assert error.value.key == key
 
 
 def test_stares_without_a_flare_have_no_bins(engine: Engine) -> None:

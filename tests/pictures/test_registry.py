@@ -14,10 +14,11 @@ from pkgutil import iter_modules, walk_packages
 from types import ModuleType
 
 import pytest
+from refusals import refused
 
 import mauvecl.answers
 import mauvecl.pictures
-from mauvecl import InputError, Source
+from mauvecl import Source
 from mauvecl.drawable import Drawable
 from mauvecl.pictures import registry
 from mauvecl.pictures.style import styled_picture
@@ -88,7 +89,7 @@ def test_picture_is_added_in_one_place(monkeypatch: pytest.MonkeyPatch, tmp_path
     ax = Figure().subplots()
     assert star.pictures["line-1"](ax=ax) is ax
     assert len(ax.lines) == 1
-    with pytest.raises(InputError):
+    with refused("ax"):
         star.pictures["line-1"](ax="axes")
 
 
