@@ -47,6 +47,8 @@ SAME_TEMPERATURE_C = 0.05
 KNOT_NM = 2.0
 #: Bands of equal width whose light the first modes of the throughput's errors determine.
 MODE_BANDS = 8
+#: Factor between fitted and nominal throughput above which it is reported.
+FAR_FROM_NOMINAL = 3.0
 #: Probability of chi-squared below which a fit is reported as bad.
 REJECTED = 0.01
 
@@ -254,7 +256,7 @@ class CalibrateAnswer(Answer):
         if assumed:
             lines.append(f"NOT DETERMINED by these observations, taken as nominal: {', '.join(assumed)}.")
         error, given = self.throughput.spectrum_error, self.study.calibrate.spectrum_error is not None
-        if len(self.stars) == 1 and not given:
+        if "errors of the star's spectrum" in self.throughput.assumed and not given:
             lines.append(
                 "One star cannot tell errors of its spectrum from the throughput: an error of "
                 f"{100 * error:.2g} % at each of {ERROR_KNOTS} wavelengths is assumed."
@@ -269,6 +271,9 @@ class CalibrateAnswer(Answer):
                 "The throughput has structure finer than the spline follows, of "
                 f"{100 * self.throughput.structure:.2g} %: every pixel has a factor of its own."
             )
+        far = float(np.exp(np.abs(self.throughput.log_factor).max()))
+        if far > FAR_FROM_NOMINAL:
+            lines.append(f"The throughput is up to {far:.2g} times above or below the nominal one: check the stars.")
         if self.study.calibrate.light_error == 0:
             lines.append("Losses by pointing are taken to be alike in all observations (calibrate.light_error).")
         for row in self.fits:
@@ -509,6 +514,11 @@ def calibrate(
         CalibrationFrames.of(given, nominal, one.source(), one.temperature_c)
         for given, one in zip(read, asked.observations, strict=True)
     )
+    for k, one in enumerate(observations):
+        if not one.usable(nominal).any():
+            raise InputError.of("observations", one.name, "frames with a pixel below saturation")
+        if any(np.array_equal(one.raw_dn, other.raw_dn) for other in observations[:k]):
+            raise InputError.of("observations", one.name, "frames that no other observation has")
     stars = [one for one in observations if one.star is not None]
     without = [one for one in observations if one.star is None]
     dark = assumed_dark(nominal, nominal.wavelength_nm.size)

@@ -81,6 +81,8 @@ class CalibrationFrames:
         if good.sum() < 3 or lengths.size != 1:
             raise InputError.of("frames", f"{int(good.sum())} good ones of {lengths.size} exposure times",
                                 "at least 3 of one exposure time", where=frames.name)  # fmt: skip
+        if (frames.flux[good] == frames.flux[good][0]).all():
+            raise InputError.of("frames", "all the same", "frames that differ by their noise", where=frames.name)
         return cls(frames.name, frames.flux[good], float(lengths[0]), temperatures[good], star)
 
     @property

@@ -134,6 +134,8 @@ def measured_variance(raw_dn: Float, light_dn: Float, dark_dn: Float, usable: ND
         Mean of a frame.
     usable : ndarray of bool, shape (n_pixel,)
     """
+    # A pixel that never changes is dead.
+    usable = usable & np.any(raw_dn != raw_dn[0], axis=0)
     steps = np.diff(raw_dn[:, usable], axis=0)
     light, dark = light_dn[usable], dark_dn[usable]
     scale = np.sqrt(np.mean(steps**2, axis=0))

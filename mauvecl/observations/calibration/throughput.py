@@ -44,6 +44,8 @@ STEP_NM, STEP_WIDTH = 0.2, 0.05
 LIMITS = np.array([5.0, 5.0, 0.3, 0.3])
 #: Largest number of iterations, and the change of log throughput at which they end.
 ITERATIONS, SETTLED = 50, 1e-5
+#: Largest change of the logarithm of the throughput in an iteration, and of its difference from the nominal one.
+LARGEST_STEP, LARGEST_LOG = 1.0, 10.0
 #: Range of the logarithm of the smoothing parameter, relative to the information, and of that of spectra's errors.
 LOG_SMOOTHING, LOG_ERROR = (-25.0, 25.0), (-9.0, 0.0)
 
@@ -252,7 +254,16 @@ class ThroughputModel:
     @property
     def n_shape(self) -> int:
         """Number of fitted values of wavelengths (shift, stretch) and width (mean, change): none for a single star."""
-        return 0 if len(self.stars) < 2 else 4 if self.nominal.gaussian_fwhm_nm > 0 else 2
+        return 0 if self.n_stars < 2 else 4 if self.nominal.gaussian_fwhm_nm > 0 else 2
+
+    @property
+    def n_stars(self) -> int:
+        """Number of stars with different spectra, whatever their brightness."""
+        flux = [one.star.flux_flam / one.star.flux_flam.max() for one in self.stars if one.star is not None]
+        return sum(
+            all(one.shape != other.shape or not np.allclose(one, other) for other in flux[:k])
+            for k, one in enumerate(flux)
+        )
 
     @cached_property
     def observed_dn(self) -> Float:
@@ -391,10 +402,7 @@ def fit_throughput(
     """
     nm = nominal.wavelength_nm
     model = ThroughputModel(tuple(stars), nominal, dark, transfer, sky, order, *_basis(nm, knots), light_error)
-    if not model.usable.any(axis=1).all():
-        bad = stars[int(np.argmin(model.usable.any(axis=1)))].name
-        raise InputError.of("observations", bad, "a star with a pixel below saturation")
-    several = len(stars) > 1
+    several = model.n_stars > 1
     error = spectrum_error if spectrum_error is not None else 0.0
     best = _iterated(model, error)
     m, n = model.n_shape, model.basis.shape[1]
@@ -497,12 +505,19 @@ def _iterated(model: ThroughputModel, error: float) -> _Solution:
         linear = model.linearised(coefficients, shape, error)
         smoothing = linear.smoothing()
         found, covariance = linear.solved(smoothing)
-        moved = np.abs(model.basis @ (found[:n] - coefficients)).max()
-        coefficients, shape = found[:n], np.clip(found[n : n + m], -LIMITS[:m], LIMITS[:m])
+        step = found[:n] - coefficients
+        moved = np.abs(model.basis @ step).max()
         if moved < SETTLED:
             return _Solution(linear, smoothing, found, covariance)
-    raise InputError(f"the throughput did not settle within {ITERATIONS} iterations",
-                     "standard stars of the stated brightness", key="observations")  # fmt: skip
+        coefficients = coefficients + step * min(1.0, LARGEST_STEP / moved)
+        shape = np.clip(found[n : n + m], -LIMITS[:m], LIMITS[:m])
+        if not np.abs(model.basis @ coefficients).max() < LARGEST_LOG:
+            break
+    raise InputError(
+        "no throughput makes the spectra of the stars those of the frames",
+        "frames of the stated stars, with dark frames if the dark current is not nominal",
+        key="observations",
+    )
 
 
 def _basis(nm: Float, knots: int) -> tuple[Float, Float]:
