@@ -30,7 +30,7 @@ def main() -> None:
         answer = answer_of(STARS, true, seed)
         f, gain = answer.throughput, answer.transfer.noise.gain
         off = f.log_factor - np.log(true.throughput(f.wavelength_nm) / NOMINAL.throughput(f.wavelength_nm))
-        counts = np.sqrt(f.error**2 - (answer.transfer.gain_error / gain) ** 2)
+        counts = np.sqrt(f.error**2 - answer.transfer.relative_gain_error**2)
         off_counts = off - np.log(true.gain_dn_per_electron / gain)
         covered.append([np.mean(np.abs(off) < 1.96 * f.error), np.mean(np.abs(off_counts) < 1.96 * counts)])
         electrons, dn = np.mean(covered, axis=0)

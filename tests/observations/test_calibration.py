@@ -5,6 +5,7 @@ Draws are NumPy's, so that the simulation shares no code with the engine.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -248,11 +249,42 @@ def test_unknowns_of_a_calibrated_instrument_are_its_modes(answer: CalibrateAnsw
     ],
 )
 def test_frames_that_cannot_be_calibrated_raise(change: dict[str, Any], key: str) -> None:
-    from dataclasses import replace
-
     frames = frames_of(truth(), star("A0V", 5.0), [16.0], 20, np.random.default_rng(6))
     with refused(key):
         calibrate(study_of((("A0V", 5.0),), dark=False), frames=(replace(frames, **change),))
+
+
+def test_frames_that_say_nothing_raise() -> None:
+    """The same frames as two observations, and frames without noise."""
+    frames = frames_of(truth(), star("A0V", 5.0), [16.0], 20, np.random.default_rng(10))
+    stars = (("A0V", 5.0), ("A0V", 5.0))
+    with refused("observations", expected="no other observation"):
+        calibrate(study_of(stars, dark=False), frames=(frames, frames))
+    with refused("frames", expected="differ by their noise"):
+        calibrate(study_of(stars[:1], dark=False), frames=(replace(frames, flux=np.tile(frames.flux[:1], (20, 1))),))
+
+
+@pytest.mark.long
+def test_one_star_seen_twice_is_one_star() -> None:
+    """Errors of its spectrum, and its wavelengths, stay unknown; on its own it is no sign of a wrong spectrum."""
+    rng = np.random.default_rng(11)
+    frames = tuple(frames_of(truth(), star("A0V", v), [16.0], 20, rng) for v in (4.5, 5.0))
+    found = calibrate(study_of((("A0V", 4.5), ("A0V", 5.0)), dark=False), frames=frames)
+    assert found.throughput.shift_nm is None
+    assert np.median(found.throughput.error) > 0.05
+    assert "errors of the star's spectrum" in found.throughput.assumed
+
+
+@pytest.mark.long
+def test_other_stars_than_stated_are_refused_or_reported() -> None:
+    """A B3V star that is called G2V: no throughput fits it and two others; alone, it is far from the nominal one."""
+    rng = np.random.default_rng(12)
+    hot = frames_of(truth(), star("B3V", 4.5), [16.0], 20, rng)
+    others = (frames_of(truth(), star(*one), [16.0], 20, rng) for one in STARS[1:3])
+    with refused("observations", expected="of the stated stars"):
+        calibrate(study_of((("G2V", 4.5), *STARS[1:3]), dark=False), frames=(hot, *others))
+    alone = calibrate(study_of((("G2V", 4.5),), dark=False), frames=(hot,))
+    assert any("check the stars" in text for text in alone.messages)
 
 
 @pytest.fixture
