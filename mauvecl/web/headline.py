@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -81,31 +81,42 @@ def _spread(closed: ClosedForms) -> str:
     return f"; {between(min(ends), max(ends))} if the throughput is {100 * THROUGHPUT:g} % lower or higher"
 
 
-#: How a limit is told, by its quantity: with a value, without one, and if the closed form is slow.
-LIMITS: dict[str, tuple[Callable[[float], str], str, str]] = {
-    "amplitude": (
-        lambda value: f"of at least {short(100 * value)} %", "of no amplitude",
+class Wording(NamedTuple):
+    """Words for a limit."""
+
+    before: str  # what precedes its value
+    value: Callable[[float], str]
+    none: str  # for a limit that does not exist
+    slow: str  # for a limit whose closed form is slow
+
+
+#: Words for limits by their quantity.
+LIMITS = {
+    "amplitude": Wording(
+        "of at least", lambda value: f"{short(100 * value)} %", "of no amplitude",
         "of an amplitude that takes a simulation",
     ),
-    "magnitude": (
-        lambda value: f"to a magnitude of {value:.2f}", "at no magnitude", "to a magnitude that takes a simulation"
+    "magnitude": Wording(
+        "to a magnitude of", lambda value: f"{value:.2f}", "at no magnitude", "to a magnitude that takes a simulation"
     ),
-    "exposure": (lambda value: f"in {short(value)} s", "in no exposure", "in an exposure that takes a simulation"),
+    "exposure": Wording(
+        "in", lambda value: f"{short(value)} s", "in no exposure", "in an exposure that takes a simulation"
+    ),
 }  # fmt: skip
 
 
 def solved(closed: ClosedForms) -> str:
     """Return a sentence on the limit of the quantity that the question solves for, with and without unknowns."""
     q, asked = closed.question, closed.study.limit
-    written, none, slow = LIMITS[asked.of]
+    words = LIMITS[asked.of]
     told, near = [], None
     for unknown in UNKNOWN:
         try:
             assumed = closed.assuming(unknown)
             near = None if assumed.slow else _limit(assumed, near)
-            told.append(slow if near is None else written(near))
+            told.append(words.slow if near is None else f"{words.before} {words.value(near)}")
         except InputError:
-            told.append(none)
+            told.append(words.none)
     flares = "flares" if asked.of == "amplitude" else f"flares of {q.amplitude_percent:g} %"
     at = "" if asked.of == "magnitude" else f" at {q.band} = {q.magnitude:g}"
     first, second = told

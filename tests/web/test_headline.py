@@ -5,7 +5,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy.interpolate import RegularGridInterpolator
 
 pytest.importorskip("bokeh")
 
@@ -19,6 +21,7 @@ from mauvecl.web.fields import UNKNOWN
 from mauvecl.web.headline import chances, other_payloads, solved
 from mauvecl.web.simulations import SIMULATIONS
 from mauvecl.web.state import State
+from mauvecl.web.tabs.limit import MAGNITUDES, PERCENTS, Curve, Map
 
 M_DWARF = "?star=M3V&magnitude=9&amplitude_percent=2&exposure_s=50"
 
@@ -107,3 +110,28 @@ def test_other_payload_is_that_of_its_own_question(tmp_path: Path) -> None:
     other = chances(forms_of(f"{M_DWARF}&instrument=mauve-electrons", tmp_path), {})
     told = " and ".join(percent(one.value) for one in other)
     assert other_payloads(forms_of(M_DWARF, tmp_path)) == f"With the payload mauve-electrons: {told}."
+
+
+@pytest.mark.parametrize("of", ["amplitude", "magnitude"])
+def test_picture_of_the_limit_has_simulated_points_of_its_own_axis_only(of: str, tmp_path: Path) -> None:
+    closed = forms_of(f"{M_DWARF}&realisations=10000&fap=0.05&of={of}", tmp_path)
+    answers = SIMULATIONS["limit"](closed.study, Pool(LocalWorkers([None])))
+    drawn = Curve().drawn(closed, answers)
+    magnitudes = list(drawn.sources["simulated"]["x"])
+    assert bool(magnitudes) == (of == "magnitude")
+    assert all(5 < magnitude < 14 for magnitude in magnitudes)
+    unit = r"of at least [\d.]+ % \[[\d.]+ % to [\d.]+ %\]" if of == "amplitude" else r"magnitude of [\d.]+ \["
+    assert re.search(f"Simulated: 90 % are detected .*{unit}", drawn.text), drawn.text
+
+
+def test_contours_of_the_map_are_labelled_where_they_are(tmp_path: Path) -> None:
+    """Each label stands where the map has its probability, and the columns of the tooltip fit the map."""
+    sources = Map().drawn(forms_of(M_DWARF, tmp_path), {}).sources
+    (image,), (percent,) = sources["map"]["image"], sources["map"]["percent"]
+    assert np.shape(image) == np.shape(percent)
+    x = np.linspace(*MAGNITUDES, np.shape(image)[1])
+    y = np.linspace(*np.log10(PERCENTS), np.shape(image)[0])
+    assert list(sources["labels"]["text"]) == ["10 %", "50 %", "90 %"]
+    at = RegularGridInterpolator((y, x), image)(np.column_stack([sources["labels"]["y"], sources["labels"]["x"]]))
+    assert at == pytest.approx([0.1, 0.5, 0.9], abs=0.03)
+    assert np.log10(percent[:, 0]) == pytest.approx(y)

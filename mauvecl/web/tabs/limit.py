@@ -11,6 +11,7 @@ from scipy import special
 from scipy.interpolate import PchipInterpolator
 
 from mauvecl.web.figures import Canvas
+from mauvecl.web.headline import LIMITS
 from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
 if TYPE_CHECKING:
@@ -23,6 +24,8 @@ Float = NDArray[np.float64]
 MAGNITUDES, PERCENTS = (2.0, 14.0), (0.1, 100.0)
 #: Columns and rows of a map in closed form; smooth quantities are interpolated between them.
 STEPS = 9, 5
+#: Labelled contours, with the part of the line at which the label stands.
+LABELLED = {0.1: 0.25, 0.5: 0.5, 0.9: 0.75}
 #: Initial number of points of a curve, number of times that steps are halved, and change above which they are halved.
 FIRST, HALVINGS, CHANGE = 9, 5, 0.25
 
@@ -159,12 +162,14 @@ class Curve(Picture):
                 text += f"to {q.band} = {x[last] + part * (x[last + 1] - x[last]):.2f}, in closed form."
         if "limit" in answers:
             limits = [one for one in answers["limit"].limits if one.statistic == q.statistic]
-            points = [(p.value, p.probability.value) for one in limits for p in (*one.points, one.check)]
-            sources["simulated"] = dict(zip(("x", "y"), np.array(points).T, strict=True))
-            text += "".join(
-                f" Simulated: {q.band} = {one.value.value:.3f} [{one.value.low:.3f}, {one.value.high:.3f}]."
-                for one in limits
-            )
+            words = LIMITS[closed.study.limit.of]
+            for one in limits:
+                # Points of another quantity than the axis's are only told.
+                points = [(p.value, p.probability.value) for p in (*one.points, one.check)]
+                if one.of == "magnitude":
+                    sources["simulated"] = dict(zip(("x", "y"), np.array(points).T, strict=True))
+                value, low, high = map(words.value, (one.value.value, one.value.low, one.value.high))
+                text += f" Simulated: {100 * power:g} % are detected {words.before} {value} [{low} to {high}]."
         return PictureData(text + " A click chooses a magnitude.", sources, {"power": {"location": power}})
 
 
@@ -176,15 +181,17 @@ class Map(Picture):
     pins, alike = "half", ("band",)
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
-        from bokeh.models import FixedTicker, LinearColorMapper
+        from bokeh.models import FixedTicker, HoverTool, LinearColorMapper
         from bokeh.models.annotations import ColorBar
 
         low, high = np.log10(PERCENTS)
         canvas = Canvas(ink, "magnitude", "flare amplitude", logs, x_range=MAGNITUDES, y_range=(low, high))
         plot: Any = canvas.plot
         mapper = LinearColorMapper(palette="Cividis256", low=0, high=1)
-        plot.image("image", "x", "y", "dw", "dh", source=canvas.source("map", "image", "x", "y", "dw", "dh"),
-                   color_mapper=mapper)  # fmt: skip
+        source = canvas.source("map", "image", "percent", "x", "y", "dw", "dh")
+        image = plot.image("image", "x", "y", "dw", "dh", source=source, color_mapper=mapper)
+        shown = [("detected", "@image{0.000}"), ("magnitude", "$x{0.00}"), ("amplitude", "@percent{0.[00]} %")]
+        plot.add_tools(HoverTool(renderers=[image], tooltips=shown))
         for name, width in (("contours", 1.2), ("half", 2.2)):
             source = canvas.source(name, "xs", "ys")
             plot.multi_line("xs", "ys", source=source, line_color="#ffffff", line_width=width).name = name
@@ -194,6 +201,11 @@ class Map(Picture):
         )  # fmt: skip
         cells.name = "simulated"
         canvas.pinned(plot.multi_line, "xs", "ys", halo="#ffffff")
+        plot.text(
+            "x", "y", "text", source=canvas.source("labels", "x", "y", "text"), text_align="center",
+            text_baseline="middle", text_font={"value": "system-ui"}, text_font_size="11px", text_color="#1b2733",
+            background_fill_color="#ffffff", background_fill_alpha=0.85, padding=2,
+        ).name = "labels"  # fmt: skip
         canvas.own_point()
         plot.yaxis.ticker = FixedTicker(ticks=[-1, 0, 1, 2])
         plot.yaxis.major_label_overrides = {-1: "0.1 %", 0: "1 %", 1: "10 %", 2: "100 %"}
@@ -214,7 +226,8 @@ class Map(Picture):
         sources: dict[str, Any] = {
             "own": {"x": [q.magnitude], "y": [np.log10(q.amplitude_percent)]},
             "simulated": {"x": [], "y": [], "p": []},
-            "map": {"image": [], "x": [], "y": [], "dw": [], "dh": []},
+            "map": {"image": [], "percent": [], "x": [], "y": [], "dw": [], "dh": []},
+            "labels": {"x": [], "y": [], "text": []},
             "contours": {"xs": [], "ys": []},
             "half": {"xs": [], "ys": []},
         }
@@ -225,6 +238,7 @@ class Map(Picture):
                 "map": _image(x, y, p),
                 "contours": _contours(x, y, p, 0.1, 0.9),
                 "half": _contours(x, y, p, 0.5),
+                "labels": _labels(x, y, p),
             }
             share = 100 * float(np.mean(p >= 0.5))
             text = (
@@ -243,8 +257,8 @@ def _image(x: Float, y: Float, p: Float) -> dict[str, Any]:
     """Return the edges of cells around the points of a map."""
     half_x, half_y = 0.5 * (x[1] - x[0]), 0.5 * (y[1] - y[0])
     return {
-        "image": [p], "x": [x[0] - half_x], "y": [y[0] - half_y], "dw": [x[-1] - x[0] + 2 * half_x],
-        "dh": [y[-1] - y[0] + 2 * half_y],
+        "image": [p], "percent": [np.repeat(10 ** y[:, None], x.size, axis=1)], "x": [x[0] - half_x],
+        "y": [y[0] - half_y], "dw": [x[-1] - x[0] + 2 * half_x], "dh": [y[-1] - y[0] + 2 * half_y],
     }  # fmt: skip
 
 
@@ -253,6 +267,21 @@ def _contours(x: Float, y: Float, p: Float, *levels: float) -> dict[str, Any]:
 
     lines: list[Any] = [line for level in levels for line in contour_generator(x, y, p).lines(level)]
     return {"xs": [line[:, 0].tolist() for line in lines], "ys": [line[:, 1].tolist() for line in lines]}
+
+
+def _labels(x: Float, y: Float, p: Float) -> dict[str, Any]:
+    """Return the names of contours, each at another part of its line: the lines are close to each other."""
+    from contourpy import contour_generator
+
+    columns: dict[str, Any] = {"x": [], "y": [], "text": []}
+    for level, part in LABELLED.items():
+        lines: list[Any] = list(contour_generator(x, y, p).lines(level))
+        if lines:
+            longest = max(lines, key=len)
+            at = longest[np.argsort(longest[:, 0])][int(part * (len(longest) - 1))]
+            for name, value in zip(columns, (float(at[0]), float(at[1]), f"{100 * level:g} %"), strict=True):
+                columns[name].append(value)
+    return columns
 
 
 class Limit(Tab):
