@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,7 +14,7 @@ from mauvecl.lightcurve.flares.shapes import shape_of
 from mauvecl.lightcurve.search.importance_sampling import SampledRate
 from mauvecl.observations.colour import Colour, event_colour
 from mauvecl.observations.completeness import Completeness, inject
-from mauvecl.observations.event_spectrum import EventSpectrum, event_spectrum, measure_flare
+from mauvecl.observations.event_spectrum import FLARE_SNR, EventSpectrum, event_spectrum, measure_flare
 from mauvecl.observations.events import ObservedEvent, detect_events, measure_events
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames
@@ -108,7 +108,7 @@ class Analysis:
         series = None if self.spectra is None else self.spectra.series
         if series is None or "light" in free_of(series.jitters):
             return False
-        return bool(series.changes) or misled(self.events)
+        return bool(series.changes) or misled(self.events, self.spectra.found if self.spectra is not None else ())
 
     def false_alarms(self, event: ObservedEvent) -> tuple[float, float]:
         """Return the false alarms per star-day at an event's statistic: in normal noise, and in noise as measured."""
@@ -220,7 +220,7 @@ def analyse_frames(
     seen = None if series is None else [event_spectrum(survey, series, taken, one) for one in detected]
     causes = None if seen is None else [one.cause for one in seen]
     events = measure_events(survey, taken, candidates, detected, causes)
-    if series is not None and jitters is None and "light" not in free_of(series.jitters) and misled(events):
+    if series is not None and jitters is None and "light" not in free_of(series.jitters) and misled(events, seen):
         # Changes that are too small to stand out by themselves, but not for the search.
         return analyse_frames(
             given, false_alarms=false_alarms, per=per, shape=shape, seed=seed, model=model, rank=rank,
@@ -247,9 +247,10 @@ def free_of(jitters: Mapping[str, float]) -> list[str]:
     return [name for name, sd in jitters.items() if np.isinf(sd)]
 
 
-def misled(events: list[ObservedEvent]) -> bool:
-    """Return whether changes of throughput are among events that pass for flares in the searched sums."""
-    return any(one.kind in ("step", "throughput") for one in events)
+def misled(events: Sequence[ObservedEvent], spectra: Sequence[EventSpectrum] | None) -> bool:
+    """Return whether events of the searched sums are, or rather resemble, changes of the throughput."""
+    resemble = any(one.chi2["throughput"] < one.chi2["flare"] and one.snr < FLARE_SNR for one in spectra or ())
+    return resemble or any(one.kind in ("step", "throughput") for one in events)
 
 
 def _spectral_messages(spectra: SpectralAnalysis) -> list[str]:
