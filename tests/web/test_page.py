@@ -677,6 +677,93 @@ def test_page_is_accessible(browser: Browser, server: Server, theme: str) -> Non
     page.context.close()
 
 
+#: Elements that are pressed or entered, each with the label that is pressed for it.
+TARGETS = """
+() => [...document.querySelectorAll("button, select, input, summary, [role=tab], a")]
+  .filter(e => e.checkVisibility() && !e.hidden && !e.matches(".skip"))
+  .map(e => [e.outerHTML.slice(0, 120), (e.type === "checkbox" ? e.closest("label") : e).getBoundingClientRect()])
+  .filter(([, box]) => Math.min(box.width, box.height) < 24).map(([what, box]) => [what, box.width, box.height])
+"""
+
+
+@pytest.mark.parametrize("width", [390, 1440])
+def test_targets_have_24_pixels(browser: Browser, server: Server, width: int) -> None:
+    page = fresh(browser, server.address, viewport={"width": width, "height": 900})
+    if width < 900:
+        page.get_by_text("Change the question").click()
+    page.get_by_text("Advanced", exact=True).click()
+    for name in TABS:
+        page.locator(f"#tab-{name}").click()
+        settled(page)
+        assert page.evaluate(TARGETS) == [], name
+    page.context.close()
+
+
+def test_text_follows_the_readers_size(page: Page) -> None:
+    """Twice the size in the browser's settings is twice the size on the page; four sizes are used."""
+    sizes = """() => [...new Set([...document.querySelectorAll("body *")].filter(e => e.checkVisibility() &&
+        [...e.childNodes].some(n => n.nodeType === 3 && n.textContent.trim()))
+        .map(e => parseFloat(getComputedStyle(e).fontSize).toFixed(2)))].sort()"""
+    before = page.evaluate(sizes)
+    assert len(before) <= 4, before
+    page.add_style_tag(content="@media all { :root { font-size: 187.5% !important; } }")
+    after = page.evaluate(sizes)
+    # The chance grows with the window, up to its largest size.
+    small = [float(one) for one in before][:3]
+    assert [float(one) for one in after][:3] == pytest.approx([2 * one for one in small], rel=0.01)
+    source = page.evaluate("fetch('assets/page.css').then(r => r.text())")
+    assert not re.search(r"font(-size)?:[^;]*\dpx", source), "relative sizes only"
+
+
+def test_picture_is_one_named_stop(page: Page) -> None:
+    settled_ranges(page, "excess")
+    stops = """box => { const found = []; const walk = node => { for (const e of node.children) {
+        if (e.tabIndex >= 0) found.push(e.className); if (e.shadowRoot) walk(e.shadowRoot); walk(e) } };
+        walk(box); return found }"""
+    box = page.locator("#plot-excess")
+    assert box.evaluate(stops) == []
+    assert box.evaluate("e => e.tabIndex") == 0
+    assert page.get_by_role("img", name="Flare minus quiet, in sigma of the noise").count() == 1
+    page.locator("#tab-detection").focus()
+    page.keyboard.press("Tab")
+    until(page, lambda: page.evaluate("document.activeElement.id") == "plot-excess" or not page.keyboard.press("Tab"))
+    assert box.evaluate("e => getComputedStyle(e).outlineStyle") != "none"
+
+
+def test_forced_colours_show_the_selected_tab(browser: Browser, server: Server) -> None:
+    page = fresh(browser, server.address, forced_colors="active")
+    ground = "name => getComputedStyle(document.getElementById(`tab-${name}`)).backgroundColor"
+    grounds = [page.evaluate(ground, name) for name in TABS]
+    assert len(set(grounds)) == 2
+    assert grounds.count(grounds[0]) == 1, "the first, which is selected"
+    page.context.close()
+
+
+def test_page_without_scripts_says_so(browser: Browser, server: Server) -> None:
+    context = browser.new_context(java_script_enabled=False)
+    page = context.new_page()
+    page.goto(server.address)
+    told = page.locator(".noscript")
+    assert told.is_visible()
+    assert "needs JavaScript" in told.inner_text()
+    context.close()
+
+
+def test_slider_speaks_its_unit(page: Page) -> None:
+    assert page.get_by_label("Exposure, slider").get_attribute("aria-valuetext") == "50 s"
+    assert page.get_by_label("Magnitude, slider").get_attribute("aria-valuetext") == "V = 8.5"
+
+
+def test_help_is_next_to_its_question_mark(page: Page) -> None:
+    button = page.get_by_role("button", name="What is Magnitude?")
+    button.click()
+    mark, message = button.bounding_box(), page.locator("#help-magnitude").bounding_box()
+    assert mark is not None
+    assert message is not None
+    assert abs(message["x"] - mark["x"]) < 60
+    assert abs(message["y"] - mark["y"]) < 60
+
+
 def test_page_works_by_keyboard(page: Page) -> None:
     """From the first field to a download, with the keys alone; each stop can be seen."""
     page.evaluate("document.body.focus()")

@@ -140,7 +140,9 @@ export class Fields {
         const place = this.scales[name].place(value)
         if (slider.value !== String(place)) slider.value = String(place)
       }
-      slider.setAttribute("aria-valuetext", this.entered[name])
+      const [unit] = every(`[data-field="${name}"] .unit`)
+      const spoken = name === "magnitude" ? `${this.entered.band} = ${this.entered[name]}` : `${this.entered[name]} ${unit?.textContent ?? ""}`
+      slider.setAttribute("aria-valuetext", spoken.trim())
     }
     if (name === "sky") {
       for (const [other, sky] of Object.entries(this.words.under)) {
