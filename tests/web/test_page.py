@@ -803,7 +803,7 @@ def test_page_fits_a_phone_and_zoom(browser: Browser, server: Server) -> None:
     """390 pixels wide, and 1280 pixels at 200 %: the answer first, nothing to scroll sideways for."""
     for width, height in ((390, 844), (640, 400)):
         page = fresh(browser, server.address, viewport={"width": width, "height": height})
-        card, asked = page.locator("#card").bounding_box(), page.locator("#asked").bounding_box()
+        card, asked = page.locator("#numbers").bounding_box(), page.locator("#asked").bounding_box()
         assert card is not None
         assert asked is not None
         assert card["y"] < asked["y"], "the answer first"

@@ -127,7 +127,7 @@ ${control(name)}
 <div id="numbers" role="group" aria-label="Chance to detect the flare">
 % for choice, title in titles.items():
 <button type="button" class="odds" data-unknown="${choice}" aria-pressed="${"true" if choice == fields.FIELDS["unknown"].first else "false"}" title="Show the pictures and tables of this">
-<span class="chance"${' id="chance"' if loop.first else ""}>…</span>
+<span class="chance"${' id=chance' if loop.first else ""}>…</span>
 <span class="title">${title}</span>
 <span class="interval"></span>
 </button>
