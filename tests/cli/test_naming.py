@@ -19,7 +19,7 @@ from mauvecl.schema.quantities import count, number, numbers
 
 ROOT = Path(mauvecl.__file__).parent
 #: The command line itself, and the command that the page offers.
-OF_FLAGS = ("cli/", "web/downloads.py")
+OF_FLAGS = ("cli/", "web/commands.py")
 FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
 #: Whole commands are named as they are typed.
 COMMAND = re.compile(r"`(?:mauvecl|wsl) [^`]*`")
