@@ -60,7 +60,7 @@ async def session(host: str, number: int) -> None:
     for step, tab in enumerate(TABS):
         link = f"?magnitude={8 + 0.01 * number + 0.1 * step:.2f}&exposure_s={50 + 5 * number}"
         await ask("pictures", ask="answer", link=link, tab=tab)
-    link = f"?star=M3V&see={target.replace(' ', '+')}&magnitude={8 + 0.01 * number:.2f}"
+    link = f"?star=M3V&targets={target.replace(' ', '+')}&magnitude={8 + 0.01 * number:.2f}"
     for kind in ("plan", "completeness"):
         await ask("ended", ask="simulate", link=link, kind=kind)
         await ask("pictures", ask="answer", link=link, tab=kind)

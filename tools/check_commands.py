@@ -45,7 +45,7 @@ TEXTS: dict[str, tuple[str, ...]] = {
     "own_unknown": ("", "200 1, 450 3, 700 1"),
     "target": ("290.68 +11.12", "30 -10"),
     "time": ("2026-09-01T12:00", "2026-03-01T00:00"),
-    "see": ("eps Eri", "AU Mic"),
+    "targets": ("eps Eri", "AU Mic"),
     "realisations": ("10000",),
     "fap": ("0.05", "0.02"),
     "balmer_jump": ("", "2.5"),

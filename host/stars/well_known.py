@@ -30,7 +30,7 @@ class WellKnown:
     @property
     def about(self) -> str:
         """Its type, distance and magnitude with their source, in words."""
-        return f"{self.spectral_type}, {self.distance_pc:g} pc, V = {self.magnitude:g}; {self.source}"
+        return f"{self.spectral_type}, {self.distance_pc:g} pc, V = {self.magnitude:g}; {self.source.partition(',')[0]}"
 
 
 def text() -> str:

@@ -102,6 +102,11 @@ class Verb:
     default: Callable[[dict[str, Any]], Study] | None = None
     tab: bool = False
 
+    def accepts(self, key: str) -> bool:
+        """Return whether the command has the flags of a key or section of the study."""
+        taken = (one for one in (*self.observation, *self.takes) if one != self.without)
+        return key != self.without and any(key == one or key.startswith(f"{one}.") for one in taken)
+
     @property
     def ask(self) -> Callable[..., Any]:
         """The function that answers."""

@@ -258,6 +258,10 @@ class Widget:
         Unit as the page shows it; that of the key by default.
     scale : float
         Factor from the value of the key to that of the page.
+    most : float, optional
+        Largest value that a server computes for a visitor; that of the key by default.
+    kind : str
+        "day" for a calendar; by default a field of text, or a choice of words.
     slider : Slider, optional
     """
 
@@ -270,6 +274,8 @@ class Widget:
     choices: tuple[str, ...] = ()
     unit: str | None = None
     scale: float = 1.0
+    most: float | None = None
+    kind: str = ""
     slider: Slider | None = None
 
 

@@ -18,6 +18,8 @@ from mauvecl.schema.text import shortened, shown
 from mauvecl.study.sections import Section
 
 if TYPE_CHECKING:
+    from astropy.table import Table
+
     from mauvecl.host.orbit.orbit import Orbit
     from mauvecl.host.orbit.targets import Target
     from mauvecl.host.orbit.time_grid import TimeGrid
@@ -31,8 +33,34 @@ MAX_TARGETS = 500
 class OrbitQuestion(Section):
     """Orbit, time grid, targets and visibility limits."""
 
-    start: Annotated[str, Help("First day or time, UTC"), Flag("--start")] = "2027-01-01"
-    days: Annotated[float, Unit("d"), Range(0, open_low=True), Help("Length of time"), Flag("--days")] = 365.0
+    start: Annotated[
+        str,
+        Help("First day or time, UTC"),
+        Flag("--start"),
+        Widget(
+            label="First day",
+            hint="The first day of the time that is looked at, UTC.",
+            group="Campaign",
+            place=1,
+            kind="day",
+        ),
+    ] = "2027-01-01"
+    days: Annotated[
+        float,
+        Unit("d"),
+        Range(0, open_low=True),
+        Help("Length of time"),
+        Flag("--days"),
+        Widget(
+            label="Days",
+            hint="How many days from the first one on are looked at: 365 show every season.",
+            group="Campaign",
+            place=2,
+            unit="d",
+            most=1000,
+            slider=Slider(5, 730, 5),
+        ),
+    ] = 365.0
     step_s: Annotated[Duration, Help("Time between the computed positions"), Flag("--step")] = 60.0
     tle: Annotated[Path | None, Help("File of two-line elements, newer than the embedded ones"), Flag("--tle")] = None
     kind: Annotated[
@@ -191,10 +219,10 @@ class PlanQuestion(Section):
         Help("Exposure of each target at most", default="all"),
         Flag("--hours"),
         Widget(
-            label="Hours of the campaign",
-            hint="How long the target is observed, at most: what would be found is on the tab Plan.",
-            group="Visibility and plan",
-            place=1,
+            label="Hours on each target",
+            hint="How long each target is observed, at most: never longer than it is seen.",
+            group="Campaign",
+            place=3,
             first="100",
             slider=Slider(10, 1000, 10),
         ),
@@ -251,60 +279,73 @@ def targets_of(orbit: OrbitQuestion, plan: PlanQuestion) -> list[Target]:
 
 
 def read_targets(path: Path) -> list[dict[str, Any]]:
-    """Read targets from a CSV or ECSV table with a column ``name`` and any other keys of `PlanTarget`.
+    """Read targets from a CSV or ECSV table; see `targets_in`. Paths in it are relative to its folder."""
+    return targets_in(
+        read_text_table(path, "table of targets"), f"table of targets {shortened(path.name)}", path.parent
+    )
+
+
+def targets_in(table: Table, named: str, folder: Path | None = None) -> list[dict[str, Any]]:
+    """Return the targets of a table with a column ``name`` and any other keys of `PlanTarget`.
 
     ``ra`` and ``dec`` in degrees replace ``coordinates``, and ``V`` replaces ``magnitude``. Empty cells are ignored.
-    """
-    import numpy as np
 
-    table = read_text_table(path, "table of targets")
-    named = f"table of targets {shortened(path.name)}"
+    Parameters
+    ----------
+    table : Table
+    named : str
+        Description of the table, for messages.
+    folder : Path, optional
+        Folder of paths in the table; without it, columns of paths are refused.
+    """
     columns = {str(name).strip(): name for name in table.colnames}
     if "V" in columns:
         columns["magnitude"] = columns.pop("V")
     if "name" not in columns:
         raise InputError(f"{named} has the columns {shown(', '.join(columns), 200)}", "one called name", key="name")
-    keys = {*PlanTarget.model_fields, "ra", "dec"}
+    keys = {*PlanTarget.model_fields, "ra", "dec"} - (set(PATH_KEYS) if folder is None else set())
     other = next((name for name in columns if name not in keys), None)
     if other is not None:
         raise InputError(f"{named} has the column {shortened(other)}", f"some of {', '.join(sorted(keys))}", key=other)
     if not 1 <= len(table) <= MAX_TARGETS:
         raise InputError(f"{named} holds {len(table)} targets", f"1 to {MAX_TARGETS}", key="name", value=len(table))
-    targets = []
-    for number, row in enumerate(table, 1):
-        one: dict[str, Any] = {}
-        for key, name in columns.items():
-            value = row[name]
-            if not np.ma.is_masked(value) and str(value).strip():
-                one[key] = value.item() if hasattr(value, "item") else value
-        if ("ra" in one) != ("dec" in one) or ("ra" in one and "coordinates" in one):
-            raise InputError(
-                f"{named}: row {number} has only one of ra and dec, or coordinates as well",
-                "both or neither",
-                key="coordinates",
-                value=number,
-            )
-        odd = next((key for key in ("ra", "dec") if key in one and not _is_number(one[key])), None)
-        if odd is not None:
-            raise InputError(
-                f"{named}: row {number} has {odd} = {shortened(str(one[odd]))}",
-                "degrees; sexagesimal values belong in a column coordinates",
-                key=odd,
-                value=one[odd],
-            )
-        if "ra" in one:
-            one["coordinates"] = f"{one.pop('ra')} {one.pop('dec')}"
-        if "name" in one:
-            one["name"] = str(one["name"])
-        for key in PATH_KEYS:
-            if isinstance(one.get(key), str):
-                one[key] = path.parent / one[key]
-        try:
-            PlanTarget.model_validate(one)
-        except ValidationError as error:
-            raise input_error(f"{named}: row {number}", PlanTarget, error) from error
-        targets.append(one)
-    return targets
+    cells = ({key: row[name] for key, name in columns.items() if _is_given(row[name])} for row in table)
+    return [_target(row, f"{named}: row {number}", folder) for number, row in enumerate(cells, 1)]
+
+
+def _target(row: dict[str, Any], named: str, folder: Path | None) -> dict[str, Any]:
+    """Return the data of a target from the cells of its row."""
+    one = {key: value.item() if hasattr(value, "item") else value for key, value in row.items()}
+    if ("ra" in one) != ("dec" in one) or ("ra" in one and "coordinates" in one):
+        raise InputError(
+            f"{named} has only one of ra and dec, or coordinates as well", "both or neither", key="coordinates"
+        )
+    odd = next((key for key in ("ra", "dec") if key in one and not _is_number(one[key])), None)
+    if odd is not None:
+        raise InputError(
+            f"{named} has {odd} = {shortened(str(one[odd]))}",
+            "degrees; sexagesimal values belong in a column coordinates",
+            key=odd,
+            value=one[odd],
+        )
+    if "ra" in one:
+        one["coordinates"] = f"{one.pop('ra')} {one.pop('dec')}"
+    if "name" in one:
+        one["name"] = str(one["name"])
+    for key in PATH_KEYS:
+        if folder is not None and isinstance(one.get(key), str):
+            one[key] = folder / one[key]
+    try:
+        PlanTarget.model_validate(one)
+    except ValidationError as error:
+        raise input_error(named, PlanTarget, error) from error
+    return one
+
+
+def _is_given(cell: Any) -> bool:
+    import numpy as np
+
+    return not np.ma.is_masked(cell) and bool(str(cell).strip())
 
 
 def _is_number(cell: Any) -> bool:

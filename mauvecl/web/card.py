@@ -7,14 +7,14 @@ from typing import Any
 from mauvecl.web.closed_forms import ClosedForms, percent, short
 from mauvecl.web.headline import TITLES, chances
 from mauvecl.web.simulations import OTHER
-from mauvecl.web.tabs.tab import Answers
+from mauvecl.web.tabs.tab import Answers, Tab
 
 #: Part of the message about the throughput, which the page shows once.
 NOMINAL = "The throughput is nominal"
 #: Part of the message about the chance with unknowns, which the card shows.
 BOTH = "Everything but the noise is taken as known"
 #: Answers whose messages are shown, since they include those of the others.
-TOLD = ("detection", "measure", "completeness", "visible", "plan")
+TOLD = ("detection", "measure")
 
 
 def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
@@ -45,18 +45,42 @@ def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
         f"chance to detect {closed.words}, by the statistic {q.statistic} at a false-alarm probability of {q.fap:g} "
         f"per test, with the payload {q.instrument}"
     )
-    # Severe messages begin in capitals.
-    notes = [(m, "danger" if m.partition(":")[0].isupper() else "info") for m in _messages(closed, answers)]
     return {
+        "headline": True,
         "numbers": [one.shown for one in both],
         "chosen": q.unknown,
         "shown": percent(chosen.value),
         "interval": f"{TITLES[q.unknown]}; {chosen.how}",
         "words": words,
         "facts": facts,
-        "notes": notes,
-        "simulated": sorted(name for name in answers if name not in ("snr", "draw", "seen", OTHER)),
+        "notes": _with_kinds(_messages(closed, answers)),
+        "simulated": _simulated(answers),
     }
+
+
+def without_headline(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
+    """Return what `card` returns, for a tab that asks for no chance of detection."""
+    messages = list(answers[tab.answer].messages) if tab.answer in answers else []
+    return {
+        "headline": False,
+        "numbers": [],
+        "chosen": "",
+        "shown": tab.title,
+        "interval": "",
+        "words": tab.words(closed.question),
+        "facts": [],
+        "notes": _with_kinds([m for m in dict.fromkeys(messages) if not m.startswith(NOMINAL)]),
+        "simulated": _simulated(answers),
+    }
+
+
+def _simulated(answers: Answers) -> list[str]:
+    return sorted(name for name in answers if name not in ("snr", "draw", "seen", OTHER))
+
+
+def _with_kinds(messages: list[str]) -> list[tuple[str, str]]:
+    """Return messages with their kinds: severe ones begin in capitals."""
+    return [(m, "danger" if m.partition(":")[0].isupper() else "info") for m in messages]
 
 
 def _messages(closed: ClosedForms, answers: Answers) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import itertools
 import re
 from collections.abc import Callable
@@ -11,7 +12,7 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin
 from pydantic.fields import FieldInfo
 
 from mauvecl.host.stars.catalogue import embedded
-from mauvecl.host.stars.star_names import spectrum_name
+from mauvecl.host.stars.star_names import near_names, spectrum_name
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Range, Slider, Unit, Widget, first, found, range_of, unit_of
 from mauvecl.schema.physical import LineFraction
@@ -30,6 +31,8 @@ UNKNOWN = ("nothing", "the usual")
 SKIES = ("brightness", "target and time", "none")
 #: Characters of a field that are looked at.
 MOST_CHARACTERS = 200
+#: Targets whose visibility and plan a visitor may ask for.
+MOST_TARGETS = 30
 
 
 @dataclass(frozen=True)
@@ -148,21 +151,61 @@ def star_name(text: str) -> str:
     return spectrum_name(text, own=False)
 
 
-def seen_target(text: str) -> str:
-    """Parse a target: empty, a name of the embedded list, or coordinates."""
-    from mauvecl.host.orbit.targets import Target
+def day(text: str) -> str:
+    """Parse a day such as 2027-01-31."""
+    from mauvecl.host.sky.helioecliptic import YEARS
 
+    expected = f"a day such as 2027-01-31, from {YEARS[0]} to {YEARS[1] - 1}"
     try:
-        if text.strip():
-            Target.of(text)
-    except InputError as error:
+        found = datetime.date.fromisoformat(text.strip())
+    except ValueError:
+        raise InputError(f"{shortened(text)} is no day", expected, key="start", value=text) from None
+    if not YEARS[0] <= found.year < YEARS[1]:
+        raise InputError(f"{found} is out of range", expected, key="start", value=text)
+    return found.isoformat()
+
+
+def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
+    """Parse targets: a name or coordinates in each line, or a CSV table with a header of keys of `PlanTarget`.
+
+    Parameters
+    ----------
+    text : str
+    check : bool
+        Whether their positions must be known, and all must differ.
+    """
+    from mauvecl.host.files.text_table import text_table
+    from mauvecl.study.orbits import PlanTarget, targets_in
+
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    if not lines:
+        return ()
+    if lines[0].partition(",")[0].strip().casefold() != "name":
+        quoted = (line.replace('"', "") for line in lines)
+        lines = ["name", *(f'"{line}"' for line in quoted)]
+    if len(lines) - 1 > MOST_TARGETS:
         raise InputError(
-            f"{shortened(text)} is neither a target of the list nor coordinates",
-            "a name such as eps Eri or AU Mic, or coordinates such as 53.23 -9.46",
-            key="see",
-            value=text,
-        ) from error
-    return text
+            f"{len(lines) - 1} targets are too many", f"at most {MOST_TARGETS}, or the command line", key="targets"
+        )
+    rows = targets_in(text_table("\n".join(lines), "the table", commas=True), "the table")
+    if not check:
+        return tuple(rows)
+    for number, row in enumerate(rows, 1):
+        try:
+            PlanTarget.model_validate(row).target(simbad=False)
+        except InputError as error:
+            like = ", ".join(near_names(row["name"], stars_only=True))
+            raise InputError(
+                f"the position of {shortened(row['name'])} (target {number}) is unknown",
+                f"a name such as {like}, or coordinates such as 53.23 -9.46",
+                key="targets",
+                value=row["name"],
+            ) from error
+    names = [row["name"] for row in rows]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"{shortened(twice)} is named twice", "different targets", key="targets", value=twice)
+    return tuple(rows)
 
 
 def star_words(name: str) -> str:
@@ -198,6 +241,12 @@ class Field:
         Key of the study that takes the value; empty if `Question` converts it.
     scale : float
         Factor from the value of the key to that of the page.
+    most : int
+        Largest number of characters.
+    kind : str
+        Kind of the widget if not that of what is read: "day" or "targets".
+    own_keys : tuple of str
+        Keys and sections of the study that it sets without a path.
     """
 
     label: str
@@ -210,6 +259,14 @@ class Field:
     place: int = 0
     path: tuple[str, ...] = ()
     scale: float = 1.0
+    most: int = MOST_CHARACTERS
+    kind: str = ""
+    own_keys: tuple[str, ...] = ()
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Keys and sections of the study that it sets."""
+        return self.own_keys or (".".join(self.path),)
 
 
 def _text(value: Any) -> str:
@@ -237,6 +294,7 @@ def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
         widget.place,
         path,
         widget.scale,
+        kind=widget.kind,
     )
 
 
@@ -244,6 +302,8 @@ def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> C
     choices = widget.choices or (get_args(field.annotation) if get_origin(field.annotation) is Literal else ())
     if choices:
         return Choice(choices)
+    if widget.kind == "day":
+        return day
     if field.annotation is bool:
         return Choice(("no", "yes"), lambda text: text == "yes")
     flag = first(field, Flag)
@@ -253,6 +313,8 @@ def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> C
     reach = first(field, Range)
     if reach is None:
         return str
+    if widget.most is not None:
+        reach = replace(reach, high=widget.most)
     if widget.scale != 1.0:
         reach = replace(reach, low=widget.scale * reach.low, high=widget.scale * reach.high)
     number = Number(reach, whole=field.annotation is int, unit=unit)
@@ -264,40 +326,45 @@ _OWN = {
     "star": Field(
         "Star", "G2V", star_name,
         "Whose spectrum: a spectral type of the library, one of its stars by any name (GJ 581, HD 40307), or your own "
-        "file.", group="", place=-1,
+        "file.", group="", place=-1, own_keys=("star.library",),
     ),
     "lines": Field(
         "Emission lines", "", line_fluxes,
         "Flux of lines as a fraction of the continuum's in 200-700 nm, such as Mg II=0.03, Ca II=0.02, Balmer=0.1, or "
-        "280=0.03 for one at 280 nm.", group="Flare's spectrum", place=1,
+        "280=0.03 for one at 280 nm.", group="Flare's spectrum", place=1, own_keys=("flare.spectrum",),
     ),
     "sky": Field("Sky", "brightness", Choice(SKIES), "Zodiacal light behind the star.", group="Sky", place=0,
+        own_keys=("sky",),
     ),
     "statistic": Field(
         "Detection statistic", "matched", Choice(tuple(STATISTICS)),
         "; ".join(f"{name}: {one.definition}" for name, one in STATISTICS.items()) + ".", group="Detection", place=1,
+        own_keys=("run.statistics",),
     ),
     "unknown": Field(
         "Unknown", UNKNOWN[0], Choice(UNKNOWN),
         "What differs from exposure to exposure and is not known: the usual are detector temperature, light lost and "
         "sky. They are drawn, and the statistic is made blind to them. The card shows both chances; this is for the "
         "pictures, tables and simulations.", group="", place=3,
+        own_keys=("nuisances.usual",),
     ),
     "own_unknown": Field(
         "Own unknown spectrum", "", points,
         "Something else of known shape and unknown strength, such as stray light: pairs of nm and DN, as in "
-        "200 1, 450 3, 700 1, or a file of two columns.", group="Unknown", place=1,
+        "200 1, 450 3, 700 1, or a file of two columns.", group="Unknown", place=1, own_keys=("nuisances.own",),
     ),
-    "see": Field(
-        "Target to see", "", seen_target,
-        "When it can be seen is on the tab Visibility: a name such as eps Eri or AU Mic, or coordinates such as "
-        "53.23 -9.46.", group="Visibility and plan", place=0,
+    "targets": Field(
+        "Targets", "", targets,
+        "Stars by name, such as eps Eri or AU Mic, or coordinates such as 53.23 -9.46. What is known of a star need "
+        "not be entered; paste a list of names, or a CSV table with columns such as name, ra, dec, V, spectral_type, "
+        "distance_pc, mass_msun and age_myr.", group="Campaign", place=0, most=MOST_TARGETS * 100, kind="targets",
+        own_keys=("plan.targets",),
     ),
     "realisations": Field(
         "Realisations", "100000",
         Choice((*map(str, REALISATIONS), *(f"{count} sampled" for count in SAMPLED)), draws),
         "How many noisy exposures a simulation draws. At least 100 must lie beyond the threshold; a sampled tail "
-        "(importance sampling) needs fewer.", group="Detection", place=2,
+        "(importance sampling) needs fewer.", group="Detection", place=2, own_keys=("run.realisations", "run.tails"),
     ),
 }  # fmt: skip
 _KEYS = {
@@ -324,12 +391,13 @@ ADVANCED = {
         "Detector",
         "Sky",
         "Unknown",
-        "Visibility and plan",
         "Change",
     )
 }
 #: Fields of the card.
 SOLVED = _group("Limit")
+#: Fields of the form above the tabs of targets.
+CAMPAIGN = _group("Campaign")
 #: Fields that ask for something under one sky only.
 ASKED_UNDER = {"sky_brightness": "brightness", "target": "target and time", "time": "target and time"}
 #: Questions to begin with; the amplitudes of the first two are the paper's smallest, the others are examples (assumed).

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -58,6 +59,8 @@ INKS = {
 }  # fmt: skip
 
 
+#: Colours of the curves of several targets; further targets are in the table alone.
+TARGETS = ("star", "flare", "sky", "own", "dark", "read", "bias", "drawn")
 #: Dash patterns of the lines of pinned scenarios: lengths of dashes and gaps.
 DASHES = ("6 3", "9 3 2 3", "2 2")
 
@@ -129,6 +132,12 @@ class Canvas:
         kind: Any = partial(self.plot.step, mode="center") if step else self.plot.line
         made = kind("x", "y", source=source, color=self.ink[colour], **({"line_width": 1.6} | how))
         return self._described(made, called, colour, "dash" if "line_dash" in how else "line", show)
+
+    def targets(self, name: str, called: str, **how: Any) -> None:
+        """Add lines of columns x and y for several targets, with tooltips."""
+        for k, colour in enumerate(TARGETS):
+            curve = self.line(f"{name} {k}", f"target {k + 1}", colour, line_width=2, **how)
+            self.tooltips(curve, (called, "y"))
 
     def band(self, name: str, called: str, colour: str, *, show: str = "", alpha: float = 0.22) -> Any:
         """Add a band of columns x, low and high."""
@@ -222,6 +231,17 @@ class Canvas:
                     text_color=self.ink.text, text_alpha=0.8,
                 )
             )  # fmt: skip
+
+
+def curves(name: str, drawn: Sequence[tuple[Any, Any]]) -> dict[str, dict[str, Any]]:
+    """Return the sources of `Canvas.targets` from x and y of each target."""
+    empty: list[tuple[Any, Any]] = [([], [])] * (len(TARGETS) - len(drawn))
+    return {f"{name} {k}": {"x": x, "y": y} for k, (x, y) in enumerate([*drawn[: len(TARGETS)], *empty])}
+
+
+def target_names(names: Sequence[str]) -> dict[str, str]:
+    """Return the entries of the legend of `Canvas.targets`."""
+    return {f"target {k}": name for k, name in enumerate(names[: len(TARGETS)], 1)}
 
 
 def strips(wavelength_nm: Any, flags: Any) -> dict[str, Any]:

@@ -84,8 +84,8 @@ class Question:
             "tails": draws.tails,
             "statistics": list(dict.fromkeys(["chi2", "chi2_element", values["statistic"]])),
         }
-        if values["see"].strip():
-            data |= {"orbit": {"targets": [values["see"].strip()]}, "plan": {"hours": values["hours"]}}
+        if values["targets"]:
+            data["plan"] = {"targets": list(values["targets"]), "hours": values["hours"]}
         return data
 
     @staticmethod

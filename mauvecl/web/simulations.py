@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.answers.verbs import VERBS
-from mauvecl.host.orbit.targets import Target
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
 
 if TYPE_CHECKING:
     from mauvecl.runs.pool import Pool
@@ -53,17 +51,8 @@ def fits(study: Study) -> Study:
 
 
 def campaign_plan(study: Study) -> Study:
-    """Return the study of a campaign on the target, without injections."""
-    for name in study.orbit.targets:
-        if Target.of(name).spectral_type is None:
-            raise InputError(
-                f"neither type nor magnitude nor distance of {shortened(name)} are known",
-                "a target of the list, such as eps Eri or AU Mic",
-                key="see",
-                value=name,
-            )
-    targets = [{"name": name} for name in study.orbit.targets]
-    return _changed(study, plan={"targets": targets, "completeness": "closed form"}, orbit={"targets": ()})
+    """Return the study of a campaign without injections."""
+    return _changed(study, plan={"completeness": "closed form"})
 
 
 def _changed(study: Study, **sections: dict[str, Any]) -> Study:
@@ -98,8 +87,8 @@ class Simulation:
     completed: Callable[[Answers], Answers] = lambda answers: answers
     others: Mapping[str, Callable[[Study], Study]] = field(default_factory=dict)
 
-    def __call__(self, study: Study, pool: Pool) -> Answers:
-        """Return the answers by name."""
+    def __call__(self, study: Study, pool: Pool, progress: Callable[[int, int], None] | None = None) -> Answers:
+        """Return the answers by name; `progress` is called with numbers of what the main verb counts."""
         asked = self.asked(study)
         main = next(iter(self.verbs.values()))
         wanted = [(name, verb, asked) for name, verb in self.verbs.items()]
@@ -110,7 +99,7 @@ class Simulation:
         answers: Answers = {}
         for name, verb, one in wanted:
             try:
-                answers[name] = VERBS[verb].ask(one, pool)
+                answers[name] = VERBS[verb].ask(one, pool, progress)
             except InputError:
                 if name not in self.others:
                     raise
@@ -141,6 +130,11 @@ def asked(name: str, study: Study) -> tuple[str, Study]:
         return name, study
     one = SIMULATIONS[name]
     return next(iter(one.verbs.values())), one.asked(study)
+
+
+def verbs_of(name: str) -> tuple[str, ...]:
+    """Return the verbs that answer a simulation, or the verb of that name."""
+    return tuple(SIMULATIONS[name].verbs.values()) if name in SIMULATIONS else (name,)
 
 
 #: Simulations that use the pool's devices.

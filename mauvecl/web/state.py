@@ -5,22 +5,23 @@ The state is independent of the page's appearance: the page enters text, and sho
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING
 from urllib.parse import parse_qsl, urlencode
 
 from mauvecl.results.requests.fap_checks import check_fap
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
-from mauvecl.web.fields import FIELDS, MOST_CHARACTERS, UPLOADED, UPLOADED_UNKNOWN, Choice, Field, several
+from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_UNKNOWN, Choice, Field, several
 from mauvecl.web.question import Points, Question
+from mauvecl.web.sentences import sentence
 from mauvecl.web.tabs import TABS
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
 
 #: Largest number of characters of a link that are parsed.
-MOST_LINKED = 4096
+MOST_LINKED = 8192
 #: Entries of a link in addition to the question.
 SEEN = {"tab": Field("Tab", next(iter(TABS)), Choice(tuple(TABS))), "simulated": Field("Simulated", "", several)}
 
@@ -32,8 +33,6 @@ class State:
     ----------
     entered : dict
         Text of each field of `FIELDS` and `SEEN` by name, valid or not.
-    faults : dict
-        Error message by name of the field; empty if there is a question.
     stray : str
         Message on entries of the last link that are not fields, or empty.
     uploaded : Source or None
@@ -46,81 +45,95 @@ class State:
         self._fields = FIELDS | SEEN
         self.entered = {name: field.first for name, field in self._fields.items()}
         self._values = {name: field.read(field.first) for name, field in self._fields.items()}
-        self.faults: dict[str, str] = {}
+        self._invalid: dict[str, str] = {}
         self.stray = ""
         self.uploaded, self.unknown = uploaded, unknown
 
     def enter(self, given: Mapping[str, str]) -> None:
-        """Enter text into fields and collect errors in `faults`."""
+        """Enter text into fields."""
         for name, text in given.items():
-            self.entered[name] = text[:MOST_CHARACTERS]
-            self.faults.pop(name, None)
+            field = self._fields[name]
+            self.entered[name] = text[: field.most]
+            self._invalid.pop(name, None)
             try:
-                if len(text) > MOST_CHARACTERS:
+                if len(text) > field.most:
                     raise InputError(
-                        f"{shortened(text)} is too long", f"at most {MOST_CHARACTERS} characters", key=name, value=text
+                        f"{shortened(text)} is too long", f"at most {field.most} characters", key=name, value=text
                     )
-                value = self._fields[name].read(text)
+                value = field.read(text)
                 if (text == UPLOADED and self.uploaded is None) or (text == UPLOADED_UNKNOWN and self.unknown is None):
                     raise InputError(
                         f"the {text} is not here", "its file again: links do not hold it", key=name, value=text
                     )
                 self._values[name] = value
             except InputError as error:
-                self.faults[name] = str(error)
-        if given.keys() & {"fap", "realisations"}:
-            self._settled()
-        if given.keys() & {"sky", "target", "time"}:
-            self._placed()
-
-    def _settled(self) -> None:
-        """Check that the realisations suffice for the false-alarm probability."""
-        if "fap" not in self.faults and self.faults.get("realisations", "fap = ").startswith("fap = "):
-            self.faults.pop("realisations", None)
-            try:
-                check_fap(self._values["fap"], *self._values["realisations"])
-            except InputError as error:
-                self.faults["realisations"] = str(error)
-
-    def _placed(self) -> None:
-        """Check target and time if the sky depends on them."""
-        from mauvecl.host.sky.helioecliptic import offline, parse_position, parse_time
-
-        read: tuple[tuple[str, Callable[[str], Any]], ...] = (("target", parse_position), ("time", parse_time))
-        for name, understood in read:
-            if not self.faults.get(name, name).startswith(name):
-                continue
-            self.faults.pop(name, None)
-            if self.entered["sky"] != "target and time":
-                continue
-            try:
-                with offline():
-                    understood(self.entered[name])
-            except InputError as error:
-                self.faults[name] = str(error)
+                self._invalid[name] = sentence(error)
 
     @property
-    def asked(self) -> tuple[str, ...]:
-        """Text of all fields on which an answer depends."""
-        return tuple(self.entered[name] for name in FIELDS)
+    def faults(self) -> dict[str, str]:
+        """Error message by name of the field; empty if there is a question."""
+        return self.faults_of(self._fields)
 
-    @property
-    def fault(self) -> str:
-        """All errors in one text, empty if there is none."""
-        return "; ".join(f"{self._fields[name].label}: {why}" for name, why in self.faults.items())
+    def faults_of(self, names: Collection[str]) -> dict[str, str]:
+        """Return the error messages of some fields, with those of values that cannot be together."""
+        faults = {name: why for name, why in self._invalid.items() if name in names}
+        for name, check in (
+            ("realisations", self._check_fap),
+            ("target", self._check_target),
+            ("time", self._check_time),
+        ):
+            if name in names and name not in faults:
+                try:
+                    check()
+                except InputError as error:
+                    faults[name] = sentence(error)
+        return faults
 
-    def question(self) -> Question:
+    def _check_fap(self) -> None:
+        """Raise InputError if the realisations do not suffice for the false-alarm probability."""
+        if "fap" not in self._invalid:
+            check_fap(self._values["fap"], *self._values["realisations"])
+
+    def _check_target(self) -> None:
+        """Raise InputError if the sky depends on a target without a position."""
+        from mauvecl.host.sky.helioecliptic import offline, parse_position
+
+        if self.entered["sky"] == "target and time":
+            with offline():
+                parse_position(self.entered["target"])
+
+    def _check_time(self) -> None:
+        """Raise InputError if the sky depends on an invalid time."""
+        from mauvecl.host.sky.helioecliptic import offline, parse_time
+
+        if self.entered["sky"] == "target and time":
+            with offline():
+                parse_time(self.entered["time"])
+
+    def asked(self, names: Collection[str] = tuple(FIELDS)) -> tuple[str, ...]:
+        """Return the text of fields on which an answer depends: of all, or of those named."""
+        return tuple(self.entered[name] for name in FIELDS if name in names)
+
+    def question(self, names: Collection[str] = tuple(FIELDS)) -> Question:
         """Return the question.
+
+        Parameters
+        ----------
+        names : collection of str
+            Fields that are asked; the others have their first values.
 
         Raises
         ------
         InputError
-            If a field is invalid, with the accepted values of each.
+            If a field that is asked is invalid, with the accepted values of each.
         """
-        if self.faults:
-            fault, _, expected = self.fault.partition(", expected ")
-            raise InputError(fault, expected or None, key=next(iter(self.faults)))
-        values = {name: self._values[name] for name in FIELDS}
+        faults = self.faults_of(names)
+        if faults:
+            all_of_them = "; ".join(f"{self._fields[name].label}: {why}" for name, why in faults.items())
+            fault, _, expected = all_of_them.partition(", expected ")
+            raise InputError(fault, expected or None, key=next(iter(faults)))
+        first = State()
+        values = {name: (self if name in names else first)._values[name] for name in FIELDS}
         if values["own_unknown"] is None:
             values["own_unknown"] = self.unknown
         return Question(values, uploaded=self.uploaded if values["star"] == UPLOADED else None)
@@ -149,7 +162,7 @@ class State:
             self.stray = f"The link holds {shortened(', '.join(strange))}, which is no field here; it was left out."
         first = {name: field.first for name, field in self._fields.items()}
         self.enter(first | {name: text for name, text in pairs if name in self._fields})
-        for name in SEEN.keys() & self.faults.keys():
+        for name in SEEN.keys() & self._invalid.keys():
             # The page has no field to correct them.
-            self.stray += f" The link's {name}: {self.faults[name]}; it was left out."
+            self.stray += f" The link's {name}: {self._invalid[name]}; it was left out."
             self.enter({name: SEEN[name].first})

@@ -68,12 +68,14 @@ def front() -> bytes:
     """Return the page."""
     from mako.lookup import TemplateLookup
 
+    from mauvecl.host.stars import well_known
     from mauvecl.host.stars.star_names import all_names
     from mauvecl.web import fields
     from mauvecl.web.figures import DASHES, INKS
     from mauvecl.web.headline import TITLES
+    from mauvecl.web.simulations import SIMULATIONS
     from mauvecl.web.state import SEEN
-    from mauvecl.web.tabs import TABS
+    from mauvecl.web.tabs import TABS, reads_of
     from mauvecl.web.upload import MOST_UPLOADED
     from mauvecl.web.visitor import UNUSED
 
@@ -86,6 +88,8 @@ def front() -> bytes:
             if (s := field.slider) is not None
         },
         "stars": all_names(),
+        "example": "AU Mic\nYZ CMi\neps Eri",
+        "asks": {name: sorted(reads_of(name)) for name in SIMULATIONS},
         "uploads": {"star": fields.UPLOADED, "own_unknown": fields.UPLOADED_UNKNOWN},
         "under": fields.ASKED_UNDER,
         "presets": fields.PRESETS,
@@ -97,6 +101,8 @@ def front() -> bytes:
                     for p in tab.pictures
                 ],
                 "files": dict(tab.files),
+                "reads": sorted(tab.reads),
+                "headline": tab.headline,
             }
             for tab in TABS.values()
         },
@@ -107,8 +113,9 @@ def front() -> bytes:
     lookup = TemplateLookup([str(_FOLDER)], default_filters=["h"], strict_undefined=True)
     template = lookup.get_template("page.html.mako")
     text = template.render(
-        fields=fields, tabs=TABS, version=VERSION, bibtex=BIBTEX.format(version=VERSION), titles=TITLES,
-        words=json.dumps(words).replace("<", "\\u003c"), digest=_digest(),
+        fields=fields, names=[star.name for star in well_known.stars()], tabs=TABS, version=VERSION,
+        bibtex=BIBTEX.format(version=VERSION), titles=TITLES, digest=_digest(),
+        words=json.dumps(words).replace("<", "\\u003c"),
     )  # fmt: skip
     return str(text).encode()
 

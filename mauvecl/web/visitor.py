@@ -18,18 +18,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
+from mauvecl.answers.verbs import VERBS
 from mauvecl.device.errors import DeviceError
 from mauvecl.host.version import VERSION
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
-from mauvecl.web.card import card
+from mauvecl.web.card import card, without_headline
 from mauvecl.web.closed_forms import ClosedForms
 from mauvecl.web.downloads import as_file, asked_study, taken_along
 from mauvecl.web.fields import UPLOADED, UPLOADED_UNKNOWN
 from mauvecl.web.headline import other_payloads, solved
-from mauvecl.web.simulations import DRAWING, SIMULATIONS
+from mauvecl.web.known_stars import known
+from mauvecl.web.sentences import field_of, sentence
+from mauvecl.web.simulations import DRAWING, SIMULATIONS, verbs_of
 from mauvecl.web.state import State
-from mauvecl.web.tabs import TABS
+from mauvecl.web.tabs import TABS, asking, reads_of
 from mauvecl.web.upload import read_pairs, read_upload
 from mauvecl.web.work import Cancelled, Job, reading
 
@@ -44,8 +47,8 @@ log = logging.getLogger(__name__)
 LOOK_S = 0.25
 #: Number of threads, besides the event loop, that make closed forms, pictures and files for all visitors.
 _closed_forms = ThreadPoolExecutor(2, thread_name_prefix="mauvecl-closed")
-#: Questions whose simulations a visitor's connection remembers, and files.
-MOST_KEPT = 4
+#: Files that a visitor's connection remembers, and answers of simulations.
+MOST_KEPT, MOST_ANSWERS = 4, 12
 #: Things that are done for a visitor at a time.
 MOST_TASKS = 8
 #: Message if the page itself fails.
@@ -80,7 +83,7 @@ class Visitor(WebSocketHandler):
         self._coming: tuple[int, str, str] | None = None
         self._uploads: dict[str, Any] = {}
         self._closed: tuple[tuple[Any, ...], ClosedForms] | None = None
-        self._answers: OrderedDict[tuple[Any, ...], dict[str, Any]] = OrderedDict()
+        self._answers: OrderedDict[tuple[str, tuple[Any, ...]], dict[str, Any]] = OrderedDict()
         self._files: OrderedDict[tuple[Any, ...], tuple[str, bytes]] = OrderedDict()
         self._folder = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
 
@@ -155,32 +158,44 @@ class Visitor(WebSocketHandler):
             self._answering = False
 
     async def _answer(self, asked: dict[str, Any]) -> None:
-        n, state = asked["n"], self.state(asked["link"])
-        message: dict[str, Any] = {"n": n, "stray": state.stray, "faults": state.faults}
-        if state.faults:
+        n, state, tab = asked["n"], self.state(asked["link"]), tab_of(str(asked.get("tab")))
+        faults = state.faults_of(tab.reads)
+        message: dict[str, Any] = {"n": n, "stray": state.stray, "faults": faults, "known": known(state)}
+        if faults:
             self.send(**message)
             return
 
         async def answer() -> None:
-            closed = await self._in_thread(partial(self.closed, state))
-            answers = self._answers.get(self._key(state), {})
-            self.send(**message, answer=await self._in_thread(partial(card, closed, answers)))
+            closed = await self._in_thread(partial(self.closed, state, tab))
+            answers = self.answers(state)
+            made = partial(card, closed, answers) if tab.headline else partial(without_headline, tab, closed, answers)
+            self.send(**message, answer=await self._in_thread(made))
             if self._next is None:
-                self.send(n=n, **await self._in_thread(partial(shown, str(asked.get("tab")), closed, answers)))
+                self.send(n=n, **await self._in_thread(partial(shown, tab.name, closed, answers)))
 
         await self._or_why(answer(), **message)
 
-    def closed(self, state: State) -> ClosedForms:
-        """Return the closed forms of a question; the last ones are cached."""
-        key = self._key(state)
+    def closed(self, state: State, tab: Tab) -> ClosedForms:
+        """Return the closed forms of what a tab reads of a question; the last ones are cached."""
+        key = self._key(state, tab.reads), tab.headline
         if self._closed is None or self._closed[0] != key:
-            self._closed = key, ClosedForms.of(state.question(), Path(self._folder.name))
+            question = state.question(tab.reads)
+            self._closed = key, ClosedForms.of(question, Path(self._folder.name), headline=tab.headline)
         return self._closed[1]
 
-    def _key(self, state: State) -> tuple[Any, ...]:
-        star: Source | None = self._uploads.get("star")
-        unknown: Points | None = self._uploads.get("own_unknown")
-        return state.asked, None if star is None else star.digest, hash(unknown)
+    def answers(self, state: State) -> dict[str, Any]:
+        """Return the simulated answers that hold for a question, by name."""
+        found: dict[str, Any] = {}
+        for (simulation, key), answers in self._answers.items():
+            if key == self._key(state, reads_of(simulation)):
+                found |= answers
+        return found
+
+    def _key(self, state: State, names: frozenset[str]) -> tuple[Any, ...]:
+        """Return everything on which an answer to some fields depends."""
+        star: Source | None = self._uploads.get("star") if "star" in names else None
+        unknown: Points | None = self._uploads.get("own_unknown") if "own_unknown" in names else None
+        return state.asked(names), None if star is None else star.digest, hash(unknown)
 
     def _begin(self, work: Coroutine[Any, Any, None]) -> None:
         """Run a function without blocking other visitors."""
@@ -200,7 +215,14 @@ class Visitor(WebSocketHandler):
         """Run a function, and report an invalid request or an internal error."""
         try:
             await work
-        except (InputError, DeviceError) as error:
+        except InputError as error:
+            name = field_of(error.key)
+            if name is not None and "faults" in message:
+                # Values that cannot be together: one of their fields says so.
+                self.send(**message | {"faults": {name: sentence(error)}})
+            else:
+                self.send(**message, refused=sentence(error))
+        except DeviceError as error:
             self.send(**message, refused=str(error))
         except Exception:
             log.exception("no answer")
@@ -217,7 +239,7 @@ class Visitor(WebSocketHandler):
         self._give(self._solve(n, self.state(asked["link"])), n=n, solved="")
 
     async def _solve(self, n: int, state: State) -> None:
-        closed = await self._in_thread(partial(self.closed, state))
+        closed = await self._in_thread(partial(self.closed, state, tab_of("")))
         self.send(n=n, payloads=await self._in_thread(partial(other_payloads, closed)))
         self.send(n=n, solved=await self._in_thread(partial(solved, closed)))
 
@@ -229,7 +251,8 @@ class Visitor(WebSocketHandler):
     async def _pinned(self, n: int, state: State, name: str) -> None:
         tab = tab_of(name)
         pictures = [picture for picture in tab.pictures if picture.pins]
-        closed = await self._in_thread(partial(ClosedForms.of, state.question(), Path(self._folder.name)))
+        question = state.question(tab.reads)
+        closed = await self._in_thread(partial(ClosedForms.of, question, Path(self._folder.name)))
         drawn = await self._in_thread(lambda: {p.name: p.drawn(closed, {}).sources[p.pins] for p in pictures})
         self.send(n=n, pins={name: {c: packed(v) for c, v in columns.items()} for name, columns in drawn.items()})
 
@@ -237,8 +260,8 @@ class Visitor(WebSocketHandler):
 
     def _ask_draw(self, asked: dict[str, Any]) -> None:
         """Draw one exposure with the flare."""
-        state = self.state(asked["link"])
-        if state.faults or self._closed is None or self._closed[0] != self._key(state):
+        state, tab = self.state(asked["link"]), tab_of(str(asked.get("tab")))
+        if self._closed is None or self._closed[0] != (self._key(state, tab.reads), tab.headline):
             return
         closed = self._closed[1]
         if self._drawing is not None:
@@ -249,35 +272,36 @@ class Visitor(WebSocketHandler):
         def came(future: Future[Any]) -> None:
             if self._closed is None or self._closed[1] is not closed or future.cancelled() or future.exception():
                 return
-            answers = self._answers.get(self._key(state), {}) | {"draw": future.result()}
-            self.send(n=asked["n"], **shown(str(asked.get("tab")), closed, answers))
+            answers = self.answers(state) | {"draw": future.result()}
+            self.send(n=asked["n"], **shown(tab.name, closed, answers))
 
         self._when_done(self._drawing, came)
 
     def _ask_simulate(self, asked: dict[str, Any]) -> None:
         """Simulate, report progress, and send the answer."""
         n, kind, state = asked["n"], asked.get("kind"), self.state(asked["link"])
-        if self.job is not None or kind not in SIMULATIONS or state.faults:
+        if self.job is not None or kind not in SIMULATIONS or state.faults_of(reads_of(kind)):
             self.send(n=n, ended="", refused="there is a simulation already, or nothing to simulate")
             return
         self._begin(self._or_why(self._simulate(n, kind, state), n=n, ended=""))
 
     async def _simulate(self, n: int, kind: str, state: State) -> None:
-        key = self._key(state)
-        closed = await self._in_thread(partial(self.closed, state))
+        key = kind, self._key(state, reads_of(kind))
+        question, headline = state.question(reads_of(kind)), asking(kind).headline
+        closed = await self._in_thread(partial(ClosedForms.of, question, Path(self._folder.name), headline=headline))
         if self.job is not None:
             raise InputError("there is a simulation already", "its end first", key="simulate", value=kind)
-        job = self.job = Job(partial(SIMULATIONS[kind], closed.study), drawing=kind in DRAWING)
+        # Several verbs count the realisations of all in the pool.
+        verbs = verbs_of(kind)
+        unit = VERBS[verbs[0]].counts if len(verbs) == 1 else ""
+        job = self.job = Job(partial(SIMULATIONS[kind], closed.study), kind in DRAWING, unit)
         done = asyncio.wrap_future(job.future)
         try:
             while not (await asyncio.wait([done], timeout=LOOK_S))[0]:
-                standing = job.standing
-                done_part = standing.done / standing.total if standing is not None and standing.total else 0.0
-                self.send(n=n, progress=min(done_part, 1.0), message=job.words)
-            kept = self._answers.setdefault(key, {})
-            kept |= done.result()
+                self.send(n=n, progress=job.share, message=job.words)
+            self._answers[key] = done.result()
             self._answers.move_to_end(key)
-            while len(self._answers) > MOST_KEPT:
+            while len(self._answers) > MOST_ANSWERS:
                 self._answers.popitem(last=False)
             self.send(n=n, ended=f"Done: {job.words}.", kind=kind)
         except (Cancelled, CancelledError, asyncio.CancelledError):
@@ -338,8 +362,10 @@ class Visitor(WebSocketHandler):
 
     def file(self, state: State, tab: str, name: str, ending: str) -> tuple[str, bytes]:
         """Send a table or study of the question; the last ones are cached."""
-        closed, key = self.closed(state), self._key(state)
-        answers = self._answers.get(key, {})
+        # The page asks for the study of a question by its name alone.
+        front = TABS.get(tab) or next((one for one in TABS.values() if name in one.questions), tab_of(tab))
+        closed, key = self.closed(state, front), self._key(state, front.reads)
+        answers = self.answers(state)
         which = key, tab, name, ending, tuple(answers)
         if which not in self._files:
             made = as_file(TABS[tab], name, ending, closed, answers) if tab in TABS else asked_study(name, closed.study)
@@ -354,7 +380,7 @@ class Visitor(WebSocketHandler):
         self._give(self._export(n, self.state(asked["link"]), tab), n=n)
 
     async def _export(self, n: int, state: State, tab: Tab) -> None:
-        work = partial(taken_along, tab, state.question(), Path(self._folder.name))
+        work = partial(taken_along, tab, state.question(tab.reads), Path(self._folder.name))
         self.send(n=n, taken=await self._in_thread(work))
 
 
@@ -373,7 +399,7 @@ def shown(name: str, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
             source: {column: packed(values) for column, values in columns.items()}
             for source, columns in drawn.sources.items()
         }
-        pictures[picture.name] = {"text": drawn.text, "sources": sources, "props": drawn.props}
+        pictures[picture.name] = {"text": drawn.text, "sources": sources, "props": drawn.props, "names": drawn.names}
     return {"tab": tab.name, "pictures": pictures, "rows": tab.rows(closed, answers)}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mauvecl.device.engine import Engine
-from mauvecl.runs.pool import LocalWorkers, Pool, PoolProgress
+from mauvecl.runs.pool import LocalWorkers, Pool
 
 #: Simulations that a server computes at the same time; others wait.
 TOGETHER = 2
@@ -62,18 +63,23 @@ class Job:
     Parameters
     ----------
     ask : callable
-        Makes the answer with a pool.
+        Makes the answer with a pool; with a unit also with a function that is called with counts of it.
     drawing : bool
         Whether it draws: it then ends between two tiles. What draws nothing asks nobody, and ends wherever it is.
+    unit : str
+        What is counted; realisations of the pool if empty.
     """
 
-    ask: Callable[[Pool], Any]
+    ask: Callable[..., Any]
     drawing: bool = True
+    unit: str = ""
     _cancelled: threading.Event = field(default_factory=threading.Event)
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _thread: int | None = None
     _pool: Pool | None = None
     _started: float | None = None
+    _counted: tuple[int, int] = (0, 0)
+    _left_s: float = math.inf
 
     def __post_init__(self) -> None:
         self.future: Future[Any] = _threads.submit(self._run)
@@ -102,7 +108,12 @@ class Job:
         self._started = time.monotonic()
         workers = LocalWorkers([None], make=lambda device, progress: _engine(progress))
         self._pool = Pool(workers, progress=lambda done, total: self._check())
-        return self.ask(self._pool)
+        return self.ask(self._pool, self._count) if self.unit else self.ask(self._pool)
+
+    def _count(self, done: int, total: int) -> None:
+        self._counted = done, total
+        if self.drawing:
+            self._check()
 
     def _check(self) -> None:
         if self._cancelled.is_set():
@@ -118,23 +129,29 @@ class Job:
         self.future.cancel()
 
     @property
-    def standing(self) -> PoolProgress | None:
-        """Return the progress, or None while the job waits."""
-        return None if self._pool is None else self._pool.standing
+    def counts(self) -> tuple[int, int]:
+        """Return what is done and the total, or 0 if nothing is counted yet."""
+        if self.unit:
+            return self._counted
+        standing = None if self._pool is None else self._pool.standing
+        return (0, 0) if standing is None else (standing.done, standing.total)
+
+    @property
+    def share(self) -> float:
+        """Return the share that is done."""
+        done, total = self.counts
+        return min(done / total, 1.0) if total else 0.0
 
     @property
     def words(self) -> str:
-        """Return the progress in words."""
-        s = self.standing
-        if s is None or self._started is None:
+        """Return the progress in words; the estimated time never rises."""
+        if self._started is None:
             return "waiting for its turn"
-        if not s.total:
-            # What is computed without a draw is not counted.
-            return f"{time.monotonic() - self._started:.0f} s"
-        rate = s.done / max(time.monotonic() - self._started, 1e-9)
-        left = f", {(s.total - s.done) / rate:.0f} s left" if rate and s.total > s.done else ""
-        return (
-            f"{s.done:,} of {s.total:,} realisations, {rate:,.0f} a second{left}"
-            + (f", {s.shards} of {s.of} parts" if s.of > 1 else "")
-            + (f", {s.retries} counted again" if s.retries else "")
-        )
+        (done, total), spent = self.counts, time.monotonic() - self._started
+        if not total:
+            return f"{spent:.0f} s"
+        words = f"{done:,} of {total:,} {self.unit or 'realisations'}"
+        if not 0 < done < total:
+            return f"{words}, {spent:.0f} s"
+        self._left_s = min(self._left_s, spent * (total - done) / done)
+        return f"{words}, about {self._left_s:.0f} s left"

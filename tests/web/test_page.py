@@ -109,7 +109,7 @@ def until(page: Page, true: Callable[[], bool]) -> None:
 
 def settled(page: Page) -> None:
     """Wait until the page shows the answer to what was entered."""
-    page.locator("#card[aria-busy=false]").wait_for()
+    page.locator("#card[aria-busy=false]").wait_for(state="attached")
     assert not page.faults, page.faults  # type: ignore[attr-defined]
 
 
@@ -554,7 +554,7 @@ def test_uploads_are_used_or_refused(page: Page, tmp_path: Path) -> None:
 def test_cancel_stops_while_others_are_served(browser: Browser, page: Page, server: Server) -> None:
     enter(page, "Realisations", "4000000")
     page.get_by_role("button", name="Simulate", exact=True).click()
-    page.get_by_text(re.compile(r"of 8,000,000 realisations, .* a second")).wait_for()
+    page.get_by_text(re.compile(r"of 8,000,000 realisations, about .* s left")).wait_for()
     second = fresh(browser, server.address)
     enter(second, "Magnitude", "12")
     assert "V = 12" in shown(second)
@@ -844,3 +844,141 @@ def test_lost_connection_is_reported_and_restored(browser: Browser, server: Serv
     until(page, lambda: shown(page) == before)  # the upload too: the browser has kept it, and what was simulated
     assert page.get_by_label("Magnitude", exact=True).input_value() == "9"
     page.context.close()
+
+
+FIELDS = ("magnitude", "amplitude_percent", "exposure_s")
+
+
+def places(page: Page) -> list[float]:
+    return [page.evaluate(f"document.getElementById('f-{name}').getBoundingClientRect().y") for name in FIELDS]
+
+
+def test_fields_stay_where_they_are(page: Page) -> None:
+    before = places(page)
+    for label, text in (
+        ("Magnitude", "abc"),
+        ("Magnitude", "8.5"),
+        ("Star", "AU Mic"),
+        ("Star", "GJ 581"),
+        ("Star", "x"),
+    ):
+        field = page.get_by_label(label, exact=True)
+        field.fill(text)
+        settled(page)
+        wrong = field.get_attribute("aria-invalid") == "true"
+        assert wrong == (text in ("abc", "AU Mic", "x"))
+        assert places(page) == pytest.approx(before, abs=1), text
+
+
+def test_star_is_filled_in_or_offered(page: Page) -> None:
+    enter(page, "Star", "gj 581")
+    until(page, lambda: "V = 10.57" in shown(page))
+    assert page.locator("#k-star").inner_text() == "M3V, 6.215 pc, V = 10.57; Hipparcos"
+    page.go_back()
+    until(page, lambda: "a G2V star of V = 8.5" in shown(page))
+    enter(page, "Star", "AU Mic")
+    page.get_by_text("No answer.", exact=True).wait_for()
+    page.get_by_role("button", name="Use M1V at V = 8.81").click()
+    until(page, lambda: "M1V star" in shown(page) and "V = 8.81" in shown(page))
+    # A magnitude of one's own stays.
+    enter(page, "Magnitude", "9")
+    until(page, lambda: "V = 9," in shown(page))
+
+
+def test_chosen_realisations_come_back(page: Page) -> None:
+    enter(page, "Realisations", "1000000")
+    enter(page, "False-alarm probability", "1e-6")
+    field = page.get_by_label("Realisations", exact=True)
+    assert field.input_value() == "100000 sampled"
+    assert "1,000,000 are too few" in page.locator("#n-realisations").inner_text()
+    enter(page, "False-alarm probability", "0.01")
+    assert field.input_value() == "1000000"
+    assert page.locator("#n-realisations").inner_text() == ""
+
+
+def test_values_that_cannot_be_together_mark_their_field(page: Page) -> None:
+    enter(page, "Unknown", "the usual")
+    enter(page, "Detection statistic", "paper")
+    assert page.get_by_label("Detection statistic", exact=True).get_attribute("aria-invalid") == "true"
+    assert "cannot be marginalised" in page.locator("#words-of").inner_text()
+    enter(page, "Detection statistic", "matched")
+    assert "chance to detect" in shown(page)
+
+
+def press(page: Page, *keys: str) -> None:
+    for key in keys:
+        page.keyboard.press(key)
+
+
+def focused(page: Page) -> str:
+    return str(page.evaluate("document.activeElement.getAttribute('aria-label') ?? document.activeElement.textContent"))
+
+
+def tab_to(page: Page, name: str) -> None:
+    for _ in range(60):
+        if focused(page) == name:
+            return
+        page.keyboard.press("Tab")
+    raise AssertionError(name)
+
+
+def test_three_targets_are_planned_by_keyboard(page: Page) -> None:
+    """And the plan survives a change of the star of other tabs, is pinned, and is found again."""
+    tab_to(page, "Detection")
+    press(page, *["ArrowRight"] * 10)
+    assert focused(page) == "Plan"
+    page.wait_for_url("**tab=plan**")
+    assert not page.locator("#card").is_visible(), "no headline of another star"
+    assert not page.get_by_label("Magnitude", exact=True).is_visible()
+    page.locator("#panel-plan .rows", has_text="best months").wait_for()
+    tab_to(page, "Target of target 1")
+    for name in ("AU Mic", "eps Eri", "YZ CMi"):
+        page.keyboard.type(name)
+        page.keyboard.press("Enter")
+    until(page, lambda: page.get_by_label("V of target 3").get_attribute("placeholder") == "11.19")
+    days = page.get_by_label("Days", exact=True)
+    tab_to(page, "Remove all")
+    press(page, "Tab")
+    while not days.evaluate("e => e === document.activeElement"):
+        press(page, "Tab")
+    page.keyboard.type("20")
+    tab_to(page, "Plan")
+    press(page, "Enter")
+    page.locator("#panel-plan").get_by_text("Done: 3 of 3 targets").wait_for()
+    table = page.locator("#panel-plan .rows")
+    until(page, lambda: all(name in table.inner_text() for name in ("AU Mic", "eps Eri", "YZ CMi", "false alarms")))
+    page.locator("#figure-recovered .legend", has_text="YZ CMi").wait_for()
+    planned = table.inner_text()
+    page.get_by_role("button", name="Pin", exact=True).click()
+    tab(page, "Detection")
+    enter(page, "Magnitude", "6")
+    tab(page, "Plan")
+    until(page, lambda: table.inner_text() == planned and "simulated=plan" in page.url)
+    tab(page, "Compare")
+    pinned = page.locator("#pinned")
+    assert "eps Eri" in pinned.inner_text()
+    pinned.get_by_role("button", name="Open table 1").click()
+    until(page, lambda: "tab=plan" in page.url and "YZ CMi" in table.inner_text())
+
+
+def test_targets_are_pasted_and_opened(page: Page, tmp_path: Path) -> None:
+    tab(page, "Visibility")
+    page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    page.get_by_label("Target of target 1").click()
+    page.evaluate("navigator.clipboard.writeText('name\\tV\\nAU Mic\\t\\nmine\\t9.5')")
+    page.keyboard.press("Control+v")
+    until(page, lambda: page.get_by_label("V of target 2").input_value() == "9.5")
+    page.locator("#w-targets", has_text="mine").wait_for()
+    assert page.get_by_label("Target of target 2").get_attribute("aria-invalid") == "true"
+    page.get_by_label("Coordinates (deg) of target 2").fill("53.2 -9.4")
+    until(page, lambda: page.get_by_role("button", name="Find when").is_enabled())
+    file = tmp_path / "targets.csv"
+    file.write_text('name,ra,dec,mass_msun,age_myr\n"one, two",10,20,1.0,600\nAU Mic,,,,\n')
+    page.locator("#targets-file").set_input_files(file)
+    until(page, lambda: page.get_by_label("age_myr of target 1").input_value() == "600")
+    assert page.get_by_label("Target of target 1").input_value() == "one, two"
+    until(page, lambda: page.get_by_role("button", name="Find when").is_enabled())
+    page.get_by_role("button", name="Remove target 1", exact=True).click()
+    assert page.get_by_label("Target of target 1").input_value() == "AU Mic"
+    page.get_by_role("button", name="Remove all").click()
+    assert page.get_by_role("button", name="Find when").is_disabled()

@@ -1,4 +1,4 @@
-"""Fields of each tab: those that it shows change its answer, and others do not."""
+"""Fields of each tab: those that it shows change what is asked, and others change nothing."""
 
 from __future__ import annotations
 
@@ -12,11 +12,19 @@ import pytest
 pytest.importorskip("tornado")
 pytest.importorskip("bokeh")
 
+from mauvecl.answers.verbs import VERBS
+from mauvecl.web.card import card
 from mauvecl.web.closed_forms import ClosedForms
 from mauvecl.web.fields import FIELDS
+from mauvecl.web.simulations import SIMULATIONS, asked, verbs_of
 from mauvecl.web.state import State
-from mauvecl.web.tabs import TABS
+from mauvecl.web.tabs import TABS, reads_of
+from mauvecl.web.tabs.tab import Tab
 from mauvecl.web.visitor import shown
+
+pytestmark = pytest.mark.long
+
+Given = tuple[tuple[str, str], ...]
 
 #: Another valid text for every field.
 OTHER = {
@@ -24,28 +32,68 @@ OTHER = {
     "statistic": "chi2", "realisations": "1000000", "flare_temperature_k": "12000", "balmer_jump": "2",
     "lines": "Mg II=0.03", "second_temperature_k": "20000", "second_area": "0.3", "temperature_c": "5", "sky": "none",
     "sky_brightness": "21", "target": "53.2 -9", "time": "2027-01-20", "unknown": "the usual",
-    "own_unknown": "200 1, 700 2", "see": "AU Mic", "hours": "50", "seed": "7", "signal": "paper",
-    "instrument": "mauve-electrons", "visits": "5",
+    "own_unknown": "200 1, 700 2", "targets": "AU Mic", "start": "2027-06-01", "days": "100", "hours": "50",
+    "seed": "7", "signal": "paper", "instrument": "mauve-electrons", "visits": "5", "of": "magnitude", "power": "0.5",
+    "skipped_nm": "200:250", "snr_per_bin": "20", "joint_fit": "yes",
 }  # fmt: skip
 #: What must be entered first for a field to apply.
-BEFORE = {
-    "target": {"sky": "target and time", "target": "eps Eri", "time": "2027-01-15"},
-    "time": {"sky": "target and time", "target": "eps Eri", "time": "2027-01-15"},
-    "second_area": {"second_temperature_k": "20000"},
-}
+SKY = {"sky": "target and time", "target": "eps Eri", "time": "2027-01-15"}
+BEFORE = {"target": SKY, "time": SKY, "second_area": {"second_temperature_k": "20000"},
+          **{name: {"targets": "eps Eri"} for name in ("start", "days", "hours")}}  # fmt: skip
+#: Fields of the headline that the tabs of pictures show with it.
+HEADLINE = TABS["detection"].reads
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return one folder for all tests, so that pictures of the first question are drawn once."""
+    return tmp_path_factory.mktemp("fields")
 
 
 @cache
-def pictures(tab: str, given: tuple[tuple[str, str], ...], folder: Path) -> str:
-    """Return what a tab shows without a simulation."""
-    return json.dumps(shown(tab, forms(given, folder), {}), default=str)
-
-
-@cache
-def forms(given: tuple[tuple[str, str], ...], folder: Path) -> ClosedForms:
+def forms(tab: str, given: Given, folder: Path, *, everything: bool = False) -> ClosedForms:
     state = State()
     state.enter(dict(given))
-    return ClosedForms.of(state.question(), folder)
+    question = state.question() if everything else state.question(TABS[tab].reads)
+    return ClosedForms.of(question, folder, headline=TABS[tab].headline)
+
+
+@cache
+def pictures(tab: str, given: Given, folder: Path, *, everything: bool = False) -> str:
+    """Return what a tab shows without a simulation, its headline included."""
+    closed = forms(tab, given, folder, everything=everything)
+    above = card(closed, {}) if TABS[tab].headline else {}
+    return json.dumps([above, shown(tab, closed, {})], default=str)
+
+
+def requests(tab: Tab, given: Given, folder: Path) -> list[str]:
+    """Return the keys of the studies that a tab's simulations ask, as far as their verbs take them."""
+    study, found = forms(tab.name, given, folder).study, []
+    for simulation in tab.simulations:
+        wanted = SIMULATIONS[simulation].asked(study).model_dump(mode="json")
+        for verb in verbs_of(simulation):
+            taken = {f"{section}.{key}": value for section, keys in wanted.items() if isinstance(keys, dict)
+                     for key, value in keys.items()}  # fmt: skip
+            taken |= {f"star.{key}": value for key, value in wanted["star"][0].items()}
+            # The keys that a simulation sets itself are part of what it asks.
+            found.append(str({key: value for key, value in taken.items() if takes(verb, key)}))
+    return found
+
+
+def takes(verb: str, key: str) -> bool:
+    section = key.partition(".")[0]
+    one = VERBS[verb]
+    return (
+        one.accepts(key)
+        or section in ("map", "injections", "measure")
+        or any(taken.startswith(f"{key}.") for taken in (*one.observation, *one.takes))
+    )
+
+
+def texts(name: str) -> tuple[Given, Given]:
+    """Return what is entered before a field is changed, and after it."""
+    before: dict[str, Any] = BEFORE.get(name, {})
+    return tuple(before.items()), tuple((before | {name: OTHER[name]}).items())
 
 
 def test_every_field_has_another_text() -> None:
@@ -53,7 +101,45 @@ def test_every_field_has_another_text() -> None:
 
 
 @pytest.mark.parametrize("name", OTHER)
-def test_every_tab_is_drawn_for_every_field(name: str, tmp_path: Path) -> None:
-    given: dict[str, Any] = BEFORE.get(name, {}) | {name: OTHER[name]}
-    for tab in TABS:
-        assert pictures(tab, tuple(given.items()), tmp_path)
+def test_hidden_fields_change_nothing_and_others_do(name: str, folder: Path) -> None:
+    before, after = texts(name)
+    for tab in TABS.values():
+        if name in tab.reads:
+            drawn = pictures(tab.name, before, folder) != pictures(tab.name, after, folder)
+            wanted = requests(tab, before, folder) != requests(tab, after, folder)
+            # The number of draws and their seed are those of the button next to the headline.
+            headline = tab.headline and name in HEADLINE
+            assert drawn or wanted or headline, f"{tab.title} shows {name}, which changes nothing"
+        else:
+            # Even if the value reached the pictures, they would not change.
+            same = [pictures(tab.name, given, folder, everything=True) for given in (before, after)]
+            assert same[0] == same[1], f"{tab.title} hides {name}, which changes its pictures"
+            assert requests(tab, before, folder) == requests(tab, after, folder)
+
+
+def test_fields_of_the_detection_change_the_detection(folder: Path) -> None:
+    for name in HEADLINE:
+        before, after = texts(name)
+        drawn = pictures("detection", before, folder) != pictures("detection", after, folder)
+        # The limit in a sentence is that of the tab of limits.
+        tabs = [TABS["detection"], TABS["limit"]]
+        assert drawn or any(requests(tab, before, folder) != requests(tab, after, folder) for tab in tabs), name
+
+
+def test_fields_are_shown_where_they_matter() -> None:
+    assert {"exposure_s", "fap", "statistic"}.isdisjoint(TABS["completeness"].reads)
+    assert TABS["visibility"].reads == {"targets", "start", "days"}
+    spectrum = {"flare_temperature_k", "balmer_jump", "lines", "second_temperature_k", "second_area"}
+    assert TABS["plan"].reads == {"targets", "start", "days", "hours", "instrument", "temperature_c"} | spectrum
+    assert "visits" in TABS["change"].reads
+    assert "visits" not in HEADLINE
+    for name in SIMULATIONS:
+        assert asked(name, State().question(reads_of(name)).study())
+
+
+def test_invalid_field_of_another_tab_leaves_the_answer() -> None:
+    state = State()
+    state.enter({"star": "no such star", "targets": "eps Eri"})
+    assert state.faults.keys() == {"star"}
+    assert state.faults_of(TABS["plan"].reads) == {}
+    assert state.question(TABS["plan"].reads).star == "G2V"

@@ -354,6 +354,8 @@ def plan(
             key=f"processes.{name}",
         )
     stars = [star_of(text, study.orbit.simbad) for text in study.plan.targets]
+    if progress is not None:
+        progress(0, len(stars))
     seen = visible(study)
     names, hours = seen.visibility.by_month()
     along = OrbitConditions.along(seen.visibility.track) if study.plan.along_orbit else None
@@ -382,8 +384,6 @@ def plan(
         return Planned(one, exposed, observed, its, rates, recovered, best, why, of_throughput)
 
     planned: list[Planned] = []
-    if progress is not None:
-        progress(0, len(stars))
     # With a pool, the noise of a target is drawn while the threshold of the next one is sampled.
     for one in map_in_order(engine, planned_for, observations()):
         planned.append(one)

@@ -1,7 +1,7 @@
 // @ts-check
 // The answer card, the notices below it, and what fades where there is no answer.
 
-import {byId, element, every} from "./dom.js"
+import {byId, element, every, tableOf} from "./dom.js"
 
 /** @typedef {import("./protocol.js").Answer} Answer */
 
@@ -48,8 +48,13 @@ export class Card {
     if (payloads !== undefined) byId("payloads").textContent = payloads
   }
 
-  /** @param {Answer} answer */
+  /** Show the answer, where the tab in front has one that the card shows.
+   * @param {Answer} answer */
   tell(answer) {
+    if (!answer.headline) {
+      this.busy(false)
+      return
+    }
     this.empty(false)
     for (const part of this.parts) part.classList.remove("dim")
     for (const {unknown, shown, interval} of answer.numbers) {
@@ -95,17 +100,7 @@ export class Card {
     const box = every(`#panel-${tab} .rows`)[0]
     if (!box) return
     box.hidden = rows.length === 0
-    const table = document.createElement("table")
-    rows.forEach((cells, k) => {
-      const row = table.insertRow()
-      for (const text of cells) {
-        const cell = element(k ? "td" : "th")
-        if (!k) cell.scope = "col"
-        cell.textContent = text
-        row.append(cell)
-      }
-    })
-    box.replaceChildren(table)
+    box.replaceChildren(tableOf(rows))
   }
 
   /** Sentences that can be put away; one that was stays away as long as it is the same.

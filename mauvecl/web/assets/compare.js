@@ -1,14 +1,15 @@
 // @ts-check
 // Scenarios that are pinned, side by side, and what was simulated; the browser's tab keeps them.
 
-import {byId, element} from "./dom.js"
+import {byId, element, tableOf} from "./dom.js"
 import {dashed} from "./legend.js"
 
 /** @typedef {import("./protocol.js").Entered} Entered */
 /**
- * A question with its answer: its slot is how pictures draw it, and at is when it was simulated.
+ * A question with its answer: its slot is how pictures draw it, and at is when it was simulated. The answer of a tab
+ * without a headline is its table, in rows.
  * @typedef {{link: string, entered: Entered, files: string, shown: string, interval: string, words: string,
- *   facts: [string, string][], slot?: number, at?: string}} Scenario
+ *   facts: [string, string][], rows?: string[][], slot?: number, at?: string}} Scenario
  */
 
 const MOST = 8
@@ -72,7 +73,7 @@ export class Compare {
    * @returns {(Scenario | undefined)[]} */
   get drawn() {
     const slots = this.pins.light.map((_, k) => this.kept.pinned.find(one => one.slot === k))
-    const others = this.kept.pinned.filter(one => !slots.includes(one))
+    const others = this.kept.pinned.filter(one => !slots.includes(one) && !one.rows)
     return slots.map((one, slot) => one ?? (others.length ? Object.assign(others.shift(), {slot}) : undefined))
   }
 
@@ -101,8 +102,22 @@ export class Compare {
     return made
   }
 
+  /** Buttons of a pinned scenario.
+   * @param {Scenario} one
+   * @param {string} called */
+  handles(one, called) {
+    return [
+      this.button("Open", `Open ${called}`, () => this.open(one.link)),
+      this.button("Remove", `Remove ${called}`, () => {
+        this.kept.pinned = this.kept.pinned.filter(other => other !== one)
+        this.keep()
+      }),
+    ]
+  }
+
   show() {
-    const {pinned, history} = this.kept
+    const {history} = this.kept
+    const pinned = this.kept.pinned.filter(one => !one.rows), tables = this.kept.pinned.filter(one => one.rows)
     const drawn = this.drawn, look = this.pins[document.documentElement.dataset.theme]
     const box = byId("pinned")
     if (pinned.length) {
@@ -130,22 +145,23 @@ export class Compare {
       }
       row("", pinned.map((one, k) => {
         const cell = element("td")
-        cell.append(
-          this.button("Open", `Open scenario ${k + 1}`, () => this.open(one.link)),
-          this.button("Remove", `Remove scenario ${k + 1}`, () => {
-            this.kept.pinned = pinned.filter(other => other !== one)
-            this.keep()
-          }),
-        )
+        cell.append(...this.handles(one, `scenario ${k + 1}`))
         return cell
       }))
       box.replaceChildren(table)
-    } else {
-      box.replaceChildren(element("p", "Nothing is pinned yet: Pin keeps the present question and its answer here."))
+    } else box.replaceChildren()
+    if (!this.kept.pinned.length) {
+      box.append(element("p", "Nothing is pinned yet: Pin keeps the present question and its answer here."))
+    }
+    for (const [k, one] of tables.entries()) {
+      const table = tableOf(one.rows ?? [])
+      table.prepend(element("caption", `${one.shown}: ${one.words} `))
+      table.caption.append(...this.handles(one, `table ${k + 1}`))
+      box.append(table)
     }
     byId("no-history").hidden = history.length > 0
     byId("history").replaceChildren(...history.map((one, k) => {
-      const item = element("li", `${one.at}: ${one.shown} (${one.interval}), ${one.words} `)
+      const item = element("li", `${one.at}: ${one.shown}${one.interval && ` (${one.interval})`}, ${one.words} `)
       item.append(this.button("Open", `Open run ${history.length - k}`, () => this.open(one.link)))
       return item
     }))

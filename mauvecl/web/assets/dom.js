@@ -22,3 +22,15 @@ export function element(tag, text = null, more = {}) {
   if (text !== null) made.textContent = text
   return Object.assign(made, more)
 }
+
+/** A table of text, whose first row is its head.
+ * @param {string[][]} rows
+ * @returns {HTMLTableElement} */
+export function tableOf(rows) {
+  const table = document.createElement("table")
+  rows.forEach((cells, k) => {
+    const row = table.insertRow()
+    for (const text of cells) row.append(element(k ? "td" : "th", text, k ? {} : {scope: "col"}))
+  })
+  return table
+}

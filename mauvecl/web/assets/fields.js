@@ -2,6 +2,7 @@
 // Fields of the page: entered text, valid or not, sliders, the list of stars, and files.
 
 import {byId, every} from "./dom.js"
+import {Targets} from "./targets.js"
 
 /** @typedef {import("./protocol.js").Entered} Entered */
 /** @typedef {import("./protocol.js").Faults} Faults */
@@ -47,6 +48,15 @@ export class Fields {
     this.words = words
     this.changed = changed
     this.entered = {...words.fields}
+    /** Fields on which the tab in front depends.
+     * @type {Set<string>} */
+    this.reads = new Set(Object.keys(words.fields))
+    // The number of realisations that was chosen, and a larger one that the false-alarm probability needs.
+    this.wish = this.raised = words.fields.realisations
+    // The star whose values are filled in once the server knows them.
+    this.fresh = ""
+    this.stars = new Stars(byId("f-star"), byId("stars"), words.stars, () => this.take("star", true))
+    this.targets = new Targets(words.example)
     /** @type {Record<string, Scale>} */
     this.scales = {}
     for (const name of Object.keys(words.fields)) this.wire(name)
@@ -60,7 +70,6 @@ export class Fields {
         if (one) chosen(button.dataset.choose, one)
       })
     }
-    this.stars = new Stars(byId("f-star"), byId("stars"), words.stars, () => this.take("star", true))
     this.show()
   }
 
@@ -96,6 +105,14 @@ export class Fields {
     return document.querySelector(`label[for="f-${name}"]`)?.textContent ?? name
   }
 
+  /** A sentence on a field, with the field's label.
+   * @param {string} name
+   * @param {string} why */
+  said(name, why) {
+    const label = this.label(name)
+    return why.startsWith(label) ? why : `${label}: ${why}`
+  }
+
   /**
    * @param {string} name
    * @param {boolean} last
@@ -104,7 +121,9 @@ export class Fields {
     const text = byId(`f-${name}`).value
     const other = text !== this.entered[name]
     this.entered[name] = text
-    if (name === "fap" && other) this.possible()
+    if (name === "realisations") this.wish = text
+    if (["fap", "realisations"].includes(name) && other) this.possible()
+    if (name === "star" && last && text !== this.settled) this.fresh = this.settled = text
     if (other || last) this.changed(name, last, other)
     this.aside(name)
   }
@@ -126,8 +145,11 @@ export class Fields {
         field.add(new Option(text, text))
       }
       if (field.value !== text) field.value = text
+      if (name === "targets") field.dispatchEvent(new Event("shown"))
       this.aside(name)
     }
+    this.settled = this.entered.star
+    if (this.entered.realisations !== this.raised) this.wish = this.entered.realisations
   }
 
   /** Elements that accompany a field: its slider, and fields that apply to one choice of sky only.
@@ -144,23 +166,57 @@ export class Fields {
       const spoken = name === "magnitude" ? `${this.entered.band} = ${this.entered[name]}` : `${this.entered[name]} ${unit?.textContent ?? ""}`
       slider.setAttribute("aria-valuetext", spoken.trim())
     }
-    if (name === "sky") {
-      for (const [other, sky] of Object.entries(this.words.under)) {
-        every(`[data-field="${other}"]`)[0].hidden = this.entered.sky !== sky
-      }
-    }
+    if (name === "sky") this.hide()
   }
 
-  // Realisations that can settle the false-alarm probability are offered, others are not; one is chosen that can.
+  /** Show the fields on which a tab depends.
+   * @param {string[]} reads */
+  front(reads) {
+    this.reads = new Set(reads)
+    this.hide()
+  }
+
+  // Hide fields on which the tab does not depend, and those that apply to another choice of sky.
+  hide() {
+    for (const name of Object.keys(this.words.fields)) {
+      const sky = this.words.under[name]
+      const [box] = every(`[data-field="${name}"]`)
+      if (box) box.hidden = !this.reads.has(name) || (sky !== undefined && this.entered.sky !== sky)
+    }
+    for (const group of every("#advanced fieldset")) group.hidden = !every("[data-field]:not([hidden])", group).length
+    byId("advanced").hidden = !every("#advanced fieldset:not([hidden])").length
+    byId("begin").hidden = !this.reads.has("amplitude_percent")
+  }
+
+  // Realisations that can settle the false-alarm probability are offered, others are not. Where the chosen number
+  // cannot, the next one that can stands in for it, and says so.
   possible() {
     const fap = Number(this.entered.fap)
     const field = byId("f-realisations")
     const settles = (/** @type {string} */ text) => text.endsWith("sampled") || Number(text) * fap >= 100 * (1 - 1e-9)
     for (const option of field.options) option.disabled = fap > 0 && !settles(option.value)
-    if (fap > 0 && !settles(this.entered.realisations)) {
-      const wanted = [...field.options].find(option => !option.disabled)
-      this.entered.realisations = field.value = wanted.value
-    }
+    const enough = !(fap > 0) || settles(this.wish)
+    const stand = enough ? this.wish : [...field.options].find(option => !option.disabled).value
+    this.entered.realisations = field.value = this.raised = stand
+    const chosen = [...field.options].find(option => option.value === this.wish)?.textContent ?? this.wish
+    byId("n-realisations").textContent = enough ? "" : `${chosen} are too few for this false-alarm probability; with a larger one they come back.`
+  }
+
+  /** Show what is known of the star and of the targets, and fill in what is known of a star that was just chosen.
+   * @param {import("./protocol.js").Message["known"]} known
+   * @param {(given: Entered, fills: boolean) => void} enter */
+  facts(known, enter) {
+    this.targets.tell(known.targets)
+    const {about, given, offer} = known.star
+    const other = Object.fromEntries(Object.entries(given).filter(([name, text]) => this.entered[name] !== text))
+    byId("k-star").textContent = about
+    const button = byId("o-star")
+    button.hidden = !offer || !Object.keys(other).length
+    button.textContent = offer
+    button.onclick = () => enter(given, false)
+    const fills = this.fresh === this.entered.star && !("star" in given)
+    this.fresh = ""
+    if (fills && Object.keys(other).length) enter(given, true)
   }
 
   /** Error messages at their fields; an invalid field is never hidden.

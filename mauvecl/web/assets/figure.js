@@ -1,6 +1,8 @@
 // @ts-check
 // A figure of BokehJS. It is filled before it is drawn: without data its ranges are unknown, of which BokehJS warns.
 
+import {element} from "./dom.js"
+
 /** @typedef {import("./protocol.js").Columns} Columns */
 /** @typedef {import("./protocol.js").Drawn} Drawn */
 
@@ -68,6 +70,13 @@ export class Figure {
       for (let slot = 0; slot < slots; slot++) this.columns(`pin ${slot}`, pinned[slot] ?? none)
     }
     for (const [name, props] of Object.entries(drawn.props)) this.models.get(name).setv(props)
+    for (const tool of this.plot.toolbar.tools) {
+      if (tool.type !== "HoverTool") continue
+      const [, called] = /<b>(.*?)<\/b>/.exec(tool.tooltips) ?? []
+      const shown = drawn.names[called]
+      // What visitors type is text, not markup.
+      if (shown) tool.tooltips = element("b", shown).outerHTML + tool.tooltips.slice(`<b>${called}</b>`.length)
+    }
   }
 
   /**

@@ -34,3 +34,10 @@ export const items = entries => entries.map(([called, colour, form, shows]) => {
   Object.assign(item.dataset, {shows, called})
   return item
 })
+
+/** Give entries the names that they have in an answer, such as those of targets.
+ * @param {any[]} entries
+ * @param {Record<string, string>} names */
+export function rename(entries, names) {
+  for (const entry of entries) entry.lastChild.textContent = names[entry.dataset.called] ?? entry.dataset.called
+}

@@ -17,7 +17,7 @@ export function offer(answer, busy, entered, tabs) {
   byId("pin").disabled = !ready
   byId("study").disabled = !ready
   for (const button of every("[data-simulate]")) {
-    const lacks = ["visible", "plan"].includes(button.dataset.simulate) && !entered.see.trim()
+    const lacks = ["visible", "plan"].includes(button.dataset.simulate) && !entered.targets.trim()
     button.disabled = !ready || busy || lacks
   }
   for (const tab of Object.values(tabs)) {

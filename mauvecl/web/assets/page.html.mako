@@ -31,21 +31,34 @@
  aria-expanded="false" aria-controls="stars" aria-autocomplete="list" aria-describedby="w-star">
 <ul id="stars" role="listbox" aria-label="Stars" hidden></ul>
 </div>
+<p class="known"><span id="k-star"></span> <button type="button" class="plain" id="o-star" hidden></button></p>
 <div class="file"><button type="button" class="plain" data-choose="star">Use your own spectrum</button>
 <input type="file" data-upload="star" aria-label="Your own spectrum" tabindex="-1" hidden><span class="hint">nm and erg/s/cm²/Å; text, ECSV, VOTable, FITS</span></div>
 % elif name == "own_unknown":
 <input id="f-own_unknown" name="own_unknown" type="text" autocomplete="off" spellcheck="false" placeholder="200 1, 450 3, 700 1" aria-describedby="w-own_unknown">
 <div class="file"><button type="button" class="plain" data-choose="own_unknown">Use a file of nm and DN</button>
 <input type="file" data-upload="own_unknown" aria-label="File of the unknown spectrum" tabindex="-1" hidden></div>
+% elif field.kind == "targets":
+<textarea id="f-targets" name="targets" hidden></textarea>
+<div class="wide"><table id="targets"><caption class="quiet">Targets</caption><thead><tr></tr></thead><tbody></tbody></table></div>
+<div class="row"><button type="button" class="plain" id="targets-example">Three flare stars, as an example</button>
+<button type="button" class="plain" id="targets-open">Open a CSV table</button><input type="file" id="targets-file" accept=".csv,.ecsv,.txt" aria-label="CSV table of targets" tabindex="-1" hidden>
+<button type="button" class="plain" id="targets-clear" hidden>Remove all</button>
+<p class="wrong" id="w-targets" hidden></p><span class="hint">Type names or paste a list or table; what is known of a star stands in grey and can be overwritten.</span></div>
+% elif field.kind == "day":
+<input id="f-${name}" name="${name}" type="date" value="${field.first}" aria-describedby="w-${name}">
 % elif hasattr(field.read, "options"):
 <select id="f-${name}" name="${name}" aria-describedby="w-${name}">
 % for option in field.read.options:
 <option value="${option}"${" selected" if option == field.first else ""}>${spoken(name, option)}</option>
 % endfor
 </select>
+% if name == "realisations":
+<p class="known" id="n-realisations"></p>
+% endif
 % else:
 <div class="number"><input id="f-${name}" name="${name}" type="text" value="${field.first}" autocomplete="off" spellcheck="false"
- ${"inputmode=decimal" if hasattr(field.read, "range") else ""} aria-describedby="w-${name}">
+ ${"inputmode=decimal" if hasattr(field.read, "range") else "list=names" if name == "target" else ""} aria-describedby="w-${name}">
 % if name == "magnitude":
 <label class="aside" for="f-band">in</label>
 <select id="f-band" name="band" aria-describedby="w-band">
@@ -61,9 +74,24 @@
 <input type="range" data-slider="${name}" aria-label="${field.label}, slider" min="0" max="1" step="1">
 % endif
 % endif
+% if field.kind != "targets":
 <p class="wrong" id="w-${name}" hidden></p>
+% endif
 % if name == "magnitude":
 <p class="wrong" id="w-band" hidden></p>
+% endif
+</div>
+</%def>
+<%def name="actions(tab)">
+<div class="row">
+% for kind, title in tab.simulations.items():
+% if kind != "detection":
+<button type="button" data-simulate="${kind}" class="main" disabled>${title}</button>
+% endif
+% endfor
+% if any(p for p in tab.pictures if p.name in ("excess", "recorded", "telescope", "snr", "budget")):
+<label><input type="checkbox" data-marks="marks" checked> spectral lines</label>
+<label><input type="checkbox" data-marks="more marks"> H alpha</label>
 % endif
 </div>
 </%def>
@@ -91,7 +119,7 @@ elif name == "signal":
 <details id="controls" open>
 <summary class="fold">Change the question</summary>
 <form autocomplete="off">
-<div class="field"><div class="head"><label for="preset">Begin with</label></div>
+<div class="field" id="begin"><div class="head"><label for="preset">Begin with</label></div>
 <select id="preset"><option value="">choose an example</option>
 % for name in fields.PRESETS:
 <option>${name}</option>
@@ -147,13 +175,23 @@ ${control(name)}
 <dl id="facts"></dl>
 <div class="row run">
 <button type="button" id="simulate" class="main" disabled>Simulate</button>
-<button type="button" id="cancel" disabled>Cancel</button>
+<span id="standing"><button type="button" id="cancel" disabled>Cancel</button>
 <progress id="progress" class="idle" max="1" value="0" aria-label="Simulation"></progress>
-<span id="status" role="status"></span>
+<span id="status" role="status"></span></span>
 </div>
 </div>
 </div>
 <ul id="notices" aria-label="Notices"></ul>
+<datalist id="names">
+% for name in names:
+<option value="${name}"></option>
+% endfor
+</datalist>
+<div id="campaign" hidden>
+% for name in fields.CAMPAIGN:
+${control(name)}
+% endfor
+</div>
 <div class="tabs">
 <div role="tablist" aria-label="Pictures of the answer">
 % for k, tab in enumerate(tabs.values()):
@@ -163,6 +201,9 @@ ${control(name)}
 % for k, tab in enumerate(tabs.values()):
 <div role="tabpanel" id="panel-${tab.name}" aria-labelledby="tab-${tab.name}"${"" if k == 0 else " hidden"}>
 <p class="about">${tab.about}</p>
+% if "targets" in tab.reads:
+${actions(tab)}
+% endif
 % if any(p.pins for p in tab.pictures):
 <div class="pins" hidden><label><input type="checkbox" data-marks="pins" checked> Pinned</label></div>
 % endif
@@ -198,17 +239,9 @@ ${control(name)}
 <ol id="history" reversed></ol>
 <p id="no-history">Nothing is simulated yet.</p>
 % else:
-<div class="row">
-% for kind, title in tab.simulations.items():
-% if kind != "detection":
-<button type="button" data-simulate="${kind}" class="main" disabled>${title}</button>
+% if "targets" not in tab.reads:
+${actions(tab)}
 % endif
-% endfor
-% if any(p for p in tab.pictures if p.name in ("excess", "recorded", "telescope", "snr", "budget")):
-<label><input type="checkbox" data-marks="marks" checked> spectral lines</label>
-<label><input type="checkbox" data-marks="more marks"> H alpha</label>
-% endif
-</div>
 % if tab.pictures:
 <p class="hint">To zoom: drag a box, pinch, or turn the wheel with Ctrl or after a click. Keys: + − arrows 0.</p>
 % endif

@@ -33,17 +33,20 @@ class Page {
     /** @type {Answer | null} */
     this.answer = null
     this.asking = this.dirty = false
+    /** Table of the tab in front.
+     * @type {string[][]} */
+    this.rows = []
     this.card = new Card()
     this.fields = new Fields(words, (name, last, other) => {
       // A changed question cancels the wait for a file.
       if (other) this.uploads.forget([name])
       this.changed(last, other)
     }, (field, file) => this.uploads.choose(field, file))
-    this.routing = new Routing(words, this.fields.entered, () => this.moved(), () => this.ask())
+    this.routing = new Routing(words, this.fields.entered, () => this.moved(), () => { this.front(); this.ask() })
     this.live = new Live(version => this.back(version), code => this.lost(code))
     const refused = (/** @type {string} */ why) => this.card.notices([[why, "danger"]])
     this.simulations = new Simulations(this.live, this.routing, this.card, {
-      question: () => this.question, ready: () => this.answer !== null, offer: () => this.offer(),
+      question: kind => this.asked(words.asks[kind]), ready: () => this.answer !== null, offer: () => this.offer(),
       ended: () => this.simulated(), refused,
     })
     this.uploads = new Uploads(words, this.fields, this.live, {
@@ -62,10 +65,33 @@ class Page {
     return JSON.stringify(this.fields.entered)
   }
 
+  /** What is entered in some fields, and which files stand in them.
+   * @param {string[]} names */
+  asked(names) {
+    const entered = Object.fromEntries(names.map(name => [name, this.fields.entered[name]]))
+    return JSON.stringify([entered, this.uploads.of(entered)])
+  }
+
+  get tab() {
+    return words.tabs[this.routing.seen.tab]
+  }
+
   /** @param {string} link */
   follow(link) {
     this.routing.follow(link)
     this.fields.show()
+    this.front()
+  }
+
+  // The tab in front shows the fields on which it depends; the card is that of the detection.
+  front() {
+    const {reads, headline} = this.tab
+    this.fields.front(reads)
+    byId("card").hidden = !headline
+    const campaign = byId("campaign")
+    campaign.hidden = !reads.includes("targets")
+    if (!campaign.hidden) byId(`panel-${this.routing.seen.tab}`).querySelector(".about").after(campaign)
+    if (this.simulations.running === null) this.simulations.place()
   }
 
   // The browser's history has led to another question or tab.
@@ -83,7 +109,7 @@ class Page {
   changed(last, other) {
     if (other) {
       this.routing.seen.simulated = ""
-      this.simulations.drop()
+      this.simulations.changed()
       this.withdraw()
       this.ask()
       this.routing.step(last)
@@ -115,7 +141,8 @@ class Page {
     this.withdraw()
     document.title = "No answer: mauvecl"
     this.fields.tell(faults)
-    this.card.none(refused ?? Object.entries(faults).map(([name, why]) => `${this.fields.label(name)}: ${why}`).join("; "))
+    if (refused && !this.tab.headline) this.card.notices([[refused, "danger"]])
+    this.card.none(refused ?? Object.entries(faults).map(([name, why]) => this.fields.said(name, why)).join("; "))
   }
 
   /** @param {Answer} answer */
@@ -131,7 +158,7 @@ class Page {
       this.compare.ran({...this.scenario(), at: new Date().toLocaleTimeString()})
     }
     clearTimeout(this.later)
-    this.later = setTimeout(() => this.solve(), SOLVE_MS)
+    if (answer.headline) this.later = setTimeout(() => this.solve(), SOLVE_MS)
     this.simulations.next(answer.simulated)
   }
 
@@ -167,6 +194,11 @@ class Page {
   /** @param {Message} message */
   show(message) {
     this.fields.tell(message.faults)
+    this.fields.facts(message.known, (given, fills) => {
+      // What is filled in belongs to the same step of the history as the star.
+      if (fills) this.routing.editing = true
+      this.enter(given)
+    })
     // Without an answer the notes of the last one keep their room, unseen: nothing jumps while a number is typed.
     /** @type {[string, string][]} */
     const stray = message.stray ? [[message.stray, "stray"]] : []
@@ -177,6 +209,7 @@ class Page {
 
   /** @param {Message} message */
   async draw(message) {
+    this.rows = message.rows
     this.card.rows(message.tab, message.rows)
     this.pinned()
     await this.pictures.put(message.pictures)
@@ -245,12 +278,15 @@ class Page {
     const facts = [...this.answer.facts]
     for (const one of this.answer.numbers) facts.push([one.title, one.shown])
     const entered = {...this.fields.entered}
-    return {link: this.routing.link, entered, files: this.uploads.of(entered), shown, interval, facts, words: said}
+    // Where there is no headline, the table is what is compared.
+    const rows = this.tab.headline ? undefined : this.rows
+    return {link: this.routing.link, entered, files: this.uploads.of(entered), shown, interval, facts, words: said, rows}
   }
 
   // What a saved picture says of the question.
   about() {
-    const others = Object.entries(this.fields.entered).filter(([name, text]) => text !== words.fields[name])
+    const others = Object.entries(this.fields.entered)
+      .filter(([name, text]) => text !== words.fields[name] && this.tab.reads.includes(name))
     const entered = others.map(([name, text]) => `${this.fields.label(name)}: ${text}`).join("; ")
     const sentences = [this.answer && `${this.answer.shown} ${this.answer.words}.`, entered && `Entered: ${entered}.`]
     return {sentences: [...sentences.filter(Boolean), `mauvecl ${words.version}`], pins: this.compare.key("light")}

@@ -3,7 +3,7 @@
 
 import {byId, every} from "./dom.js"
 import {Figure, isEmpty} from "./figure.js"
-import {items} from "./legend.js"
+import {items, rename} from "./legend.js"
 import {pictureFile} from "./picture-files.js"
 import {tables} from "./picture-table.js"
 
@@ -126,6 +126,7 @@ class Picture {
 
   fill() {
     this.figure.fill(this.drawn, this.pinned, this.pictures.slots.length)
+    rename(every(".legend li", this.frame), this.drawn.names)
     this.some()
   }
 
@@ -179,6 +180,7 @@ class Picture {
     const here = every(".legend li", this.frame)
     const {sentences, pins} = this.pictures.about()
     const legend = entries.filter((_, k) => !here[k].hidden && !here[k].classList.contains("absent"))
+    rename(legend, this.drawn.names)
     if (this.pins && this.pictures.marks.has("pins")) legend.push(...pins)
     const [title] = every("h3", this.frame)
     const blob = await pictureFile(ending, figure, title.textContent, legend, [this.drawn.text, ...sentences])

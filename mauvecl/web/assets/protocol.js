@@ -12,27 +12,30 @@
  * @typedef {Record<string, string[] | {f4: string, shape: number[]}>} Columns
  *
  * Data of a picture: its words, columns by data source, and properties by model.
- * @typedef {{text: string, sources: Record<string, Columns>, props: Record<string, Record<string, any>>}} Drawn
+ * @typedef {{text: string, sources: Record<string, Columns>, props: Record<string, Record<string, any>>,
+ *   names: Record<string, string>}} Drawn
  *
  * The answer to a question, as the card shows it; notes are sentences with their kind.
  * @typedef {{numbers: {unknown: string, title: string, shown: string, interval: string}[], chosen: string,
  *   shown: string, interval: string, words: string, facts: [string, string][], notes: [string, string][],
- *   simulated: string[]}} Answer
+ *   simulated: string[], headline: boolean}} Answer
  *
  * A message of the server: which entries it has depends on what was asked.
  * @typedef {{n: number, faults: Faults, stray: string, answer: Answer, refused: string, tab: string,
  *   pictures: Record<string, Drawn>, rows: string[][], draws: boolean, ended: string, kind: string, progress: number,
  *   message: string, lacks: string, entered: string, file: string, taken: any[], solved?: string, payloads?: string,
- *   pins: Record<string, Columns>, hello: string}} Message
+ *   pins: Record<string, Columns>, hello: string,
+ *   known: {star: {about: string, given: Entered, offer: string}, targets: any[]}}} Message
  *
  * What the server says of a picture once.
  * @typedef {{name: string, sets: string, logs: string[], pins: string, alike: string[]}} PictureWords
  *
  * Texts and limits that the page is served with.
  * @typedef {{version: string, fields: Entered, seen: {tab: string, simulated: string}, stars: string[],
+ *   example: string, asks: Record<string, string[]>,
  *   uploads: Record<string, string>, under: Record<string, string>, presets: Record<string, Entered>,
  *   sliders: Record<string, {low: number, high: number, step: number, log: boolean}>,
- *   tabs: Record<string, {pictures: PictureWords[], files: Record<string, string | null>}>,
+ *   tabs: Record<string, {pictures: PictureWords[], files: Record<string, string | null>, reads: string[], headline: boolean}>,
  *   pins: Record<string, [string, string][]>, most_uploaded: number, unused: number}} Words
  */
 

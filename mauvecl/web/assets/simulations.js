@@ -12,8 +12,8 @@ export class Simulations {
    * @param {Live} live
    * @param {Routing} routing
    * @param {Card} card
-   * @param {{question(): string, ready(): boolean, offer(): void, ended(): void, refused(why: string): void}} page
-   *   the question; whether it has an answer; show which buttons can be pressed; a simulation's answer is there, or not
+   * @param {{question(kind: string): string, ready(): boolean, offer(): void, ended(): void, refused(why: string): void}} page
+   *   what a simulation is asked; whether it has an answer; show which buttons can be pressed; a simulation's answer is there, or not
    */
   constructor(live, routing, card, page) {
     this.live = live
@@ -22,8 +22,13 @@ export class Simulations {
     this.page = page
     /** @type {number | null} */
     this.running = null
+    // The running simulation.
+    this.kind = "detection"
+    this.question = ""
     /** @type {string[]} */
     this.wanted = []
+    // Where the progress is shown unless another button was pressed.
+    this.home = byId("standing").parentElement
     byId("simulate").onclick = () => this.start("detection")
     byId("cancel").onclick = () => this.drop()
     for (const button of every("[data-simulate]")) {
@@ -34,7 +39,9 @@ export class Simulations {
   /** @param {string} kind */
   start(kind) {
     if (this.running !== null || !this.page.ready()) return
-    const question = this.page.question()
+    const question = this.question = this.page.question(kind)
+    this.kind = kind
+    this.place(kind)
     this.card.progress(0, "waiting for its turn")
     const n = this.running = this.live.ask("simulate", {kind, link: this.routing.link}, message => {
       if (message.ended === undefined) {
@@ -45,11 +52,19 @@ export class Simulations {
       this.running = null
       this.card.ended(message.ended)
       this.page.offer()
-      if (question !== this.page.question()) return
+      if (question !== this.page.question(kind)) return
       if (message.refused) this.page.refused(message.refused)
       else if (message.kind) this.page.ended()
     })
     this.page.offer()
+  }
+
+  /** Show the progress next to the button that was pressed.
+   * @param {string} [kind] */
+  place(kind) {
+    const [button] = every(`[role=tabpanel]:not([hidden]) [data-simulate="${kind}"]`)
+    const place = button?.parentElement ?? this.home
+    if (byId("standing").parentElement !== place) place.append(byId("standing"))
   }
 
   /** Start the next one that a link wants and that is not here.
@@ -61,6 +76,12 @@ export class Simulations {
 
   stop() {
     if (this.running !== null) this.live.ask("cancel", {})
+  }
+
+  // Another question: want no other, and stop what does not belong to it.
+  changed() {
+    this.wanted = []
+    if (this.question !== this.page.question(this.kind)) this.stop()
   }
 
   // Stop, and want no other.

@@ -48,3 +48,13 @@ TABS: dict[str, Tab] = {
     **{name: _tab_of(name) for name, verb in VERBS.items() if verb.tab and name not in DRAWN},
     Compare.name: Compare(),
 }
+
+
+def asking(simulation: str) -> Tab:
+    """Return the tab whose button starts a simulation."""
+    return next(tab for tab in TABS.values() if simulation in tab.simulations)
+
+
+def reads_of(simulation: str) -> frozenset[str]:
+    """Return the fields on which the answers of a simulation depend."""
+    return asking(simulation).reads_of(simulation)

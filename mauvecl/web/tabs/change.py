@@ -54,4 +54,7 @@ class Change(Tab):
     verb = "change"
     about = "How small a difference between visits is seen: of lines, bands, the Balmer jump and the colour."
     pictures = (AgainstMagnitude(),)
+    headline = False
+    # Visits are evenly spaced, without an orbit.
+    never = ("start", "days")
     files = {"change": "change", "indices": "change"}  # noqa: RUF012

@@ -73,6 +73,9 @@ class Completeness(Tab):
         "finds, at one false alarm a month."
     )
     pictures = (Shares(),)
+    headline = False
+    # The picture reads off the share of flares of this size.
+    also = ("amplitude_percent",)
     simulations = {"completeness": "Inject flares"}  # noqa: RUF012
     answer, view = "completeness", 1
     files = {"completeness": "completeness", "limits": "completeness"}  # noqa: RUF012

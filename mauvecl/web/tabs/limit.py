@@ -31,7 +31,7 @@ FIRST, HALVINGS, CHANGE = 9, 5, 0.25
 
 
 #: Fields on which a map does not depend; an upload is identified by its content.
-FREE = {"magnitude", "amplitude_percent", "realisations", "seed", "see", "hours", "uploaded"}
+FREE = {"magnitude", "amplitude_percent", "realisations", "seed", "targets", "start", "days", "hours", "uploaded"}
 
 
 def odds(closed: ClosedForms, magnitude: float, rises: Float) -> list[DetectionForms]:

@@ -1,4 +1,4 @@
-"""Campaign on a target: recovered and expected flares."""
+"""Campaign on targets: recovered and expected flares."""
 
 from __future__ import annotations
 
@@ -6,28 +6,42 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.answers.campaigns.plan import COLUMNS
 from mauvecl.web.closed_forms import short
-from mauvecl.web.figures import Canvas
-from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
+from mauvecl.web.figures import Canvas, curves, target_names
+from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab, target_words
 
 if TYPE_CHECKING:
     from mauvecl.web.closed_forms import ClosedForms
+    from mauvecl.web.question import Question
 
 #: Ends of the axes, erg, the same for all questions.
 ENERGIES = (1e28, 1e37)
 
 
-def _columns(answers: Answers) -> tuple[Any, Any, Any]:
-    """Return energies, the recovered fraction at each, and the number of flares above it in the campaign."""
-    table, (star,) = answers["plan"].by_energy, answers["plan"].planned
-    columns = (table["energy"].to_value("erg"), table["recovered"], table["rate_above"].to_value("1 / h") * star.hours)
-    energy, recovered, above = (np.asarray(column, float) for column in columns)
-    return energy, recovered, above
+#: Columns of energies, with the recovered fraction at each and the number of flares above it in the campaign.
+Columns = tuple[Any, Any, Any]
+
+
+def _columns(answers: Answers) -> list[Columns]:
+    """Return the columns of each target that is seen."""
+    answer, found = answers["plan"], []
+    table = answer.by_energy
+    for star in answer.planned:
+        # Beyond the pictures' ends there is nothing to see.
+        rows = table[(np.asarray(table["target"]) == star.name) & (table["energy"].to_value("erg") <= ENERGIES[1])]
+        above = rows["rate_above"].to_value("1 / h") * star.hours
+        found.append((rows["energy"].to_value("erg"), np.asarray(rows["recovered"], float), np.asarray(above, float)))
+    return found
 
 
 def _energy(value: Any) -> str:
     """Format an energy for readers."""
     return f"{value.value:.2g} erg" if np.isfinite(value) else "no energy"
+
+
+def _names(answers: Answers) -> list[str]:
+    return [star.name for star in answers["plan"].planned]
 
 
 class Recovered(Picture):
@@ -38,50 +52,53 @@ class Recovered(Picture):
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         name = "bolometric energy of the flare (erg)"
         canvas = Canvas(ink, name, "share recovered", logs | {"x"}, x_range=ENERGIES, y_range=(-0.03, 1.05))
-        curve = canvas.line("recovered", "share recovered", "flare", line_width=2)
-        canvas.tooltips(curve, ("energy (erg)", "x"), ("recovered", "y"))
+        canvas.targets("recovered", "share recovered")
         return canvas
 
     def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         if "plan" not in answers:
-            text = "Nothing is planned yet: name a target under Advanced, such as eps Eri, and press Plan."
-            return PictureData(text, {"recovered": {"x": [], "y": []}})
-        (row,) = answers["plan"].table
-        energy, recovered, _ = _columns(answers)
-        half, most = (_energy(row[name]) for name in ("E50", "E90"))
-        text = f"Of the flares of {row['target']} half are recovered at {half}, 90 % at {most}."
-        return PictureData(text, {"recovered": {"x": energy, "y": recovered}})
+            return PictureData("For each target, from which energy on flares are found.", curves("recovered", []))
+        parts = [
+            f"{row['target']}: half of the flares at {_energy(row['E50'])}, 90 % at {_energy(row['E90'])}"
+            if row["seen"] > 0
+            else f"{row['target']} is never seen"
+            for row in answers["plan"].table
+        ]
+        found = [(energy, recovered) for energy, recovered, _ in _columns(answers)]
+        text = f"Recovered: {'; '.join(parts)}."
+        return PictureData(text, curves("recovered", found), names=target_names(_names(answers)))
 
 
 class Expected(Picture):
-    """Numbers of flares, and of recovered flares, above an energy."""
+    """Numbers of recovered flares above an energy."""
 
-    name, title = "expected", "Flares of so much energy or more in the campaign"
+    name, title = "expected", "Recovered flares of so much energy or more in the campaign"
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         name = "bolometric energy of the flare (erg)"
         canvas = Canvas(ink, name, "flares", logs | {"x", "y"}, x_range=ENERGIES, y_range=(1e-3, 1e4))
-        canvas.line("all", "all of them", "star", line_width=2)
-        curve = canvas.line("found", "recovered", "flare", line_width=2)
-        canvas.tooltips(curve, ("energy (erg)", "x"), ("recovered", "y"))
+        canvas.targets("found", "recovered flares")
         return canvas
 
     def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         if "plan" not in answers:
-            return PictureData("Nothing is planned yet.", {name: {"x": [], "y": []} for name in ("all", "found")})
-        (row,) = answers["plan"].table
-        energy, recovered, above = _columns(answers)
-        if not energy.size:
-            text = f"{row['target']} is never seen within the limits on Earth, Sun, Moon and radiation."
-            return PictureData(text, {name: {"x": [], "y": []} for name in ("all", "found")})
-        # Each step of the rate is recovered as at its middle.
-        parts = (above[:-1] - above[1:]) * (recovered[:-1] + recovered[1:]) / 2
-        flares = np.append(np.cumsum(parts[::-1])[::-1], 0.0) + above[-1] * recovered[-1]
-        text = f"{row['target']} is observed for {short(row['hours'].value)} h; "
-        known = np.isfinite(row["expected"])
-        text += f"{row['expected']:.3g} flares are expected to be recovered." if known else "no rates are known."
-        columns = {"all": {"x": energy, "y": above}, "found": {"x": energy, "y": np.where(flares > 0, flares, np.nan)}}
-        return PictureData(text, columns)
+            return PictureData("For each target, how many flares are expected.", curves("found", []))
+        found, parts = [], []
+        for row, (energy, recovered, above) in zip(answers["plan"].table, _columns(answers), strict=True):
+            # Each step of the rate is recovered as at its middle.
+            steps = (above[:-1] - above[1:]) * (recovered[:-1] + recovered[1:]) / 2
+            flares = np.append(np.cumsum(steps[::-1])[::-1], 0.0) + (above[-1] * recovered[-1] if above.size else 0.0)
+            found.append((energy, np.where(flares > 0, flares, np.nan)[: energy.size]))
+            known = np.isfinite(row["expected"])
+            number = f"{row['expected']:.3g} flares" if known else "no rates are known"
+            seen = row["seen"] > 0
+            parts.append(
+                f"{row['target']} in {short(row['hours'].value)} h: {number}"
+                if seen
+                else f"{row['target']} is never seen"
+            )
+        text = f"Expected to be recovered: {'; '.join(parts)}."
+        return PictureData(text, curves("found", found), names=target_names(_names(answers)))
 
 
 class Plan(Tab):
@@ -89,8 +106,21 @@ class Plan(Tab):
 
     verb = "plan"
     about = (
-        "What a campaign on the target of Visibility would find: hours, energies recovered, flares expected. Star and "
-        "flare rates are the target's own; completeness is in closed form, and assumptions have a table."
+        "What a campaign would find: hours, energies recovered, flares expected. Spectrum and flare rates are those of "
+        "each target's type; completeness is in closed form, and assumptions have a table."
     )
+    headline = False
     pictures = (Recovered(), Expected())
     files = dict.fromkeys(("plan", "stars", "energies", "assumptions"), "plan")
+
+    def words(self, question: Question) -> str:
+        """Return the targets, hours and days."""
+        return f"{target_words(question)}, {question.hours:g} h each at most"
+
+    def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
+        """Return the table of targets; before a plan, which columns it will have."""
+        if "plan" in answers:
+            return super().rows(closed, answers)
+        names = [target["name"] for target in closed.question.targets] or ["each target"]
+        headings = [column.heading for column in COLUMNS if column.heading]
+        return [headings, *([name, *("·" for _ in headings[1:])] for name in names)]

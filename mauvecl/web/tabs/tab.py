@@ -5,10 +5,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from mauvecl.answers.verbs import VERBS
 from mauvecl.schema.tables import View, without_empty
+from mauvecl.web.fields import FIELDS, star_words
+from mauvecl.web.simulations import verbs_of
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -16,11 +19,18 @@ if TYPE_CHECKING:
 
     from mauvecl.study.study import Study
     from mauvecl.web.closed_forms import ClosedForms
+    from mauvecl.web.question import Question
 
 #: Answers that are simulated, by name: of one question.
 Answers = Mapping[str, Any]
 #: Columns that the page does not show: its question has one star and one flare.
-FIXED = ("star", "amplitude", "target")
+FIXED = ("star", "amplitude")
+
+
+def target_words(question: Question) -> str:
+    """Return the targets and days of a question in words."""
+    names = ", ".join(target["name"] for target in question.targets) or "no target yet"
+    return f"{names}; {question.days:g} days from {question.start}"
 
 
 @dataclass
@@ -35,11 +45,14 @@ class PictureData:
         Columns by the name of the figure's data source.
     props : dict
         Properties by the name of the figure's model, such as an axis's label.
+    names : dict
+        Entries of the legend that have another name than in the figure.
     """
 
     text: str
     sources: dict[str, dict[str, ArrayLike | Sequence[str]]] = field(default_factory=dict)
     props: dict[str, dict[str, Any]] = field(default_factory=dict)
+    names: dict[str, str] = field(default_factory=dict)
 
 
 class Picture(ABC):
@@ -108,6 +121,11 @@ class Tab(ABC):
     view: ClassVar[int] = 0
     #: What is taken along: names of simulations or verbs; by default its own simulations.
     questions: ClassVar[tuple[str, ...]] = ()
+    #: Whether the chance of detection stands above it, whose fields it then shows.
+    headline: ClassVar[bool] = True
+    #: Fields that it reads although its verbs do not take their keys, and those that it does not read.
+    also: ClassVar[tuple[str, ...]] = ()
+    never: ClassVar[tuple[str, ...]] = ()
     #: Tables that can be taken along, with the simulation that each needs, or none.
     files: ClassVar[Mapping[str, str | None]] = {}
 
@@ -127,6 +145,25 @@ class Tab(ABC):
         for key, value in (of_verb | {"files": {verb: verb}}).items():
             if key not in vars(cls):
                 setattr(cls, key, value)
+
+    @cached_property
+    def reads(self) -> frozenset[str]:
+        """Fields on which the tab depends, with those of its headline: the chance, and the limit in a sentence."""
+        headline = ("detection", "limit") if self.headline else ()
+        return self.reads_of(*self.questions, *self.simulations, *headline)
+
+    def reads_of(self, *questions: str) -> frozenset[str]:
+        """Return the fields on which simulations or verbs depend, by the keys that the flags of their verbs set."""
+        verbs = [VERBS[verb] for question in questions for verb in verbs_of(question)]
+        taken = {
+            name for name, field in FIELDS.items() if any(verb.accepts(key) for verb in verbs for key in field.keys)
+        }
+        return frozenset(taken | set(self.also)) - set(self.never)
+
+    def words(self, question: Question) -> str:
+        """Return what a tab without a headline is asked, in words."""
+        star = "your own star" if question.uploaded is not None else star_words(question.star)
+        return f"{star} of {question.band} = {question.magnitude:g}"
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         """Return the table of one of `files`: by default that of the answer it needs."""
