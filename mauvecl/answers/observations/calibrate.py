@@ -357,6 +357,11 @@ class CalibrateAnswer(Answer):
             found["dispersion_nm_per_pixel"] = n.dispersion_nm_per_pixel * (1 + f.stretch_nm.value / half)
             first = n.pixel_zero_nm - f.wavelength_nm.mean()
             found["pixel_zero_nm"] = n.pixel_zero_nm + f.shift_nm.value + f.stretch_nm.value * first / half
+            # The pixels that were observed stay those that are read.
+            step, read = found["dispersion_nm_per_pixel"], n.read_pixels
+            lowest, highest = (found["pixel_zero_nm"] + step * end for end in (read.start - 0.5, read.stop - 0.5))
+            found["output_min_nm"] = max(n.output_min_nm, float(lowest))
+            found["output_max_nm"] = min(n.output_max_nm, float(highest))
         if f.fwhm_nm is not None:
             found["gaussian_fwhm_nm"] = f.fwhm_nm.value
         return found
