@@ -344,3 +344,15 @@ def test_intervals_of_joint_fits_cover(unknown: bool, count: int, engine: Engine
     for inside, lowest, highest in zip(covered, (0.63, 0.92), (0.73, 0.98), strict=True):
         least, most = scipy.stats.binom.ppf(1e-6, count, lowest), scipy.stats.binom.isf(1e-6, count, highest)
         assert ((least <= inside) & (inside <= most)).all(), (inside, least, most)
+
+
+def test_unknown_levels_do_not_mislead_the_start_of_joint_fits() -> None:
+    """60 stares with normal noise and unknown levels of dark and star: the peak, known to 0.5 s, is always found."""
+    nuisances = Nuisances.of(quiet(), {"dark": np.inf, "light": 0.02})
+    lit, _ = lit_frames(FALLING, Stare.of(300.0))
+    rng = np.random.default_rng(5)
+    for _ in range(60):
+        frames = [x.recorded_dn + rng.standard_normal(x.recorded_dn.size) * np.sqrt(x.variance_dn2) for x in lit]
+        levels = (rng.standard_normal(2) * [0.5, 0.02]) @ nuisances.spectra
+        found = fit_cooling(np.array(frames) + levels, quiet(), model(), nuisances, levels=(), **START)
+        assert abs(found.estimates[0, 0] - 52.0) < 10.0

@@ -22,8 +22,7 @@ from mauvecl.lightcurve.flares.shapes import Shape, shape_of
 from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.measured_bins import checked_frames, known_strengths, less_known
 from mauvecl.results.measurements.fit import LEVELS, Measurement
-from mauvecl.results.measurements.profile import Profile
-from mauvecl.results.measurements.reduction import Ranges, Reduction
+from mauvecl.results.measurements.reduction import EVERY, Ranges, Reduction
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import Duration, Moment, Probability, Wavelength
@@ -249,8 +248,8 @@ def fit_cooling(
     data = _data(raw, quiet, model, nuisances, stare, shape_of(shape), skipped_nm)
     free = np.arange(len(PARAMETERS) if cooling else 4)
     low, high = _limits(model, stare)
-    theta = np.clip(_start(data, peak_s, half_width_s, cooling), low, high)
     whitening = data.whitening(None)
+    theta = np.clip(_start(data, whitening, peak_s, half_width_s, cooling), low, high)
     for _ in range(REFITS):
         theta = _solve(data, whitening, theta, free, low, high)
         whitening = data.whitening(theta)
@@ -348,19 +347,19 @@ def _data(
     return _Data(sums, edges, strengths[:, 3], covariance, unknown, prior, reduction, model, gain, shape)
 
 
-def _start(data: _Data, peak_s: float, half_width_s: float, cooling: bool) -> Float:
+def _start(data: _Data, whitening: _Whitening, peak_s: float, half_width_s: float, cooling: bool) -> Float:
     """Return starting parameters: the best amplitude and temperature at the given peak and half-width."""
     rise = data.light * data.shape.mean_over(data.edges, peak_s, half_width_s)
-    power = float(np.sqrt(np.sum(rise**2)))
-    if not power > 0.0:
+    if not rise.any():
         raise InputError.of("peak_s", peak_s, "the peak of a flare with light in the stare")
-    best = Profile(data.reduction, (rise @ data.sums / power)[None]).best()
-    amplitude = max(float(best.linear[0, 0]) / power, 1e-6)
+    nodes = slice(None, None, EVERY)
+    templates = whitening.of(rise[:, None] * data.reduction.hot[nodes, None])
+    power, along = np.sum(templates**2, axis=1), templates @ whitening.of(data.sums[None])[0]
+    best = int(np.argmax(np.maximum(along, 0.0) ** 2 / power))
+    amplitude, log_k = max(float(along[best] / power[best]), 1e-6), data.reduction.log_k[nodes][best]
     # Somewhat hotter at the peak than on average, if it cools.
     first, last = (0.1, -0.3) if cooling else (0.0, 0.0)
-    return np.array(
-        [peak_s, np.log(half_width_s), np.log(amplitude), best.log_k[0] + first, last, np.log(2.0 * half_width_s)]
-    )
+    return np.array([peak_s, np.log(half_width_s), np.log(amplitude), log_k + first, last, np.log(2.0 * half_width_s)])
 
 
 def _limits(model: FlareModel, stare: Stare) -> tuple[Float, Float]:
