@@ -551,6 +551,26 @@ def test_uploads_are_used_or_refused(page: Page, tmp_path: Path) -> None:
     assert "points" in (tmp_path / "study" / "study.toml").read_text()
 
 
+def test_dropped_file_is_named_and_not_in_the_link(page: Page) -> None:
+    text = "\n".join(f"{nm} 1e-12" for nm in range(170, 1001))
+    page.evaluate(
+        """text => { const held = new DataTransfer()
+        held.items.add(new File([text], "dropped star.txt"))
+        const how = {dataTransfer: held, bubbles: true, cancelable: true}
+        document.querySelector('[data-field=star]').dispatchEvent(new DragEvent("drop", how)) }""",
+        text,
+    )
+    page.locator("[data-uploaded=star]", has_text="dropped star.txt").wait_for()
+    until(page, lambda: "your own star" in shown(page))
+    page.get_by_role("button", name="Take along", exact=True).click()
+    page.get_by_text("The link does not hold your file").wait_for()
+    page.keyboard.press("Escape")
+    enter(page, "Star", "Vega")
+    page.get_by_role("button", name="Take along", exact=True).click()
+    page.locator("#export[open]").wait_for()
+    assert not page.get_by_text("The link does not hold your file").is_visible()
+
+
 def test_cancel_stops_while_others_are_served(browser: Browser, page: Page, server: Server) -> None:
     enter(page, "Realisations", "4000000")
     page.get_by_role("button", name="Simulate", exact=True).click()

@@ -63,6 +63,14 @@ export class Fields {
     for (const button of every("[data-choose]")) {
       const [file] = every(`[data-upload="${button.dataset.choose}"]`)
       button.addEventListener("click", () => file.click())
+      const box = button.closest(".field")
+      box.addEventListener("dragover", (/** @type {DragEvent} */ event) => event.preventDefault())
+      box.addEventListener("drop", (/** @type {DragEvent} */ event) => {
+        const [one] = event.dataTransfer.files
+        if (!one) return
+        event.preventDefault()
+        chosen(button.dataset.choose, one)
+      })
       file.addEventListener("change", () => {
         const [one] = file.files
         // The same file may be chosen again; its name is not shown for another star.

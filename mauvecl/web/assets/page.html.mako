@@ -33,11 +33,11 @@
 </div>
 <p class="known"><span id="k-star"></span> <button type="button" class="plain" id="o-star" hidden></button></p>
 <div class="file"><button type="button" class="plain" data-choose="star">Use your own spectrum</button>
-<input type="file" data-upload="star" aria-label="Your own spectrum" tabindex="-1" hidden><span class="hint">nm and erg/s/cm²/Å; text, ECSV, VOTable, FITS</span></div>
+<input type="file" data-upload="star" aria-label="Your own spectrum" tabindex="-1" hidden><span class="hint">nm and erg/s/cm²/Å; text, ECSV, VOTable, FITS; or drop it here</span><span data-uploaded="star"></span></div>
 % elif name == "own_unknown":
 <input id="f-own_unknown" name="own_unknown" type="text" autocomplete="off" spellcheck="false" placeholder="200 1, 450 3, 700 1" aria-describedby="w-own_unknown">
 <div class="file"><button type="button" class="plain" data-choose="own_unknown">Use a file of nm and DN</button>
-<input type="file" data-upload="own_unknown" aria-label="File of the unknown spectrum" tabindex="-1" hidden></div>
+<input type="file" data-upload="own_unknown" aria-label="File of the unknown spectrum" tabindex="-1" hidden><span data-uploaded="own_unknown"></span></div>
 % elif field.kind == "targets":
 <textarea id="f-targets" name="targets" hidden></textarea>
 <div class="wide"><table id="targets"><caption class="quiet">Targets</caption><thead><tr></tr></thead><tbody></tbody></table></div>
@@ -272,6 +272,7 @@ ${actions(tab)}
 <p>What this tab shows after its simulation: the same numbers, to the bit, wherever mauvecl runs.</p>
 <p class="row"><label for="of">Answer of</label> <select id="of"></select></p>
 <div class="row"><button type="button" class="main" id="study">Study for the command line</button><button type="button" data-copy="address">Copy the link</button></div>
+<p class="wrong" id="link-lacks" hidden>The link does not hold your file: who opens it needs the file, too. The study holds it.</p>
 <h3>Command line</h3><pre id="as-command" tabindex="0"></pre><button type="button" data-copy="as-command">Copy the command</button>
 <h3>Python</h3><pre id="as-python" tabindex="0"></pre><button type="button" data-copy="as-python">Copy the program</button>
 <h3>Citation</h3><pre id="as-bibtex" tabindex="0">${bibtex}</pre><button type="button" data-copy="as-bibtex">Copy the BibTeX</button>

@@ -262,6 +262,7 @@ class Page {
 
   // Actions that are available now.
   offer() {
+    this.uploads.mention()
     offer(this.answer, this.simulations.running !== null, this.fields.entered, words.tabs)
   }
 

@@ -1,6 +1,8 @@
 // @ts-check
 // Files of the visitor: they go to the server, and the browser keeps them for one that has lost them.
 
+import {byId, every} from "./dom.js"
+
 /** @typedef {import("./protocol.js").Entered} Entered */
 /** @typedef {import("./protocol.js").Faults} Faults */
 /** @typedef {import("./protocol.js").Words} Words */
@@ -100,6 +102,18 @@ export class Uploads {
    * @param {string[]} names */
   forget(names) {
     for (const name of names) delete this.lacks[name]
+  }
+
+  // Name the files that stand in fields, and say that a link does not hold them.
+  mention() {
+    let any = false
+    for (const name of every("[data-uploaded]")) {
+      const field = name.dataset.uploaded
+      const here = this.fields.entered[field] === this.words.uploads[field]
+      name.textContent = here ? this.files[field]?.name ?? "" : ""
+      any ||= here
+    }
+    byId("link-lacks").hidden = !any
   }
 
   /** Which files stand in fields, for the comparison of two questions.
