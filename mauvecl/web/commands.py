@@ -83,6 +83,9 @@ def as_program(verb: str, study: Study) -> str:
 
 def as_command(verb: str, study: Study) -> str:
     """Return a question to a verb as a command, which names a study file if flags cannot say all of it."""
+    from_file = ["mauvecl", verb, STUDY_FILE]
+    if any(star.file is not None for star in study.star):
+        return shlex.join(from_file)
     one = VERBS[verb]
     base = Study().with_settings([f"{key}={value}" for key, value in (one.defaults or {}).items()])
     words = ["mauvecl", verb]
@@ -94,9 +97,7 @@ def as_command(verb: str, study: Study) -> str:
         else:
             words += _flag_words(name, value, one) or ["--set", f"{name}={_toml(value)}"]
     long = any(len(word) > MOST_CHARACTERS for word in words)
-    if long or any(star.file is not None for star in study.star):
-        words = ["mauvecl", verb, STUDY_FILE]
-    return shlex.join(words)
+    return shlex.join(from_file if long else words)
 
 
 def keys_used(verb: Verb, study: Study, base: Study) -> Iterator[tuple[str, Any]]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 import re
 import shlex
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +25,13 @@ from mauvecl.cli.app import app
 from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
 from mauvecl.web.commands import differing, keys_used
-from mauvecl.web.downloads import taken_along
+from mauvecl.web.downloads import study_file, taken_along
+from mauvecl.web.fields import UPLOADED
 from mauvecl.web.simulations import asked
 from mauvecl.web.state import State
 from mauvecl.web.static_pages import BIBTEX
 from mauvecl.web.tabs import TABS
+from mauvecl.web.upload import read_upload
 
 ROOT = Path(__file__).parents[2]
 #: Links with fields that the random ones do not reach.
@@ -94,6 +98,28 @@ def test_command_and_program_are_the_question(number: int, tmp_path: Path, monke
             for study in found:
                 other = dict(differing(study, Study()))
                 assert {key: other.get(key) for key in said} == said, one["command"]
+
+
+def test_own_star_is_in_the_study_that_the_command_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No flag holds a visitor's file: what observes it is asked by the study, next to which the file lies."""
+    monkeypatch.chdir(tmp_path)
+    text = "\n".join(f"{nm} 1e-12" for nm in range(170, 1001))
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    state = State(read_upload("star.txt", text.encode()))
+    state.follow(f"?star={UPLOADED.replace(' ', '+')}")
+    for tab in TABS.values():
+        question = state.question(tab.reads)
+        for one in taken_along(tab, question, kept):
+            if "star" not in tab.reads:
+                continue
+            verb, wanted = asked(one["question"], question.study(kept))
+            assert one["command"] == f"mauvecl {verb} study.toml"
+            assert "'file': 'star.ecsv'" in one["python"]
+            _, content = study_file(wanted, "study")
+            with zipfile.ZipFile(io.BytesIO(content)) as archive:
+                archive.extractall(tmp_path)
+            assert _study_of(one["command"], monkeypatch).star[0].file == Path("star.ecsv")
 
 
 @pytest.mark.long

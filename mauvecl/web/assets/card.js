@@ -31,11 +31,11 @@ export class Card {
     for (const part of every(`#panel-${tab} :is(.pictures, .rows)`)) part.classList.remove("dim")
   }
 
-  /** The numbers, or the words that there are none; what is below stays where it is.
+  /** The numbers, or the words that there are none, in the same room; what is below stays where it is.
    * @param {boolean} empty */
   empty(empty) {
     this.box.classList.toggle("none", empty)
-    byId("numbers").hidden = empty
+    byId("numbers").classList.toggle("absent", empty)
     byId("no-answer").hidden = !empty
     byId("facts").classList.toggle("absent", empty)
   }

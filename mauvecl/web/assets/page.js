@@ -193,12 +193,15 @@ class Page {
 
   /** @param {Message} message */
   show(message) {
+    const question = this.question
     this.fields.tell(message.faults)
     this.fields.facts(message.known, (given, fills) => {
       // What is filled in belongs to the same step of the history as the star.
       if (fills) this.routing.editing = true
       this.enter(given)
     })
+    // What was filled in made it another question, which has been asked; this answer is not shown.
+    if (question !== this.question) return
     // Without an answer the notes of the last one keep their room, unseen: nothing jumps while a number is typed.
     /** @type {[string, string][]} */
     const stray = message.stray ? [[message.stray, "stray"]] : []
