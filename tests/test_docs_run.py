@@ -181,8 +181,14 @@ def observed_noise() -> None:
     hdu.writeto("light-curve.fits")
 
 
+def files_of_the_checkout() -> None:
+    """Provide the files that commands of the gallery name by their place in a checkout."""
+    Path("tests").symlink_to(ROOT / "tests")
+
+
 BROUGHT: dict[str, tuple[Callable[[], None], ...]] = {
     "README.md": (targets, observed_frames),
+    "gallery.md": (files_of_the_checkout,),
     "cluster.md": (study_of_ones_own,),
     "mapping.md": (observed_noise, lambda: documented_files(Path())),
     "long-runs.md": (study_of_ones_own,),

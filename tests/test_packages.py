@@ -35,7 +35,8 @@ FILES = (
     "environment.yml",
     "pyproject.toml",
 )
-MADE = ("__pycache__", "_build", "_generated", "jupyter_execute", ".ipynb_checkpoints", "*_cache", ".hypothesis")
+MADE = ("__pycache__", "_build", "_generated", "jupyter_execute", ".ipynb_checkpoints", "*_cache", ".hypothesis",
+        "node_modules")  # fmt: skip
 WHEEL = f"mauvecl-{VERSION}-py3-none-any.whl"
 SDIST = f"mauvecl-{VERSION}.tar.gz"
 BUILD = """import sys

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from mauvecl.lightcurve.defaults import RANK, Per, per_day
@@ -30,6 +31,8 @@ Float = NDArray[np.float64]
 
 #: False alarms per star-day above which events are candidates.
 CANDIDATES = 1.0
+#: Probability of a number of chance events below which they are taken for changes of the throughput.
+IMPROBABLE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +111,8 @@ class Analysis:
         series = None if self.spectra is None else self.spectra.series
         if series is None or "light" in free_of(series.jitters):
             return False
-        return bool(series.changes) or misled(self.events, self.spectra.found if self.spectra is not None else ())
+        found = () if self.spectra is None else self.spectra.found
+        return bool(series.changes) or misled(self.events, found, max(self.wanted, CANDIDATES) * self.days)
 
     def false_alarms(self, event: ObservedEvent) -> tuple[float, float]:
         """Return the false alarms per star-day at an event's statistic: in normal noise, and in noise as measured."""
@@ -220,7 +224,9 @@ def analyse_frames(
     seen = None if series is None else [event_spectrum(survey, series, taken, one) for one in detected]
     causes = None if seen is None else [one.cause for one in seen]
     events = measure_events(survey, taken, candidates, detected, causes)
-    if series is not None and jitters is None and "light" not in free_of(series.jitters) and misled(events, seen):
+    expected = frequent * survey.stare.observed_s / DAY_S
+    free = free_of({} if series is None else series.jitters)
+    if series is not None and jitters is None and "light" not in free and misled(events, seen, expected):
         # Changes that are too small to stand out by themselves, but not for the search.
         return analyse_frames(
             given, false_alarms=false_alarms, per=per, shape=shape, seed=seed, model=model, rank=rank,
@@ -247,10 +253,14 @@ def free_of(jitters: Mapping[str, float]) -> list[str]:
     return [name for name, sd in jitters.items() if np.isinf(sd)]
 
 
-def misled(events: Sequence[ObservedEvent], spectra: Sequence[EventSpectrum] | None) -> bool:
-    """Return whether events of the searched sums are, or rather resemble, changes of the throughput."""
-    resemble = any(one.chi2["throughput"] < one.chi2["flare"] and one.snr < FLARE_SNR for one in spectra or ())
-    return resemble or any(one.kind in ("step", "throughput") for one in events)
+def misled(events: Sequence[ObservedEvent], spectra: Sequence[EventSpectrum] | None, expected: float) -> bool:
+    """Return whether events of the searched sums are changes of the throughput, or too many resemble them by chance.
+
+    Of an expected number of events that noise feigns, some resemble changes of the throughput rather than flares.
+    """
+    resemble = sum(one.chi2["throughput"] < one.chi2["flare"] and one.snr < FLARE_SNR for one in spectra or ())
+    clear = any(one.kind in ("step", "throughput") for one in events)
+    return clear or bool(scipy.stats.poisson.sf(resemble - 1, expected) < IMPROBABLE)
 
 
 def _spectral_messages(spectra: SpectralAnalysis) -> list[str]:

@@ -51,8 +51,8 @@ ROWS: list[tuple[tuple[str, ...], *tuple[str, ...]]] = [
     ((*FLARE, "--second-area", "0.2"), "second_temperature_k"),
     ((*FLARE, "--flare-file", "missing.txt"), "missing.txt"),
     # Names
-    (("detect", "--star", "G3V"), "'G3V' is unknown"),
-    (("detect", "--star", "G2V,M3V,", "-m", "7"), "library spectrum '' is unknown"),
+    (("detect", "--star", "G3V"), "'G3V' has no spectrum", "--star G2V"),
+    (("detect", "--star", "G2V,M3V,", "-m", "7"), "star '' is unknown"),
     (("detect", "--star", "no.txt"), "'no.txt' does not exist"),
     (("detect", "--instrument", "hubble"), "hubble"),
     (("detect", "--instrument", "."), "instrument '.' is a folder, expected a name or a TOML file"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from mauvecl.schema.errors import InputError
 from mauvecl.schema.messages import Message
 from mauvecl.statistics.linear import Matched
 from mauvecl.study.cases import Case
@@ -26,10 +27,14 @@ def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
     if not known:
         return []
     case, flare = min(known, key=lambda item: abs(known[item] - 0.5))
-    unknown = _chance(case.with_sections(nuisances=NuisanceChoice(usual=True)), flare)
+    of = f"{case.label}, flare of {100 * case.amplitudes[flare]:g} %"
+    try:
+        unknown = _chance(case.with_sections(nuisances=NuisanceChoice(usual=True)), flare)
+    except InputError as error:
+        # Too few pixels are left.
+        return [Message(f"The usual unknowns cannot be taken into account for {of}: {error}.", "chance with unknowns")]
     if unknown is None:
         return []
-    of = f"{case.label}, flare of {100 * case.amplitudes[flare]:g} %"
     text = (
         f"Everything but the noise is taken as known: {of} is then detected by the matched statistic with a chance of "
         f"{100 * known[case, flare]:.1f} %, with the usual unknowns of {100 * unknown:.1f} % (closed forms; "
