@@ -364,11 +364,15 @@ class Visitor(WebSocketHandler):
         """Send a table or study of the question; the last ones are cached."""
         # The page asks for the study of a question by its name alone.
         front = TABS.get(tab) or next((one for one in TABS.values() if name in one.questions), tab_of(tab))
-        closed, key = self.closed(state, front), self._key(state, front.reads)
+        # A simulation asks what its own answers depend on, which their tables state.
+        reads = reads_of(name) if tab not in TABS and name in SIMULATIONS else front.reads
         answers = self.answers(state)
-        which = key, tab, name, ending, tuple(answers)
+        which = self._key(state, reads), tab, name, ending, tuple(answers)
         if which not in self._files:
-            made = as_file(TABS[tab], name, ending, closed, answers) if tab in TABS else asked_study(name, closed.study)
+            if tab in TABS:
+                made = as_file(TABS[tab], name, ending, self.closed(state, front), answers)
+            else:
+                made = asked_study(name, state.question(reads).study(Path(self._folder.name)))
             self._files[which] = made
             while len(self._files) > MOST_KEPT:
                 self._files.popitem(last=False)
