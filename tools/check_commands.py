@@ -54,6 +54,7 @@ TEXTS: dict[str, tuple[str, ...]] = {
     "magnitude": ("5.5", "7.25", "9", "10.1"),
     "amplitude_percent": ("0.7", "2", "13"),
     "seed": ("1", "7", "123456789"),
+    "joint_fit": ("no",),
 }
 
 
