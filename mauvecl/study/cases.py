@@ -44,6 +44,7 @@ class Loader:
         self.sky: Callable[[SkyLight], Sky] = lru_cache(MAX_SOURCES)(lambda light: light.sky())
         self._near: Callable[[Star], Neighbours | None] = lru_cache(MAX_SOURCES)(lambda star: star.near())
         self._instruments: dict[str, Instrument] = {}
+        self._unchanged: dict[str, Instrument] = {}
 
     def neighbours(self, star: Star) -> Neighbours | None:
         """Return the neighbours of a star, whatever its magnitude."""
@@ -53,7 +54,11 @@ class Loader:
         """Return the instrument of an observation."""
         key = repr((observation.instrument, observation.temperature_c, sorted(observation.changes.items())))
         if key not in self._instruments:
-            self._instruments[key] = observation.load_instrument()
+            file = str(observation.instrument)
+            if file not in self._unchanged:
+                unchanged = observation.model_copy(update={"changes": {}, "temperature_c": None})
+                self._unchanged[file] = unchanged.load_instrument()
+            self._instruments[key] = observation.changed(self._unchanged[file])
         return self._instruments[key]
 
 

@@ -339,7 +339,10 @@ class Observation(Section):
         """Load the instrument and apply `changes` and the detector temperature."""
         from mauvecl.host.instrument.instrument import Instrument
 
-        instrument = Instrument.load(self.instrument)
+        return self.changed(Instrument.load(self.instrument))
+
+    def changed(self, instrument: Instrument) -> Instrument:
+        """Return an instrument with `changes` and the detector temperature."""
         changes = self.changes | ({} if self.temperature_c is None else {"temperature_c": self.temperature_c})
         return instrument.with_(**changes) if changes else instrument
 
