@@ -15,15 +15,13 @@ import bz2
 import json
 import os
 import re
-import socket
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy.table import Table
+from page_server import page_server
 from tornado.httpclient import AsyncHTTPClient, HTTPRequest
 from tornado.websocket import websocket_connect
 
@@ -151,22 +149,11 @@ def main() -> None:
     parser.add_argument("--bombs", action="store_true")
     parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results" / "crowd.ecsv")
     given = parser.parse_args()
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    server = subprocess.Popen(
-        [sys.executable, "-m", "mauvecl", "serve", "--port", str(port)], stdout=subprocess.PIPE, text=True
-    )
-    try:
-        assert server.stdout is not None
-        while "serves at" not in server.stdout.readline():
-            time.sleep(0.1)
+    with page_server() as (host, process):
         rows = [
-            asyncio.run(measure(f"127.0.0.1:{port}", server.pid, visitors, given.changes, given.bombs))
+            asyncio.run(measure(host, process, visitors, given.changes, given.bombs))
             for visitors in sorted({1, given.visitors})
         ]
-    finally:
-        server.terminate()
     table = Table(rows)
     table.meta["what"] = f"{given.changes} changes of each visitor, one a second; all on one machine"
     print(table)

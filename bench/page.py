@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import socket
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 from astropy.table import Table
+from page_server import page_server
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from mauvecl.statistics.registry import STATISTICS
@@ -85,7 +83,7 @@ def first_load(browser: Browser, address: str) -> tuple[float, float, float]:
     session.on("Network.loadingFinished", count)
     start = time.perf_counter()
     page.goto(address)
-    page.locator("#card[aria-busy=false]").wait_for()
+    page.locator("#card[aria-busy=false]").wait_for(state="attached")
     answered = time.perf_counter() - start
     page.locator(".pictures:not(.dim) canvas").first.wait_for()
     drawn = time.perf_counter() - start
@@ -98,18 +96,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results" / "page.ecsv")
     output = parser.parse_args().output
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    server = subprocess.Popen(
-        [sys.executable, "-m", "mauvecl", "serve", "--port", str(port)], stdout=subprocess.PIPE, text=True
-    )
     rows = []
-    try:
-        assert server.stdout is not None
-        while "serves at" not in server.stdout.readline():
-            time.sleep(0.1)
-        address = f"http://127.0.0.1:{port}/"
+    with page_server() as (host, _):
+        address = f"http://{host}/"
         with sync_playwright() as play:
             browser = play.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
             loads = np.array([first_load(browser, address) for _ in range(5)])
@@ -117,7 +106,7 @@ def main() -> None:
             print(f"first load: answer {load_s:.2f} s, pictures {load_drawn_s:.2f} s, {load_mb:.3f} MB", flush=True)
             page = browser.new_page()
             page.goto(address)
-            page.locator("#card[aria-busy=false]").wait_for()
+            page.locator("#card[aria-busy=false]").wait_for(state="attached")
             page.get_by_text("Advanced", exact=True).click()
             for tab, statistic in CASES:
                 page.locator(f"#tab-{tab}").click()
@@ -129,8 +118,6 @@ def main() -> None:
                     rows.append((tab, statistic, name, round(answer, 3), round(drawn, 3), times))
                     print(f"{tab:12s} {statistic:14s} {name:18s} {answer:.3f} s, drawn {drawn:.3f} s", flush=True)
             browser.close()
-    finally:
-        server.terminate()
     table = Table(rows=rows, names=("tab", "statistic", "changed", "answer (s)", "drawn (s)", "times drawn"))
     table.meta["what"] = (
         f"medians of {CHANGES} changes; server and browser on the same two cores; a first load has its answer after "

@@ -12,14 +12,12 @@ import argparse
 import asyncio
 import json
 import os
-import socket
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 from astropy.table import Table
+from page_server import page_server
 from tornado.httpclient import HTTPRequest
 from tornado.websocket import websocket_connect
 
@@ -92,19 +90,8 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results" / "page_memory.ecsv")
     given = parser.parse_args()
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    server = subprocess.Popen(
-        [sys.executable, "-m", "mauvecl", "serve", "--port", str(port)], stdout=subprocess.PIPE, text=True
-    )
-    try:
-        assert server.stdout is not None
-        while "serves at" not in server.stdout.readline():
-            time.sleep(0.1)
-        rows = asyncio.run(visits(f"127.0.0.1:{port}", server.pid, given.sessions, given.minutes))
-    finally:
-        server.terminate()
+    with page_server() as (host, process):
+        rows = asyncio.run(visits(host, process, given.sessions, given.minutes))
     table = Table(rows)
     table.meta["what"] = (
         f"{given.sessions} sessions in {given.minutes:g} minutes, each with a plan and a search of a stare"

@@ -112,7 +112,7 @@ class Analysis:
         if series is None or "light" in free_of(series.jitters):
             return False
         found = () if self.spectra is None else self.spectra.found
-        return bool(series.changes) or misled(self.events, found, max(self.wanted, CANDIDATES) * self.days)
+        return bool(series.changes) or misled(self.events, found, chance_events(self.survey, self.wanted))
 
     def false_alarms(self, event: ObservedEvent) -> tuple[float, float]:
         """Return the false alarms per star-day at an event's statistic: in normal noise, and in noise as measured."""
@@ -224,9 +224,9 @@ def analyse_frames(
     seen = None if series is None else [event_spectrum(survey, series, taken, one) for one in detected]
     causes = None if seen is None else [one.cause for one in seen]
     events = measure_events(survey, taken, candidates, detected, causes)
-    expected = frequent * survey.stare.observed_s / DAY_S
+    chance = chance_events(survey, wanted)
     free = free_of({} if series is None else series.jitters)
-    if series is not None and jitters is None and "light" not in free and misled(events, seen, expected):
+    if series is not None and jitters is None and "light" not in free and misled(events, seen, chance):
         # Changes that are too small to stand out by themselves, but not for the search.
         return analyse_frames(
             given, false_alarms=false_alarms, per=per, shape=shape, seed=seed, model=model, rank=rank,
@@ -253,10 +253,15 @@ def free_of(jitters: Mapping[str, float]) -> list[str]:
     return [name for name, sd in jitters.items() if np.isinf(sd)]
 
 
-def misled(events: Sequence[ObservedEvent], spectra: Sequence[EventSpectrum] | None, expected: float) -> bool:
-    """Return whether events of the searched sums are changes of the throughput, or too many resemble them by chance.
+def chance_events(survey: SeriesSurvey, wanted: float) -> float:
+    """Return the expected number of events above the threshold of candidates in noise alone."""
+    return max(wanted, CANDIDATES) * survey.stare.observed_s / DAY_S
 
-    Of an expected number of events that noise feigns, some resemble changes of the throughput rather than flares.
+
+def misled(events: Sequence[ObservedEvent], spectra: Sequence[EventSpectrum] | None, expected: float) -> bool:
+    """Return whether events are changes of the throughput, or more of them resemble such changes than chance explains.
+
+    Some of the expected number of events in noise alone resemble changes of the throughput rather than flares.
     """
     resemble = sum(one.chi2["throughput"] < one.chi2["flare"] and one.snr < FLARE_SNR for one in spectra or ())
     clear = any(one.kind in ("step", "throughput") for one in events)

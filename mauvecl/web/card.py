@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from mauvecl.answers.detection.chance_with_unknowns import BOTH_CHANCES
+from mauvecl.schema.messages import of_kind
 from mauvecl.web.closed_forms import ClosedForms, percent, short
 from mauvecl.web.headline import TITLES, chances
 from mauvecl.web.simulations import OTHER
@@ -11,8 +13,6 @@ from mauvecl.web.tabs.tab import Answers, Tab
 
 #: Part of the message about the throughput, which the page shows once.
 NOMINAL = "The throughput is nominal"
-#: Part of the message about the chance with unknowns, which the card shows.
-BOTH = "Everything but the noise is taken as known"
 #: Answers whose messages are shown, since they include those of the others.
 TOLD = ("detection", "measure")
 
@@ -85,4 +85,6 @@ def _with_kinds(messages: list[str]) -> list[tuple[str, str]]:
 
 def _messages(closed: ClosedForms, answers: Answers) -> list[str]:
     of_answers = [m for name in TOLD if name in answers for m in answers[name].messages]
-    return [m for m in dict.fromkeys([*of_answers, *closed.messages]) if not m.startswith((NOMINAL, BOTH))]
+    # The card shows both chances itself.
+    both = of_kind(of_answers, BOTH_CHANCES)
+    return [m for m in dict.fromkeys([*of_answers, *closed.messages]) if not m.startswith(NOMINAL) and m not in both]

@@ -14,7 +14,7 @@ SUMMARY_TABLE = "plan.ecsv"
 #: Explanation of the columns.
 LEGEND = (
     "E50 and E90: bolometric energies from which on half and 90 % of the flares are recovered. Flares: recovered "
-    "in the hours observed, expected by the rates as they are; 95 % of campaigns recover the numbers beside them, by "
+    "in the hours observed, expected by the rates as they are; 95 % of campaigns recover the numbers next to them, by "
     "Poisson's scatter and that of a star's rate; P(>= 1): probability of recovering any. False alarms: expected of "
     f"noise. Numbers are those of {SUMMARY_TABLE}."
 )

@@ -10,6 +10,8 @@ from mauvecl.statistics.linear import Matched
 from mauvecl.study.cases import Case
 from mauvecl.study.nuisances import NuisanceChoice
 
+#: Kind of the message.
+BOTH_CHANCES = "chance with unknowns"
 #: Largest number of flares of which the most uncertain is looked for.
 MAX_FLARES = 100
 
@@ -32,7 +34,7 @@ def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
         unknown = _chance(case.with_sections(nuisances=NuisanceChoice(usual=True)), flare)
     except InputError as error:
         # Too few pixels are left.
-        return [Message(f"The usual unknowns cannot be taken into account for {of}: {error}.", "chance with unknowns")]
+        return [Message(f"The usual unknowns cannot be taken into account for {of}: {error}.", BOTH_CHANCES)]
     if unknown is None:
         return []
     text = (
@@ -40,7 +42,7 @@ def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
         f"{100 * known[case, flare]:.1f} %, with the usual unknowns of {100 * unknown:.1f} % (closed forms; "
         "`nuisances.usual` draws them)."
     )
-    return [Message(text, "chance with unknowns")]
+    return [Message(text, BOTH_CHANCES)]
 
 
 def _chance(case: Case, flare: int) -> float | None:

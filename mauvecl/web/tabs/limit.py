@@ -164,7 +164,7 @@ class Curve(Picture):
             limits = [one for one in answers["limit"].limits if one.statistic == q.statistic]
             words = LIMITS[closed.study.limit.of]
             for one in limits:
-                # Points of another quantity than the axis's are only told.
+                # Points of another quantity than the axis's are reported in words only.
                 points = [(p.value, p.probability.value) for p in (*one.points, one.check)]
                 if one.of == "magnitude":
                     sources["simulated"] = dict(zip(("x", "y"), np.array(points).T, strict=True))
