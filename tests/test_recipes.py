@@ -77,3 +77,11 @@ def test_workflow_runs_targets_that_exist() -> None:
     called = set(re.findall(r"run: (?:sudo )?make ([\w-]+)", text))
     assert called >= {"quick", "lowest", "coverage", "dist", "try-wheel", "docs"}
     assert called <= targets
+
+
+def test_workflow_pins_actions_by_commit() -> None:
+    """A tag can be moved to other code."""
+    jobs = loaded(".github/workflows/ci.yml")["jobs"].values()
+    used = [step["uses"] for job in jobs for step in job["steps"] if "uses" in step]
+    assert len(used) > 15
+    assert not [one for one in used if not re.fullmatch(r"[\w-]+/[\w-]+@[0-9a-f]{40}", one)]

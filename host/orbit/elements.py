@@ -112,11 +112,6 @@ class Elements:
         return float((GRAVITY / (2 * np.pi / self.period_s) ** 2) ** (1 / 3))
 
     @property
-    def inclination_deg(self) -> float:
-        """Inclination to the equator."""
-        return float(np.degrees(self.satellite.inclo))
-
-    @property
     def node_drift_deg_per_day(self) -> float:
         """Eastward drift of the node due to J2; the mean Sun moves by 0.98565 deg per day."""
         return float(np.degrees(-1.5 * self._oblate * np.cos(self.satellite.inclo)) * DAY_S)

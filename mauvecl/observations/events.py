@@ -23,8 +23,6 @@ END_FRAMES = 3
 FAINT = 0.2
 #: Largest number of events, after which the light curve is declared too variable for a search.
 MAX_EVENTS = 500
-#: Share of the best template's statistic above which templates belong to the same event.
-SAME_EVENT = 0.5
 #: Smallest number of frames for a baseline.
 MIN_BASELINE = 10
 #: Smallest number of means of frames in a half-width to which flares are fitted: standard errors rise by less than 5 %.

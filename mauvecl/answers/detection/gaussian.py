@@ -295,5 +295,3 @@ def gaussian(
 
 #: Former name.
 gaussian_report = gaussian
-#: Former name of the class.
-GaussianReport = GaussianAnswer

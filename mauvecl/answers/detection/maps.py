@@ -355,5 +355,3 @@ def _fill(
 
 #: The older name, which does not hide Python's own `map`.
 detection_map = map
-#: The older name of the class.
-MapResult = MapAnswer

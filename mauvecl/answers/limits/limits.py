@@ -340,8 +340,6 @@ def limit(
 
 #: Former name.
 limiting_magnitude = limit
-#: Former name of the class.
-LimitResult = LimitAnswer
 
 
 @validated
