@@ -487,7 +487,7 @@ def expect(
     low, high = instrument.output_min_nm, instrument.output_max_nm
     first, last = source.measured_nm or (float(source.wavelength_nm[0]), float(source.wavelength_nm[-1]))
     check_covers(source.name, (first, last), (low, high), f"{instrument.name}'s output range ")
-    source = _continued_to_reach(source, instrument)
+    source = continued_to_reach(source, instrument)
     if source.unscaled:
         raise InputError(
             f"the spectrum of {source.name} is not as bright as the star is seen: {source.unscaled}",
@@ -574,7 +574,7 @@ def expect(
     return replace(plain, messages=tuple(messages))
 
 
-def _continued_to_reach(source: Source, instrument: Instrument) -> Source:
+def continued_to_reach(source: Source, instrument: Instrument) -> Source:
     """Continue the dark ends of a source as far as the instrument's line spread function reaches."""
     nm = source.wavelength_nm
     if nm[0] <= SPAN_NM[0] and nm[-1] >= SPAN_NM[1]:

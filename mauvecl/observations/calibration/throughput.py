@@ -13,7 +13,7 @@ factor of its own, whose spread follows from the data.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -21,10 +21,11 @@ import scipy
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.optimize import minimize_scalar
+from scipy.sparse import csr_array
 
-from mauvecl.host.expectation import expect
+from mauvecl.host.expectation import continued_to_reach, expect
 from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.host.response import Order
+from mauvecl.host.response import Order, response_matrix
 from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.host.stars.source import Source
 from mauvecl.observations.calibration.dark import DarkFit
@@ -38,7 +39,9 @@ Float = NDArray[np.float64]
 ERROR_KNOTS, ONE_STAR_ERROR = 12, 0.10
 #: Probability of chi-squared below which errors of the stars' spectra are fitted.
 REJECTED = 0.01
-#: Steps of wavelength, nm, and of the line's width, as a factor, for derivatives.
+#: Widths of the line function, over the nominal, through which the light is computed; it is quadratic in between.
+WIDTHS = (1.0, 0.9, 1.1)
+#: Steps of wavelength, nm, and of the relative width for derivatives.
 STEP_NM, STEP_WIDTH = 0.2, 0.05
 #: Largest fitted shift and stretch, nm, and relative change of the line's width, beyond which nothing is linear.
 LIMITS = np.array([5.0, 5.0, 0.3, 0.3])
@@ -280,30 +283,48 @@ class ThroughputModel:
         """Seconds of dark current and their change with its slope, shape (n_star, 2)."""
         return np.array([self.dark.terms(one) for one in self.stars])
 
-    def light_dn(self, one: CalibrationFrames, log_factor: Float, shape: Float) -> Float:
-        """Return the mean light of a frame, DN, shape (n_pixel,)."""
-        assert one.star is not None
-        shift, stretch, width, change = np.pad(shape, (0, 4 - shape.size))
-        at, flux = one.star.wavelength_nm, one.star.flux_flam
-        nm = self.nominal.wavelength_nm
-        if shift or stretch:
-            flux = np.interp(at + shift + stretch * np.interp(at, nm, self.x), at, flux)
-        if self.order == "physical":
-            flux = flux * np.exp(np.interp(at, nm, log_factor))
-        star = replace(one.star, flux_flam=flux)
-        electrons = self._electrons(star, 1.0 + width)
-        if change:
-            wide, narrow = (self._electrons(star, 1.0 + width + sign * STEP_WIDTH) for sign in (1, -1))
-            electrons = electrons + change * self.x * (wide - narrow) / (2 * STEP_WIDTH)
-        counts = self.transfer.noise.gain * electrons * one.exposure_s / self.nominal.frame_s
-        return np.asarray(counts if self.order == "physical" else counts * np.exp(log_factor))
+    @cached_property
+    def sky_electrons(self) -> Float:
+        """Zodiacal light of a second in each pixel, shape (n_pixel,)."""
+        star, nominal = self.stars[0].star, self.nominal
+        assert star is not None
+        return expect(star, nominal, exposure=nominal.frame_s, sky=self.sky, order=self.order).sky_electrons / (
+            nominal.frame_s
+        )
 
-    def _electrons(self, star: Source, width: float) -> Float:
-        instrument = self.nominal
-        if width != 1.0:
-            instrument = instrument.with_(gaussian_fwhm_nm=instrument.gaussian_fwhm_nm * float(width))
-        x = expect(star, instrument, exposure=instrument.frame_s, sky=self.sky, order=self.order)
-        return np.asarray(x.source_electrons + x.sky_electrons)
+    @cached_property
+    def responses(self) -> list[tuple[Source, list[csr_array]]]:
+        """Each star with the electrons per second for its flux, through line functions of `WIDTHS` on the nominal."""
+        fwhm, found = self.nominal.gaussian_fwhm_nm, []
+        lines = [self.nominal.with_(gaussian_fwhm_nm=fwhm * width) for width in WIDTHS[: 3 if fwhm else 1]]
+        for one in self.stars:
+            assert one.star is not None
+            star = continued_to_reach(one.star, lines[-1])
+            found.append((star, [response_matrix(line, star.wavelength_nm, self.order) for line in lines]))
+        return found
+
+    def light_dn(self, log_factor: Float, shape: Float) -> Float:
+        """Return the mean light of a frame of each star, DN, shape (n_star, n_pixel).
+
+        The light is quadratic in the local width of the line function.
+        """
+        shift, stretch, width, change = np.pad(shape, (0, 4 - shape.size))
+        nm, local, step = self.nominal.wavelength_nm, width + change * self.x, WIDTHS[-1] - 1.0
+        light = []
+        for one, (star, responses) in zip(self.stars, self.responses, strict=True):
+            at, flux = star.wavelength_nm, star.flux_flam
+            if shift or stretch:
+                flux = np.interp(at + shift + stretch * np.interp(at, nm, self.x), at, flux)
+            if self.order == "physical":
+                flux = flux * np.exp(np.interp(at, nm, log_factor))
+            electrons = responses[0] @ flux
+            if width or change:
+                narrow, wide = (response @ flux for response in responses[1:])
+                slope, bend = (wide - narrow) / (2 * step), (wide + narrow - 2 * electrons) / (2 * step**2)
+                electrons = electrons + local * (slope + local * bend)
+            electrons = np.maximum(electrons * self.nominal.per_pixel("response", 1.0), 0.0) + self.sky_electrons
+            light.append(self.transfer.noise.gain * electrons * one.exposure_s)
+        return np.array(light) if self.order == "physical" else np.array(light) * np.exp(log_factor)
 
     def variance_dn2(self, light_dn: Float) -> Float:
         """Return the variance of the mean frames of all stars, shape (n_star, n_pixel)."""
@@ -323,15 +344,14 @@ class ThroughputModel:
         slopes = []
         for step, place in [(STEP_NM, 0), (STEP_WIDTH, 2)][: self.n_shape // 2]:
             moved = step * np.eye(self.n_shape)[place]
-            more, less = (np.array([self.light_dn(one, np.zeros(self.x.size), sign * moved) for one in self.stars])
-                          for sign in (1, -1))  # fmt: skip
+            more, less = (self.light_dn(np.zeros(self.x.size), sign * moved) for sign in (1, -1))
             slopes += [(more - less) / (2 * step), (more - less) / (2 * step) * self.x]
         return slopes
 
     def linearised(self, coefficients: Float, shape: Float, error: float) -> _Linearised:
         """Return the linear problem around a spline and a shape, for a relative error of the stars' spectra."""
         n_star, own = len(self.stars), self.basis @ coefficients
-        model = np.array([self.light_dn(one, own, shape) for one in self.stars])
+        model = self.light_dn(own, shape)
         columns = [model * column for column in self.basis.T]
         columns += [slope * np.exp(own) for slope in self.slopes_dn]
         around = np.concatenate([coefficients, shape])
@@ -432,7 +452,7 @@ def fit_throughput(
     errors = np.sqrt(np.diag(covariance))[n : n + m]
     scale = [1.0, 1.0, nominal.gaussian_fwhm_nm, nominal.gaussian_fwhm_nm]
     values = [Value(scale[k] * float(shape[k] + (k == 2)), scale[k] * float(errors[k])) for k in range(m)]
-    light = np.array([model.light_dn(one, log_factor, shape) for one in stars])
+    light = model.light_dn(log_factor, shape)
     sd = np.sqrt(model.variance_dn2(light) + np.diagonal(model.dark_covariance, axis1=1, axis2=2).T)
     residual = np.where(model.usable, (model.observed_dn - light) / sd, np.nan)
     assumed = [*(() if m else ("wavelength zero point",)), *(() if m == 4 else ("line width",)),

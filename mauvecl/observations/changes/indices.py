@@ -60,13 +60,13 @@ class Index:
 #: Indices by name. The bands are an assumption of this project: published ones, of 0.1 to 3 nm, lie within Mauve's line
 #: function of 13.3 nm, so that the band is 16 nm about the lines and each continuum 12 nm beyond.
 #: The published windows of Ca II and H alpha were compared with the table of ACTIN 2, that of H beta with lists of Lick
-#: indices; the papers themselves were not read. Of Mg II no stellar definition at low resolution could be verified.
+#: indices, that of Mg II with the public code of the Mg II index of SUIT; the papers themselves were not read.
 INDICES = {
     one.name: one
     for one in (
         Index("Mg II", (272.0, 288.0), ((258.0, 270.0), (290.0, 302.0)),
-              "none verified; for the 0.6 nm of IUE this project takes 278.5-281.5 nm above a straight continuum "
-              "(observations.line_index.MG_II_NM, an assumption)"),
+              "solar index: 4/3 of the sum at 279.8, 280.0 and 280.2 nm over that at 276.6, 276.8, 283.2 and 283.4 nm "
+              "(Heath & Schlesinger 1986, J. Geophys. Res. 91, 8672)"),
         Index("Ca II", (387.0, 403.0), ((373.0, 385.0), (405.0, 417.0)),
               "Mount Wilson S: triangles of 0.109 nm (FWHM) at 393.366 and 396.847 nm over 2 nm at 390.107 and "
               "400.107 nm (Duncan et al. 1991, ApJS 76, 383)"),
