@@ -59,6 +59,7 @@ ORBIT = (
     *(f"orbit.{key}" for key in ("start", "days", "step_s", "tle", "kind", "simbad")),
     "orbit.limits",
 )
+TARGETS = ("orbit.targets", "plan.targets")
 
 
 @dataclass(frozen=True)
@@ -334,7 +335,7 @@ VERBS: dict[str, Verb] = {
 
     mauvecl change --star K5V -m 8 --exposure 300 --visits 40 --periods --look-at "eps Eri" --days 60
     """,
-            ("change", "limit.power", "run.fap", "run.seed", *NUISANCES, *ORBIT, "orbit.targets", "sweep"),
+            ("change", "limit.power", "run.fap", "run.seed", *NUISANCES, *ORBIT, *TARGETS, "sweep"),
             tab=True,
         ),
         Verb(
@@ -359,7 +360,7 @@ VERBS: dict[str, Verb] = {
 
     Example: mauvecl visible --look-at "eps Eri" --look-at "AU Mic" --start 2027-01-01 --days 365
     """,
-            ("orbit.targets", "plan.targets"),
+            TARGETS,
             observation=ORBIT,
         ),
         Verb(

@@ -25,7 +25,15 @@ class ChangeQuestion(Section):
         tuple[str, ...],
         Field(min_length=1),
         Help("Change", choices="a line such as Mg II, balmer jump, colour, a band in nm such as 200-320, or spectrum"),
-        Flag("--change", read=parsing.words),
+        Flag("--change", kind=list[str], read=parsing.words),
+        Widget(
+            label="Changes",
+            hint="What changes, with commas: lines such as Mg II or 656.5 (nm), balmer jump, colour, and bands such as "
+            "200-320 (nm).",
+            group="Change",
+            name="changes",
+            first=", ".join(DEFAULT_CHANGES),
+        ),
     ] = DEFAULT_CHANGES
     file: Annotated[
         Path | None,
@@ -42,14 +50,35 @@ class ChangeQuestion(Section):
             label="Visits",
             hint="How many exposures of the star are compared with each other.",
             group="Change",
+            first="20",
             slider=Slider(2, 100, 1),
         ),
     ] = 2
     periods: Annotated[
         bool, Help("Map which periods are recovered, from visits to the first target of the orbit"), Flag("--periods")
     ] = False
-    shortest_d: Annotated[Days, Help("Shortest period"), Flag("--shortest-period")] = 1.0
-    longest_d: Annotated[Days, Help("Longest period"), Flag("--longest-period")] = 30.0
+    shortest_d: Annotated[
+        Days,
+        Help("Shortest period"),
+        Flag("--shortest-period"),
+        Widget(
+            label="Shortest period",
+            hint="The first period of the map.",
+            group="Change",
+            slider=Slider(0.1, 10, 1.1, log=True),
+        ),
+    ] = 1.0
+    longest_d: Annotated[
+        Days,
+        Help("Longest period"),
+        Flag("--longest-period"),
+        Widget(
+            label="Longest period",
+            hint="The last period of the map.",
+            group="Change",
+            slider=Slider(2, 200, 1.1, log=True),
+        ),
+    ] = 30.0
     steps: Annotated[int, Range(2, 50), Help("Periods and amplitudes of the map, each")] = 6
     period_fap: Annotated[
         Annotated[float, Range(1e-3, 0.5)], Help("Probability of a peak of noise anywhere in a periodogram")

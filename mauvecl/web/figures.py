@@ -122,6 +122,15 @@ class Canvas:
         if wavelength:
             self._mark()
 
+    @property
+    def bar_text(self) -> dict[str, Any]:
+        """Look of a colour bar's text."""
+        return {
+            "background_fill_color": None, "major_label_text_color": self.ink.text, "title_text_color": self.ink.text,
+            "major_tick_line_color": self.ink.text, "title_text_font_style": "normal",
+            "title_text_font": "system-ui", "major_label_text_font": "system-ui",
+        }  # fmt: skip
+
     def source(self, name: str, *columns: str) -> ColumnDataSource:
         """Add an empty data source."""
         return ColumnDataSource({column: [] for column in columns}, name=name)

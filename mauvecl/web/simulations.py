@@ -55,6 +55,11 @@ def campaign_plan(study: Study) -> Study:
     return _changed(study, plan={"completeness": "closed form"})
 
 
+def periods(study: Study) -> Study:
+    """Return the study of periods in visits to the first target."""
+    return _changed(study, change={"periods": True})
+
+
 def _changed(study: Study, **sections: dict[str, Any]) -> Study:
     """Return a study with other values of keys, by section."""
     return study.with_changes(sections, None, "page")
@@ -119,6 +124,7 @@ _OWN = {
     "completeness": Simulation({"completeness": "inject"}, completeness),
     "visible": Simulation({"visible": "visible"}, completed=_tabulated),
     "plan": Simulation({"plan": "plan"}, campaign_plan),
+    "periods": Simulation({"periods": "change"}, periods),
 }
 #: All simulations by name: those above, and the verbs that have a tab.
 SIMULATIONS = {name: Simulation({name: name}) for name, verb in VERBS.items() if verb.tab} | _OWN

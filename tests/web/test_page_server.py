@@ -629,6 +629,7 @@ COMMANDS = {
     "fits": ("measure", [], "fits.ecsv"),
     "change": ("change", [], "change.ecsv"),
     "indices": ("change", [], "indices.ecsv"),
+    "periods": ("change", [], "periods.ecsv"),
     "completeness": ("inject", [], "completeness.ecsv"),
     "limits": ("inject", [], "limits.ecsv"),
     "visible": ("visible", [], "visible.ecsv"),
@@ -648,7 +649,7 @@ def test_downloads_equal_the_files_of_the_command_line(served: Any, tmp_path: Pa
     link = "?realisations=10000&fap=0.05&statistic=chi2&magnitude=7&star=uploaded+star&own_unknown=uploaded+spectrum"
     link += "&targets=eps+Eri"
 
-    async def work(host: str) -> dict[str, tuple[bytes, bytes]]:
+    async def work(host: str) -> dict[str, tuple[bytes, bytes, str]]:
         talk = await Talk.begin(host)
         assert "entered" in await talk.upload(star_file(tmp_path / "star.txt"))
         assert "entered" in await talk.upload(b"200 1\n400 3\n700 1\n", "own_unknown", "stray.txt")
@@ -663,16 +664,16 @@ def test_downloads_equal_the_files_of_the_command_line(served: Any, tmp_path: Pa
                 (question,) = (one for one in tab.questions if asked(one, Study())[0] == verb)
                 file, study = await talk.file(link=link, tab="", name=question, ending="study")
                 assert file.endswith(".zip" if "star" in tab.reads else ".toml")
-                found[name] = table, study
+                found[name] = table, study, question
         talk.end()
         return found
 
-    done = dict[str, Path]()
-    for name, (table, study) in served(work).items():
+    done = dict[tuple[str, str], Path]()
+    for name, (table, study, question) in served(work).items():
         assert b"mauvecl-page" not in table + study, "what an upload is called on the server appears nowhere"
         verb, flags, written = COMMANDS[name]
-        if verb not in done:
-            folder = done[verb] = tmp_path / name
+        if (verb, question) not in done:
+            folder = done[verb, question] = tmp_path / name
             folder.mkdir()
             if verb in ("visible", "plan"):
                 # These ask nothing of the uploaded star.
@@ -685,9 +686,9 @@ def test_downloads_equal_the_files_of_the_command_line(served: Any, tmp_path: Pa
                 patch.chdir(folder)
                 ended = CliRunner().invoke(app, [verb, "study.toml", *flags, "--no-pictures", "-q", "-o", "out"])
             assert ended.exit_code == 0, ended.output
-        assert (done[verb] / "out" / written).read_bytes() == table, name
+        assert (done[verb, question] / "out" / written).read_bytes() == table, name
     # From another folder the table finds its star again, and no other file of that name.
-    folder = done["detect"]
+    folder = done["detect", "detection"]
     again = Study.read(folder / "out" / "detection.ecsv")
     assert again.star[0].file == (folder / "star.ecsv").resolve()
     (folder / "star.ecsv").write_bytes(star_file(tmp_path / "other.txt"))

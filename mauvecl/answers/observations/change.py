@@ -16,7 +16,6 @@ from mauvecl.observations.changes.indices import INDICES, Change, IndexValue, co
 from mauvecl.observations.changes.periods import Recovery, recover_periods, visit_times_d
 from mauvecl.observations.changes.smallest import Smallest, error_of_change, error_of_index, smallest_change
 from mauvecl.schema.calls import validated
-from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column, View, number, percent, table_of
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import place_columns
@@ -354,8 +353,6 @@ def _indices(case: Case) -> list[IndexRow]:
 
 def _visits(study: Study) -> NDArray[np.float64]:
     """Draw the times of visits to the first target of a study's orbit."""
-    if not study.orbit.targets:
-        raise InputError("periods need a target", "`orbit.targets`", key="orbit.targets")
     o, target = study.orbit, targets_of(study.orbit, study.plan)[0]
     seen = Visibility.of(o.orbit().track(o.times()), np.array([target.direction]), o.limits)
     return visit_times_d(seen.windows(0), study.change.visits, study.observation.exposure_s, study.run.seed)

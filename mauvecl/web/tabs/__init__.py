@@ -10,6 +10,7 @@ from mauvecl.web.tabs.detection import Detection
 from mauvecl.web.tabs.limit import Limit
 from mauvecl.web.tabs.measurements import Measurement
 from mauvecl.web.tabs.noise import Noise
+from mauvecl.web.tabs.periods import Periods
 from mauvecl.web.tabs.plan import Plan
 from mauvecl.web.tabs.signal import Signal
 from mauvecl.web.tabs.spectrum import Spectrum
@@ -29,6 +30,7 @@ DRAWN: dict[str, Tab] = {
         Measurement(),
         Unknown(),
         Change(),
+        Periods(),
         Completeness(),
         Visibility(),
         Plan(),

@@ -210,13 +210,9 @@ class Map(Picture):
         plot.yaxis.ticker = FixedTicker(ticks=[-1, 0, 1, 2])
         plot.yaxis.major_label_overrides = {-1: "0.1 %", 0: "1 %", 1: "10 %", 2: "100 %"}
         plot.add_layout(
-            ColorBar(
-                color_mapper=mapper, width=10, title="detected", background_fill_color=None,
-                major_label_text_color=ink.text, title_text_color=ink.text, major_tick_line_color=ink.text,
-                title_text_font_style="normal", title_text_font="system-ui", major_label_text_font="system-ui",
-            ),
+            ColorBar(color_mapper=mapper, width=10, title="detected", **canvas.bar_text),
             "right",
-        )  # fmt: skip
+        )
         canvas.legend += [("10, 50 (bold) and 90 % in closed form", "#b8c0c8", "line", ""),
                           ("simulated", "#8a8678", "dot", "if any")]  # fmt: skip
         return canvas
