@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Self
 
 from pydantic import model_validator
 
@@ -15,9 +15,6 @@ from mauvecl.study.sections import Star
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
-
-#: Keys of an observation that hold paths.
-PATHS = ("frames", "mapping", "spectrum")
 
 
 class CalibrationObservation(Section):
@@ -65,13 +62,3 @@ class CalibrateQuestion(Section):
              default="0.1 for one star, fitted for several if they disagree"),
         Flag("--spectrum-error"),
     ] = None  # fmt: skip
-
-
-def resolve_calibration_paths(data: dict[str, Any], folder: Path) -> None:
-    """Resolve the paths of observations against a folder, in place."""
-    section = data.get("calibrate")
-    many = section.get("observations") if isinstance(section, dict) else None
-    for one in many if isinstance(many, list) else ():
-        for key in PATHS:
-            if isinstance(one, dict) and isinstance(one.get(key), str):
-                one[key] = str(folder / one[key])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
@@ -94,10 +94,3 @@ class ChangeQuestion(Section):
         if "spectrum" in self.of and self.file is None:
             raise InputError("the change 'spectrum' has no file", "`change.file`", key="change.file")
         return self
-
-
-def resolve_change_paths(data: dict[str, Any], folder: Path) -> None:
-    """Resolve the path of a spectrum against a folder, in place."""
-    section = data.get("change")
-    if isinstance(section, dict) and isinstance(section.get("file"), str):
-        section["file"] = str(folder / section["file"])

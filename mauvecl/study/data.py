@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from mauvecl.schema.fields import Flag, Help
 from mauvecl.schema.section import Section
@@ -25,11 +25,3 @@ class DataChoice(Section):
         Help("Target for which times are converted to the Solar System's barycentre (TDB)", "name or coordinates"),
         Flag("--barycentric"),
     ] = None
-
-
-def resolve_data_paths(data: dict[str, Any], folder: Path) -> None:
-    """Resolve the paths of observed frames against a folder, in place."""
-    section = data.get("data")
-    for key in ("file", "mapping"):
-        if isinstance(section, dict) and isinstance(section.get(key), str):
-            section[key] = str(folder / section[key])

@@ -181,18 +181,8 @@ class FlareLight(Section):
         return self.lines, self.line_fluxes
 
 
-def resolve_spectrum_paths(data: dict[str, Any], folder: Path) -> None:
-    """Resolve the paths of the flare's files against a folder, in place."""
-    flare = data.get("flare")
-    spectrum = flare.get("spectrum") if isinstance(flare, dict) else None
-    if isinstance(spectrum, dict):
-        for key in PATH_KEYS:
-            if isinstance(spectrum.get(key), str):
-                spectrum[key] = str(folder / spectrum[key])
-
-
 def drop_default_spectrum(data: dict[str, Any], light: FlareLight) -> None:
-    """Remove default values of the flare's spectrum from a study's data and make its paths absolute, in place."""
+    """Remove default values of the flare's spectrum from a study's data, in place."""
     if light == FlareLight():
         del data["flare"]["spectrum"]
         return
@@ -200,6 +190,3 @@ def drop_default_spectrum(data: dict[str, Any], light: FlareLight) -> None:
     for key in ("lines", "line_fluxes"):
         if not spectrum[key]:
             del spectrum[key]
-    for key in PATH_KEYS:
-        if key in spectrum:
-            spectrum[key] = str(Path(spectrum[key]).resolve())

@@ -354,15 +354,3 @@ def _is_number(cell: Any) -> bool:
     except ValueError:
         return False
     return True
-
-
-def resolve_plan_paths(data: dict[str, Any], folder: Path) -> None:
-    """Resolve the paths of elements and flare rates against a folder, in place."""
-    orbit, plan = data.get("orbit"), data.get("plan")
-    if isinstance(orbit, dict) and isinstance(orbit.get("tle"), str):
-        orbit["tle"] = str(folder / orbit["tle"])
-    targets = plan.get("targets") if isinstance(plan, dict) else None
-    for one in targets if isinstance(targets, list) else ():
-        for key in PATH_KEYS:
-            if isinstance(one, dict) and isinstance(one.get(key), str):
-                one[key] = str(folder / one[key])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -185,13 +185,3 @@ def check_sweep(sweep: Sweep, stare: StareQuestion, events: Sequence[EventChoice
                 key="sweep",
                 value=axis.quantity,
             )
-
-
-def resolve_stare_paths(data: dict[str, Any], folder: Path) -> None:
-    """Resolve the paths of curves and shapes against a folder, in place."""
-    stare, events = data.get("stare"), data.get("events")
-    curves = [one for one in stare.values() if isinstance(one, dict)] if isinstance(stare, dict) else []
-    shapes = [one for one in events if isinstance(one, dict)] if isinstance(events, list) else []
-    for one, key in [*((curve, "file") for curve in curves), *((shape, "shape_file") for shape in shapes)]:
-        if isinstance(one.get(key), str):
-            one[key] = str(folder / one[key])

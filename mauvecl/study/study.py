@@ -17,13 +17,13 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import AnyUnit
 from mauvecl.schema.records import input_error
 from mauvecl.schema.text import shortened
-from mauvecl.study.calibrations import CalibrateQuestion, resolve_calibration_paths
-from mauvecl.study.changes import ChangeQuestion, resolve_change_paths
-from mauvecl.study.data import DataChoice, resolve_data_paths
-from mauvecl.study.flare_light import drop_default_spectrum, resolve_spectrum_paths
+from mauvecl.study.calibrations import CalibrateQuestion
+from mauvecl.study.changes import ChangeQuestion
+from mauvecl.study.data import DataChoice
+from mauvecl.study.flare_light import drop_default_spectrum
 from mauvecl.study.measurements import MeasureQuestion
 from mauvecl.study.nuisances import NuisanceChoice
-from mauvecl.study.orbits import OrbitQuestion, PlanQuestion, resolve_plan_paths
+from mauvecl.study.orbits import OrbitQuestion, PlanQuestion
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.questions import (
     Axis,
@@ -36,22 +36,21 @@ from mauvecl.study.questions import (
 )
 from mauvecl.study.searches import InjectionQuestion, SearchChoice
 from mauvecl.study.sections import Flare, Observation, Run, Section, SkyLight, Star, Unknowns
-from mauvecl.study.stare_section import EventChoice, StareQuestion, resolve_stare_paths
-from mauvecl.study.study_text import locate_files, parse_toml_value, read_embedded_study, set_key, with_file_digests
+from mauvecl.study.stare_section import EventChoice, StareQuestion
+from mauvecl.study.study_text import (
+    locate_files,
+    parse_toml_value,
+    read_embedded_study,
+    set_key,
+    with_file_digests,
+    with_paths,
+)
 
 #: Sections that a study's text leaves out if they have their default values.
 OMITTED = (
     "bulk", "nuisances", "stare", "events", "search", "injections", "orbit", "plan", "measure", "data", "calibrate",
     "change",
 )  # fmt: skip
-#: Functions that resolve the paths of sections against a folder.
-RESOLVERS = (
-    resolve_stare_paths,
-    resolve_plan_paths,
-    resolve_data_paths,
-    resolve_calibration_paths,
-    resolve_change_paths,
-)
 #: The paper's two stars.
 PAPER_STARS = (Star(library="K3V", magnitude=3.7), Star(library="G2V", magnitude=7.4))
 
@@ -124,21 +123,8 @@ class Study(Section):
             )
         if path.suffix == ".ecsv":
             locate_files(data, path)
-        for star in data.get("star", []) if isinstance(data.get("star"), list) else []:
-            # Paths are relative to the study file.
-            for key in ("file", "neighbours"):
-                if isinstance(star, dict) and isinstance(star.get(key), str):
-                    star[key] = str(path.parent / star[key])
-        run = data.get("run")
-        if isinstance(run, dict) and isinstance(run.get("weights"), dict):
-            run["weights"] = {k: str(path.parent / v) if isinstance(v, str) else v for k, v in run["weights"].items()}
-        nuisances = data.get("nuisances")
-        own = nuisances.get("own") if isinstance(nuisances, dict) else None
-        for one in own.values() if isinstance(own, dict) else ():
-            if isinstance(one, dict) and isinstance(one.get("file"), str):
-                one["file"] = str(path.parent / one["file"])
-        for resolve in (*RESOLVERS, resolve_spectrum_paths):
-            resolve(data, path.parent)
+        # Paths are relative to the study file.
+        data = with_paths(data, cls, lambda file: path.parent / file)
         return cls.build(data, path.name)
 
     @classmethod
@@ -182,7 +168,7 @@ class Study(Section):
         """Return the study as TOML, without sections that have their default values."""
         import tomli_w
 
-        data = self.model_dump(mode="json", exclude_none=True)
+        data = with_paths(self.model_dump(mode="json", exclude_none=True), type(self), Path.resolve)
         if not self.sky.none:
             del data["sky"]["none"]
         if not data["observation"]["changes"]:
@@ -196,9 +182,6 @@ class Study(Section):
         for section in OMITTED:
             if getattr(self, section) == type(self).model_fields[section].default:
                 del data[section]
-        for one in data.get("nuisances", {}).get("own", {}).values():
-            if "file" in one:
-                one["file"] = str(Path(one["file"]).resolve())
         for course in COURSES:
             if "stare" in data and not data["stare"][course]:
                 del data["stare"][course]
@@ -206,18 +189,13 @@ class Study(Section):
             del data["search"]["frame"]
         if "orbit" in data and self.orbit.limits == Limits():
             del data["orbit"]["limits"]
-        for resolve in RESOLVERS:
-            resolve(data, Path.cwd())
         drop_default_spectrum(data, self.flare.spectrum)
         for section in ("processes", "campaign"):
             if not data[section]:
                 del data[section]
-        data["run"]["weights"] = {name: str(Path(file).resolve()) for name, file in data["run"]["weights"].items()}
         if not data["run"]["weights"]:
             del data["run"]["weights"]
         for star in data["star"]:
-            for key in {"file", "neighbours"} & star.keys():
-                star[key] = str(Path(star[key]).resolve())
             if "neighbours" not in star:
                 del star["neighbour_share"]
         return tomli_w.dumps(data)

@@ -5,8 +5,12 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, Union, get_args, get_origin
+
+from pydantic import BaseModel
 
 from mauvecl.host.files.ecsv import read_ecsv
 from mauvecl.host.files.parsing import parsing, read_text, toml
@@ -22,6 +26,24 @@ def read_embedded_study(path: Path) -> str:
     if not isinstance(study, str):
         raise InputError(f"{path.name} contains no study", "an answer's ECSV table", key="study", value=path.name)
     return study
+
+
+def with_paths(data: Any, kind: Any, change: Callable[[Path], Path]) -> Any:
+    """Return data of an annotated type, such as a section, with other paths; invalid data are left unchanged."""
+    parts = get_args(kind)
+    if kind is Path:
+        return str(change(Path(data))) if isinstance(data, str) else data
+    if isinstance(kind, type) and issubclass(kind, BaseModel) and isinstance(data, dict):
+        kinds = {key: field.annotation for key, field in kind.model_fields.items()}
+        return {key: with_paths(value, kinds.get(key), change) for key, value in data.items()}
+    if get_origin(kind) is tuple and isinstance(data, list):
+        return [with_paths(value, parts[0], change) for value in data]
+    if get_origin(kind) is dict and isinstance(data, dict):
+        return {key: with_paths(value, parts[1], change) for key, value in data.items()}
+    if get_origin(kind) in (Union, UnionType):
+        # At most one of the alternatives holds paths.
+        return next((new for part in parts if (new := with_paths(data, part, change)) != data), data)
+    return data
 
 
 def with_file_digests(text: str) -> str:
