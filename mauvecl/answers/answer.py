@@ -142,7 +142,7 @@ class Answer(Drawable, ContentEquality, ABC):
         return [
             *(write_table(table, place / name) for name, table in self.files.items()),
             *(write_document(content(), place / name) for name, content in self.documents.items()),
-            write_study(self.study, place),
+            write_study(self.study.toml(), place),
         ]
 
     @property

@@ -7,7 +7,7 @@ import datetime
 import io
 import json
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from mauvecl.device.device import Device
     from mauvecl.host.expectation import Expectation
     from mauvecl.runs.pool import Pool
-    from mauvecl.study.study import Study
 
 
 FITS_KEYWORDS = {"name": "OBJECT", "exposure_s": "EXPTIME", "frames": "NFRAMES", "seed": "SEED"}
@@ -110,16 +109,14 @@ def write_document(content: bytes, path: Path) -> Path:
     return path
 
 
-def write_study(study: Study, folder: Path) -> Path:
-    """Write the study; errors as for `write_table`."""
-    path = folder / "study.toml"
-    write_whole(path, study.toml().encode())
-    return path
+def write_study(text: str, folder: Path) -> Path:
+    """Write the text of a study; errors as for `write_table`."""
+    return write_document(text.encode(), folder / "study.toml")
 
 
 def write_record(
     verb: str,
-    study: Study,
+    study: Mapping[str, Any],
     expectations: Sequence[Expectation],
     folder: Path,
     *,
@@ -135,7 +132,8 @@ def write_record(
     Parameters
     ----------
     verb : str
-    study : Study
+    study : mapping
+        The study as JSON can hold it.
     expectations : sequence of Expectation
         Their provenance holds the digests of the inputs.
     folder : Path
@@ -158,8 +156,8 @@ def write_record(
         "verb": verb,
         "date_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "wall_time_s": round(seconds, 3),
-        "seed": study.run.seed,
-        "study": study.model_dump(mode="json", exclude_none=True),
+        "seed": study["run"]["seed"],
+        "study": study,
         "inputs": [{"name": x.name} | dict(x.provenance) for x in expectations],
         "messages": list(messages),
         "python": platform.python_version(),

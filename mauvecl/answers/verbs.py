@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 
     from mauvecl.study.study import Study
 
+    #: Function of a command's flags that returns the study where no file is given.
+    DefaultStudy = Callable[[dict[str, Any]], Study]
 
 #: Default of verbs that need fewer realisations than a detection.
 FEWER = {"run.realisations": 100_000}
@@ -100,7 +102,7 @@ class Verb:
     observation: tuple[str, ...] = OBSERVATION
     without: str = ""
     defaults: Mapping[str, Any] | None = None
-    default: Callable[[dict[str, Any]], Study] | None = None
+    default: DefaultStudy | None = None
     tab: bool = False
 
     def accepts(self, key: str) -> bool:

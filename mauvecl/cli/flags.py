@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
 import typer
 
-from mauvecl.schema.fields import Flag, Help, Unit, first, found
+from mauvecl.schema.fields import Flag, Help, Unit, first
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -60,9 +59,12 @@ def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, StudyFlag]
     defaults : mapping
         Defaults of a verb that differ from the study's, by key.
     """
+    # `mauvecl --help` shows no flags, and starts twice as fast without importing the study.
+    from mauvecl.study.keys import keys_with_flags
+
     flags: dict[str, StudyFlag] = {}
     for wanted in keys:
-        of_key = [one for one in _all_flags() if one[0] == wanted or one[0].startswith(f"{wanted}.")]
+        of_key = [one for one in keys_with_flags() if one[0] == wanted or one[0].startswith(f"{wanted}.")]
         assert of_key, wanted
         for path, field, flag in of_key:
             section, _, key = path.rpartition(".")
@@ -75,16 +77,6 @@ def study_flags(*keys: str, defaults: Mapping[str, Any]) -> dict[str, StudyFlag]
             )
             flags[flag.parameter] = StudyFlag(flag.parameter, Annotated[kind | None, option], section, key, flag.read)
     return flags
-
-
-@cache
-def _all_flags() -> tuple[tuple[str, FieldInfo, Flag], ...]:
-    """Return the path, field and metadata of every flag of a study."""
-    # `mauvecl --help` shows no flags, and starts twice as fast without importing the study.
-    from mauvecl.schema.section import fields_of
-    from mauvecl.study.study import Study
-
-    return tuple((".".join(path), field, flag) for path, field in fields_of(Study) for flag in found(field, Flag))
 
 
 def option_of(key: str) -> Any:

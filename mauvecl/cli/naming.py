@@ -6,8 +6,7 @@ import ast
 import re
 import shlex
 import sys
-from collections.abc import Iterator, Mapping
-from functools import cache
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -29,16 +28,6 @@ def name_flags_of(app: typer.Typer) -> None:
     _app[:] = [app]
 
 
-@cache
-def _keys() -> Mapping[str, str]:
-    """Return the parameter behind every key of a study that a flag sets, as in ``run.fap``."""
-    from mauvecl.schema.fields import Flag, found
-    from mauvecl.schema.section import fields_of
-    from mauvecl.study.study import Study
-
-    return {".".join(path): flag.parameter for path, field in fields_of(Study) for flag in found(field, Flag)}
-
-
 def _commands() -> Iterator[Any]:
     """Yield the called command, then all others."""
     from typer.main import get_command
@@ -56,7 +45,9 @@ def _commands() -> Iterator[Any]:
 
 def _flags(name: str, command: Any) -> list[str]:
     """Return the flags that set a parameter or a key of the study, the long one first."""
-    wanted = {name} | {parameter for key, parameter in _keys().items() if f".{key}".endswith(f".{name}")}
+    from mauvecl.study.keys import keys_with_flags
+
+    wanted = {name} | {flag.parameter for key, _, flag in keys_with_flags() if f".{key}".endswith(f".{name}")}
     for parameter in command.params:
         if parameter.name in wanted:
             return sorted((one for one in parameter.opts if one.startswith("-")), key=len, reverse=True)

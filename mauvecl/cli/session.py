@@ -219,25 +219,26 @@ class Session:
         from mauvecl.answers.files import write_record, write_study
 
         if self.folder / "study.toml" not in self.files:
-            self.leave(lambda: write_study(study, self.folder))
+            self.leave(lambda: write_study(study.toml(), self.folder))
         seconds = time.perf_counter() - self.started
         pool = self._pool
         how: dict[str, Any] = {"pool": pool, "opened": self.opened, "seconds": seconds, "messages": messages}
         # Only a complete answer replaces another's files.
         how |= {"files": self.files, "whole": not self._lost}
-        self.leave(lambda: write_record(self.verb, study, inputs, self.folder, **how))
+        data = study.model_dump(mode="json", exclude_none=True)
+        self.leave(lambda: write_record(self.verb, data, inputs, self.folder, **how))
         if self._checkpoint is not None and not self._lost:
             self._checkpoint.forget()
 
-    def ask(self, study: Study) -> Any:
-        """Return the answer of the session's verb; a pool draws if the verb counts something."""
+    def ask(self) -> Any:
+        """Return the answer of the session's verb to its study; a pool draws if the verb counts something."""
         from mauvecl.answers.verbs import VERBS
 
         verb = VERBS[self.verb]
         if not verb.counts:
-            return verb.ask(study)
+            return verb.ask(self.study)
         with self.pool(unit=verb.counts) as engine:
-            return verb.ask(study, engine, None if verb.counts == "realisations" else self.meter)
+            return verb.ask(self.study, engine, None if verb.counts == "realisations" else self.meter)
 
     def answer(self, answer: Answer) -> None:
         """Print an answer and write its files."""

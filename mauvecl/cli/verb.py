@@ -1,4 +1,4 @@
-"""Decorator that makes a function of a study and a session a command with a study file and flags."""
+"""Decorator that makes a function of a session a command with a study file and flags."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from mauvecl.cli.question import holds_study, is_star, study_of
 from mauvecl.cli.values import as_text
 
 if TYPE_CHECKING:
+    from mauvecl.answers.verbs import DefaultStudy
     from mauvecl.cli.session import Session
-    from mauvecl.study.study import Study
 
 
 class StudyCommand(NamedTuple):
@@ -45,13 +45,13 @@ def takes_study(
     without: str = "",
     defaults: Mapping[str, Any] = MappingProxyType({}),
     writes: str = "",
-    default: Callable[[dict[str, Any]], Study] | None = None,
+    default: DefaultStudy | None = None,
     draws: bool = True,
     resumes: bool = False,
     pictures: bool = True,
     observation: Sequence[str] = OBSERVATION,
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a function a command with a study file and flags, called with the resulting study and session.
+    """Make a function a command with a study file and flags, called with the session of the resulting study.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def takes_study(
     Returns
     -------
     callable
-        Decorator of functions whose first parameters are the study and the session. A parameter `given` receives the
+        Decorator of functions whose first parameter is the session. A parameter `given` receives the
         flags; others are the verb's own options.
     """
 
@@ -95,8 +95,8 @@ def takes_study(
             | (PICTURES if pictures else {})
             | (WORKERS if draws else RESUMING if resumes else {})
         )
-        kinds = get_type_hints(verb, localns={"Study": Any, "Session": Any}, include_extras=True)
-        _, _, *own = inspect.signature(verb).parameters.values()
+        kinds = get_type_hints(verb, localns={"Session": Any}, include_extras=True)
+        _, *own = inspect.signature(verb).parameters.values()
 
         def command(study_file: Path | None = None, **values: Any) -> None:
             from mauvecl.cli.foresight import question_time, question_values
@@ -136,7 +136,7 @@ def takes_study(
             if draws:
                 question_time(study, **{key: how[key] for key in ("device", "cluster", "insist")})
             with Session(called, study, **how) as session:
-                verb(study, session, **values)
+                verb(session, **values)
 
         named = inspect.Parameter.KEYWORD_ONLY
         parameters = [
@@ -165,7 +165,7 @@ def takes_study(
 def command_of(
     name: str, *, draws: bool | None = None, resumes: bool = False
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a function of the study and the session the command of a registered verb.
+    """Make a function of the session the command of a registered verb.
 
     Parameters
     ----------
@@ -192,8 +192,8 @@ def command_of(
 def add_plain_commands() -> None:
     """Add the commands of verbs without their own function, which compute and print the answer."""
 
-    def ask(study: Study, session: Session) -> None:
-        session.answer(session.ask(study))
+    def ask(session: Session) -> None:
+        session.answer(session.ask())
 
     for name in VERBS:
         if name not in COMMANDS:

@@ -27,6 +27,7 @@ from mauvecl.runs.locks import differing_keys
 from mauvecl.schema.errors import InputError
 from mauvecl.store.description import describe, study_in
 from mauvecl.store.stored_scenes import StoredScene, scenes
+from mauvecl.study.cases import cases
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -110,7 +111,7 @@ class Store:
     @cached_property
     def scenes(self) -> list[StoredScene]:
         """Arrays of spectra."""
-        return scenes(self.study)
+        return scenes(cases(self.study))
 
     def scene(self, path: str) -> StoredScene:
         """Return an array by path, such as ``star-1/flare-2``."""

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mauvecl.schema.tables import Column, percent
-from mauvecl.study.cases import cases
 from mauvecl.study.labels import full_label
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
-    from mauvecl.study.study import Study
+    from mauvecl.study.cases import Case
 
 #: Approximate size of a chunk, bytes.
 CHUNK_BYTES = 16 * 2**20
@@ -70,10 +69,10 @@ ARRAY_COLUMNS = (
 )
 
 
-def scenes(study: Study) -> list[StoredScene]:
-    """Return the arrays of a study's store: every star and sweep value, without and with each flare."""
+def scenes(cases: Sequence[Case]) -> list[StoredScene]:
+    """Return the arrays of the cases of a store: every star and sweep value, without and with each flare."""
     stored = []
-    for number, case in enumerate(cases(study), 1):
+    for number, case in enumerate(cases, 1):
         chosen = case.study.bulk.chosen(case.quiet.n_frames)
         # The amplitude is an attribute of the flare's array.
         swept = {name: value for name, value in case.at.items() if name != "amplitude"}

@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from mauvecl.answers.verbs import VERBS
 from mauvecl.schema import parsing
 from mauvecl.schema.fields import Flag, found
-from mauvecl.schema.section import fields_of
+from mauvecl.study.keys import keys_with_flags
 from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
 
@@ -102,30 +102,20 @@ def as_command(verb: str, study: Study) -> str:
 
 def keys_used(verb: Verb, study: Study, base: Study) -> Iterator[tuple[str, Any]]:
     """Yield the keys that a verb uses of a study, with their plain values, if they are `differing` from a base."""
-    flagged = {".".join(path) for path, field in fields_of(Study) if any(found(field, Flag))}
-    observes = _takes(verb, "star.library")
+    flagged = {key for key, *_ in keys_with_flags()}
+    observes = verb.accepts("star.library")
     for name, value in differing(study, base):
         if name in ("star", "sky"):
-            used = observes if name == "star" else _takes(verb, "sky.surface_brightness")
+            used = observes if name == "star" else verb.accepts("sky.surface_brightness")
         else:
-            used = _takes(verb, name) or name not in flagged or (observes and name.startswith(ALWAYS_USED))
+            used = verb.accepts(name) or name not in flagged or (observes and name.startswith(ALWAYS_USED))
         if used:
             yield name, value
 
 
-def _takes(verb: Verb, name: str) -> bool:
-    """Return whether a verb accepts the flag of a key."""
-    taken = (key for key in (*verb.observation, *verb.takes) if key != verb.without)
-    return name != verb.without and any(name == key or name.startswith(f"{key}.") for key in taken)
-
-
 def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
     """Return the words of a key's flag, or none if the verb has no flag that takes such a value."""
-    path = tuple(name.split("."))
-    flags = [flag for key, field in fields_of(Study) if key == path for flag in found(field, Flag)]
-    if not _takes(verb, name):
-        return []
-    for flag in flags:
+    for flag in (flag for key, _, flag in keys_with_flags() if key == name and verb.accepts(name)):
         if isinstance(value, bool) and flag.read is None:
             return [flag.names[0]] if value else []
         if flag.read is parsing.line_fluxes:

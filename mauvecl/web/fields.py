@@ -16,10 +16,9 @@ from mauvecl.host.stars.star_names import near_names, spectrum_name
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Range, Slider, Unit, Widget, first, found, range_of, unit_of
 from mauvecl.schema.physical import LineFraction
-from mauvecl.schema.section import fields_of
 from mauvecl.schema.text import shortened
 from mauvecl.statistics.registry import STATISTICS
-from mauvecl.study.study import Study
+from mauvecl.study.keys import study_keys
 from mauvecl.web.simulations import SIMULATIONS
 
 UPLOADED, UPLOADED_UNKNOWN = "uploaded star", "uploaded spectrum"
@@ -368,8 +367,8 @@ _OWN = {
     ),
 }  # fmt: skip
 _KEYS = {
-    widget.name or path[-1]: _field(path, field, widget)
-    for path, field in fields_of(Study)
+    widget.name or key.rpartition(".")[2]: _field(tuple(key.split(".")), field, widget)
+    for key, field in study_keys().items()
     for widget in found(field, Widget)
 }
 #: Fields by name, as in links and in `Question`; the default is a flare at the edge of detection.

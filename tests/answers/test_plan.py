@@ -260,5 +260,5 @@ def test_file_of_rates_is_found_next_to_the_table(tmp_path: Path) -> None:
     changes = {"plan": QUICK | {"targets": read_targets(tmp_path / "targets.csv")}, "orbit": {"days": 2.0}}
     answer = plan(Study().with_changes(changes, None))
     assert answer.stars["rates"][0] == "ffd.csv"
-    write_study(answer.study, tmp_path)
+    write_study(answer.study.toml(), tmp_path)
     assert Study.read(tmp_path / "study.toml").plan.targets[0].rates_file == tmp_path / "ffd.csv"

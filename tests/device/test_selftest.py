@@ -122,7 +122,9 @@ def test_selftest_command_reports_and_records_outcome(
     assert kept["checks"][0]["name"] == "one thing"
     assert selftest_outcome.read_outcome(engine.device) == kept
     pool = Pool(LocalWorkers([None], make=lambda device, progress: engine))
-    record = files.write_record("detect", Study(), [], tmp_path, pool=pool, seconds=0.0, messages=[])
+    record = files.write_record(
+        "detect", Study().model_dump(mode="json"), [], tmp_path, pool=pool, seconds=0.0, messages=[]
+    )
     assert json.loads(record.read_text())["selftest"] == [kept]
     checks.append(Check("another", False, "wrong"))
     bad = CliRunner().invoke(app, ["selftest", "--quiet"])

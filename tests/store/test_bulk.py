@@ -229,7 +229,7 @@ def test_random_kills_lose_nothing(tmp_path: Path, painted: dict[str, bytes]) ->
 @pytest.mark.long
 def test_kill_at_every_step_of_writing_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Before each fsync, each rename and each line of digests, one by one."""
-    described, seen, step = Store(tmp_path, study(200)).description(), stored_scenes.scenes(study(200)), 0
+    described, seen, step = Store(tmp_path, study(200)).description(), stored_scenes.scenes(cases(study(200))), 0
     monkeypatch.setattr(Store, "description", lambda self: described)
     monkeypatch.setattr(layout, "scenes", lambda asked: seen)
     while True:

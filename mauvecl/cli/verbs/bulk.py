@@ -17,7 +17,6 @@ from mauvecl.cli.verb import takes_study
 if TYPE_CHECKING:
     from mauvecl.cli.session import Session
     from mauvecl.store.layout import Store
-    from mauvecl.study.study import Study
 
 StoreArgument = Annotated[Path, typer.Argument(help="Store that `mauvecl realise` wrote.")]
 RowsFlag = Annotated[
@@ -35,7 +34,7 @@ RowsFlag = Annotated[
     pictures=False,
     writes="mauvecl-frames.zarr; also NAME.fits, .h5, .hdf5",
 )
-def realise(study: Study, session: Session) -> None:
+def realise(session: Session) -> None:
     """Draw raw spectra in bulk: a Zarr store, a FITS or HDF5 file.
 
     One file holds fewer than 4 GiB. An array per star and flare, a row per realisation, with calibration, units and
@@ -59,7 +58,7 @@ def realise(study: Study, session: Session) -> None:
             f"--output {str(place)!r}", f"a name ending in .zarr, {', '.join(ENDINGS)}", key="output", value=str(place)
         )
     folder = bulk.unfinished(place) if one_file else place
-    question_room(Store(folder, study), insist=session.insist)
+    question_room(Store(folder, session.study), insist=session.insist)
     with (
         report_interrupts(lambda: f"what was written to {str(folder)!r} is kept, and --resume draws the rest"),
         session.metered("spectra") as meter,
@@ -70,7 +69,7 @@ def realise(study: Study, session: Session) -> None:
         pool = Pool(workers)
         meter.standing = lambda: pool.standing
         draw = bulk.realise_file if one_file else bulk.realise
-        store = draw(study, place, pool, resume=session.resume, restart=session.restart, progress=meter)
+        store = draw(session.study, place, pool, resume=session.resume, restart=session.restart, progress=meter)
     _tell(store, place, session)
 
 

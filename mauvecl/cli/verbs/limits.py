@@ -10,21 +10,19 @@ from mauvecl.cli.verb import command_of
 
 if TYPE_CHECKING:
     from mauvecl.cli.session import Session
-    from mauvecl.study.study import Study
 
 
 @command_of("limit")
 def limit(
-    study: Study,
     session: Session,
     assumptions: Annotated[
         bool, typer.Option("--assumptions", help="Also: how far what is assumed of the instrument moves it.")
     ] = False,
 ) -> None:
     """Search for limits, and vary the assumptions about the instrument if `assumptions` is set."""
-    answer = session.ask(study)
+    answer = session.ask()
     if assumptions:
         from mauvecl.answers.limits.assumptions import what_matters
 
-        answer.assumptions = what_matters(study)
+        answer.assumptions = what_matters(session.study)
     session.answer(answer)

@@ -10,12 +10,10 @@ from mauvecl.cli.verb import command_of
 
 if TYPE_CHECKING:
     from mauvecl.cli.session import Session
-    from mauvecl.study.study import Study
 
 
 @command_of("simulate")
 def simulate(
-    study: Study,
     session: Session,
     given: dict[str, Any],
     realisation: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Which realisation to show.")] = 0,
@@ -23,4 +21,4 @@ def simulate(
     """Draw a realisation, with flares if a flag names their amplitude."""
     from mauvecl.answers.signal.simulate import simulate as compute
 
-    session.answer(compute(study, realisation=realisation, flaring=bool(given["amplitude"])))
+    session.answer(compute(session.study, realisation=realisation, flaring=bool(given["amplitude"])))

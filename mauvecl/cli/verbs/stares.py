@@ -9,12 +9,10 @@ from mauvecl.cli.verb import command_of
 
 if TYPE_CHECKING:
     from mauvecl.cli.session import Session
-    from mauvecl.study.study import Study
 
 
 @command_of("stare", draws=False, resumes=True)
 def stare(
-    study: Study,
     session: Session,
     given: dict[str, Any],
     device: DeviceFlag = None,
@@ -30,5 +28,5 @@ def stare(
     stares = Stares(device)
     session.opened = stares.open_device
     with session.checkpoint() as checkpoint:
-        answer = compute(study, stares, checkpoint=checkpoint)
+        answer = compute(session.study, stares, checkpoint=checkpoint)
     session.answer(answer)
