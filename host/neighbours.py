@@ -31,34 +31,16 @@ MOST_NAMED = 4
 
 @dataclass(frozen=True, eq=False)
 class Neighbour:
-    """A star near the target; its spectrum is chosen only if its light enters the fibre.
-
-    Attributes
-    ----------
-    name : str
-    separation_arcsec : float
-        From the target.
-    magnitude : float, optional
-        In `band`; None if unknown.
-    band : str
-    spectral_type : str
-        Empty if unknown; the nearest spectrum of the library is used.
-    file : Path, optional
-        Spectrum file, in place of a type.
-    temperature_k : float, optional
-        Effective temperature, which chooses the spectrum if the type is unknown.
-    bp_rp : float, optional
-        Gaia colour, which chooses the spectrum if type and temperature are unknown.
-    """
+    """A star near the target; its spectrum is chosen only if its light enters the fibre."""
 
     name: str
-    separation_arcsec: float
-    magnitude: float | None = None
+    separation_arcsec: float  # from the target
+    magnitude: float | None = None  # in `band`; None if unknown
     band: str = "V"
-    spectral_type: str = ""
-    file: Path | None = None
-    temperature_k: float | None = None
-    bp_rp: float | None = None
+    spectral_type: str = ""  # empty if unknown; the nearest spectrum of the library is used
+    file: Path | None = None  # spectrum file, in place of a type
+    temperature_k: float | None = None  # effective temperature, which chooses the spectrum if the type is unknown
+    bp_rp: float | None = None  # Gaia colour, which chooses the spectrum if type and temperature are unknown
 
     @cached_property
     def spectrum(self) -> tuple[str, str]:
@@ -116,20 +98,11 @@ class Neighbour:
 
 @dataclass(frozen=True, eq=False)
 class Neighbours:
-    """Neighbours of one target.
-
-    Attributes
-    ----------
-    stars : tuple of Neighbour
-    share : float
-        Share of the light that enters the fibre, of stars within its radius; an assumption.
-    notes : tuple of str
-        Statements on how the table was read.
-    """
+    """Neighbours of one target."""
 
     stars: tuple[Neighbour, ...]
-    share: float = 1.0
-    notes: tuple[str, ...] = ()
+    share: float = 1.0  # share of the light that enters the fibre, of stars within its radius; an assumption
+    notes: tuple[str, ...] = ()  # statements on how the table was read
 
     def __post_init__(self) -> None:
         if not 0 <= self.share <= 1:

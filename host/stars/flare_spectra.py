@@ -224,17 +224,10 @@ def balmer_continuum(wavelength_nm: Float, electron_temperature_k: float = ELECT
 
 @dataclass(frozen=True)
 class EmissionLine:
-    """Unresolved emission line, or several lines that share a flux equally.
-
-    Attributes
-    ----------
-    name : str
-    wavelengths_nm : tuple of float
-        Vacuum wavelengths.
-    """
+    """Unresolved emission line, or several lines that share a flux equally."""
 
     name: str
-    wavelengths_nm: tuple[float, ...]
+    wavelengths_nm: tuple[float, ...]  # vacuum wavelengths
 
     @classmethod
     def named(cls, name: str) -> Self:

@@ -22,17 +22,10 @@ RECORD, OWN_DIGEST = "run.json", "record_digest"
 
 @dataclass(frozen=True)
 class FileFault:
-    """File that differs from what the run wrote.
-
-    Attributes
-    ----------
-    file : str
-    state : str
-        "changed", "missing" or another fault.
-    """
+    """File that differs from what the run wrote."""
 
     file: str
-    state: str
+    state: str  # "changed", "missing" or another fault
 
 
 #: Columns of the table of faults.

@@ -34,32 +34,19 @@ HARMONICS = 64
 
 @dataclass(frozen=True, eq=False)
 class Cumulants:
-    """Cumulants of one draw of a scenario, DN; arrays have the shape (n_pixel,).
+    """Cumulants of one draw of a scenario, DN; arrays have the shape (n_pixel,)."""
 
-    Attributes
-    ----------
-    mean : ndarray
-        Mean, including bias.
-    gaussian : ndarray
-        Variance of the Gaussian part: read noise, rounding of a stack's frames, and Gaussian photon noise.
-    photons : ndarray
-        Mean electrons of light.
-    photon_step, dark_step : ndarray
-        DN per Poisson count; the first is 0 for Gaussian photon noise.
-    dark_dn, light_dn : ndarray
-        Means of dark and light.
-    light_variance : ndarray
-        Variance of the light, Gaussian or Poisson.
-    """
-
-    mean: Float
+    mean: Float  # mean, including bias
+    #: Variance of the Gaussian part: read noise, rounding of a stack's frames, and Gaussian photon noise.
     gaussian: Float
-    photons: Float
+    photons: Float  # mean electrons of light
+    #: DN per Poisson count; the first is 0 for Gaussian photon noise.
     photon_step: Float
     dark_step: Float
+    #: Means of dark and light.
     dark_dn: Float
     light_dn: Float
-    light_variance: Float
+    light_variance: Float  # variance of the light, Gaussian or Poisson
 
     @staticmethod
     def of(x: Expectation, each: int) -> Cumulants:

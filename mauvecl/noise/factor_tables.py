@@ -22,22 +22,15 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Factors:
-    """Factors of priors on light, dark and sky; factors on light include the sky's light.
+    """Factors of priors on light, dark and sky; factors on light include the sky's light."""
 
-    Attributes
-    ----------
-    tables : ndarray of float32, shape (n_modulation, 2 * layout.PRIOR_NODES)
-        Quantile tables; see `prior_tables.table_of`.
-    light, dark, sky : float
-        Factors at the priors' medians, to which the tables are relative.
-    light_ends, dark_ends, sky_ends : tuple of float, shape (2,)
-        Smallest and largest factors of all priors together.
-    """
-
+    #: Shape (n_modulation, 2 * layout.PRIOR_NODES); quantile tables; see `prior_tables.table_of`.
     tables: NDArray[np.float32]
+    #: Factors at the priors' medians, to which the tables are relative.
     light: float
     dark: float
     sky: float
+    #: Smallest and largest factors of all priors together.
     light_ends: tuple[float, float]
     dark_ends: tuple[float, float]
     sky_ends: tuple[float, float]

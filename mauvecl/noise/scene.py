@@ -28,75 +28,39 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Scenarios on common draws, as arrays for the kernels.
+    """Scenarios on common draws, as arrays for the kernels."""
 
-    Attributes
-    ----------
-    n_pixel : int
-        Number of pixels; the arrays are padded to a multiple of `PIXEL_BLOCK`.
-    n_frames : int
-        Number of frames of the exposure.
-    frames : bool
-        Whether each frame is drawn, rounded and clipped, instead of their sum at once.
-    joint : bool
-        Whether all noise of a draw comes from one normal through its cumulants, instead of separate Poisson counts.
-    quartic : bool
-        Whether a joint draw needs the fourth power of its normal and, if factors vary, fifth cumulants.
-    photons : bool
-        Whether photon counts are also drawn separately.
-    clip : bool
-        Whether single draws are clipped at the ADC's rails.
-    modulations : tuple of (name, factor)
-        Priors that change light, dark or sky; see `Processes`.
-    job : ndarray of layout.JOB, shape ()
-        Parameters of a launch without the seed.
-    pixels : ndarray of layout.PIXEL, shape (n_padded,)
-    levels, edges, photon_counts, responses : ndarray, shape (n_scenario, n_padded)
-        Structs layout.LEVEL, EDGE, POISSON and RESPONSE; the last two are empty if not needed.
-    dark_counts : ndarray of layout.POISSON, shape (n_padded,)
-    tables : ndarray of uint32
-        Concatenated alias tables.
-    priors : ndarray of float32, shape (n_modulation, 2 * PRIOR_NODES)
-        Quantile tables.
-    medians : tuple of float, shape (3,)
-        Factors on light, dark and sky at the priors' medians.
-    references : ndarray of uint32, shape (n_scenario,)
-        For each scenario, the scenario with whose mean and variance it is compared.
-    fraction : ndarray, shape (n_scenario, n_padded)
-        Reference rounded to whole DN minus the reference; zero for noisy reference exposures.
-    estimates : ndarray of layout.ESTIMATE, shape (n_scenario, n_padded)
-        Parameters of estimated variances; empty for the model's.
-    comparison : Comparison
-    base_dn : ndarray of int64, shape (n_scenario, n_pixel)
-        Whole DN of one draw's mean that the kernels omit.
-    used : ndarray of bool, shape (n_pixel,)
-        Pixels that enter the statistics, those that no reference saturates.
-    """
-
-    n_pixel: int
-    n_frames: int
-    frames: bool
+    n_pixel: int  # number of pixels; the arrays are padded to a multiple of `PIXEL_BLOCK`
+    n_frames: int  # number of frames of the exposure
+    frames: bool  # whether each frame is drawn, rounded and clipped, instead of their sum at once
+    #: Whether all noise of a draw comes from one normal through its cumulants, instead of separate Poisson counts.
     joint: bool
-    quartic: bool
-    photons: bool
-    clip: bool
-    modulations: tuple[tuple[str, SignalPart], ...]
-    job: NDArray[np.void]
-    pixels: NDArray[np.void]
+    quartic: bool  # whether a joint draw needs the fourth power of its normal and, if factors vary, fifth cumulants
+    photons: bool  # whether photon counts are also drawn separately
+    clip: bool  # whether single draws are clipped at the ADC's rails
+    modulations: tuple[tuple[str, SignalPart], ...]  # priors that change light, dark or sky; see `Processes`
+    job: NDArray[np.void]  # shape (); parameters of a launch without the seed
+    pixels: NDArray[np.void]  # shape (n_padded,)
+    #: Shape (n_scenario, n_padded); structs layout.LEVEL, EDGE, POISSON and RESPONSE; the last two are empty if not
+    #: needed.
     levels: NDArray[np.void]
-    edges: NDArray[np.void]
-    dark_counts: NDArray[np.void]
-    photon_counts: NDArray[np.void]
-    responses: NDArray[np.void]
-    tables: NDArray[np.uint32]
-    priors: NDArray[np.float32]
-    medians: tuple[float, float, float]
+    edges: NDArray[np.void]  # shape (n_scenario, n_padded)
+    dark_counts: NDArray[np.void]  # shape (n_padded,)
+    photon_counts: NDArray[np.void]  # shape (n_scenario, n_padded)
+    responses: NDArray[np.void]  # shape (n_scenario, n_padded)
+    tables: NDArray[np.uint32]  # concatenated alias tables
+    priors: NDArray[np.float32]  # shape (n_modulation, 2 * PRIOR_NODES); quantile tables
+    medians: tuple[float, float, float]  # factors on light, dark and sky at the priors' medians
+    #: Shape (n_scenario,); for each scenario, the scenario with whose mean and variance it is compared.
     references: NDArray[np.uint32]
+    #: Shape (n_scenario, n_padded); reference rounded to whole DN minus the reference; zero for noisy reference
+    #: exposures.
     fraction: Float
+    #: Shape (n_scenario, n_padded); parameters of estimated variances; empty for the model's.
     estimates: NDArray[np.void]
     comparison: Comparison
-    base_dn: NDArray[np.int64]
-    used: NDArray[np.bool_]
+    base_dn: NDArray[np.int64]  # shape (n_scenario, n_pixel); whole DN of one draw's mean that the kernels omit
+    used: NDArray[np.bool_]  # shape (n_pixel,); pixels that enter the statistics, those that no reference saturates
 
     @property
     def n_draws(self) -> int:

@@ -85,31 +85,19 @@ class Unknown:
 
 @dataclass(frozen=True, kw_only=True)
 class Process(Unknown):
-    """Unknown factor on light, dark or sky, drawn per frame or exposure.
-
-    Attributes
-    ----------
-    stream : int
-        Its number in `layout.STREAMS`.
-    low, high : float
-        Range of allowed values.
-    change : callable
-        Function of an expectation's conditions and drawn values that returns the factor minus one.
-    expected : str or float
-        Value in the expectation, or its key in the expectation's conditions.
-    drawn : str
-        Description of the default prior for messages and documentation.
-    """
+    """Unknown factor on light, dark or sky, drawn per frame or exposure."""
 
     of: SignalPart = "light"
     when: When = "exposure"
     treatment: Treatment = "drawn"
-    stream: int
+    stream: int  # its number in `layout.STREAMS`
+    #: Range of allowed values.
     low: float
     high: float
+    #: Function of an expectation's conditions and drawn values that returns the factor minus one.
     change: Callable[[Conditions, Float], Float]
-    expected: str | float = 1.0
-    drawn: str = ""
+    expected: str | float = 1.0  # value in the expectation, or its key in the expectation's conditions
+    drawn: str = ""  # description of the default prior for messages and documentation
 
     def expected_in(self, conditions: Conditions) -> float:
         """Return the value in an expectation."""
@@ -118,29 +106,16 @@ class Process(Unknown):
 
 @dataclass(frozen=True, kw_only=True)
 class Nuisance(Unknown):
-    """Unknown amplitude of a known spectrum, which statistics marginalise over.
-
-    Attributes
-    ----------
-    spectrum : callable
-        Function of a quiescent expectation that returns DN of the exposure for unit amplitude, shape (n_pixel,).
-    unit : str
-        Unit in messages; relative amplitudes are shown in per cent.
-    process : str
-        Process that draws it in the documented set.
-    scatter : float
-        Root mean square of the amplitude that this process draws.
-    marginalised : str
-        Description of the default prior for messages and documentation.
-    """
+    """Unknown amplitude of a known spectrum, which statistics marginalise over."""
 
     when: When = "exposure"
     treatment: Treatment = "marginalised"
+    #: Function of a quiescent expectation that returns DN of the exposure for unit amplitude, shape (n_pixel,).
     spectrum: Callable[[Expectation], Float]
-    unit: str = "%"
-    process: str = ""
-    scatter: float = math.nan
-    marginalised: str = ""
+    unit: str = "%"  # unit in messages; relative amplitudes are shown in per cent
+    process: str = ""  # process that draws it in the documented set
+    scatter: float = math.nan  # root mean square of the amplitude that this process draws
+    marginalised: str = ""  # description of the default prior for messages and documentation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,20 +133,14 @@ class StareChange(Unknown):
 
 @dataclass(frozen=True, kw_only=True)
 class InstrumentValue(Unknown):
-    """Unknown but constant value of the instrument, over which answers are averaged.
-
-    Attributes
-    ----------
-    scales : str, optional
-        Value of the instrument that the unknown multiplies; by default it replaces the value of its own name.
-    of_throughput : bool
-        Whether it changes the throughput alone, so that modes of a calibrated throughput take its place.
-    """
+    """Unknown but constant value of the instrument, over which answers are averaged."""
 
     of: Of = "instrument"
     when: When = "campaign"
     treatment: Treatment = "drawn"
+    #: Value of the instrument that the unknown multiplies; by default it replaces the value of its own name.
     scales: str | None = None
+    #: Whether it changes the throughput alone, so that modes of a calibrated throughput take its place.
     of_throughput: bool = False
 
     def changes(self, nominal: Instrument, value: float) -> dict[str, Any]:
@@ -181,17 +150,10 @@ class InstrumentValue(Unknown):
 
 @dataclass(frozen=True, kw_only=True)
 class ThroughputMode(InstrumentValue):
-    """Unknown amplitude of a mode of a calibration.
+    """Unknown amplitude of a mode of a calibration."""
 
-    Attributes
-    ----------
-    number : int
-        Counted from 0.
-    others : mapping of float
-        Changes of the logarithm of other values than the throughput for an amplitude of one, by name.
-    """
-
-    number: int
+    number: int  # counted from 0
+    #: Changes of the logarithm of other values than the throughput for an amplitude of one, by name.
     others: Mapping[str, float]
 
     def changes(self, nominal: Instrument, value: float) -> dict[str, Any]:

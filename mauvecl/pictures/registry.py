@@ -21,26 +21,15 @@ WITHOUT_PICTURES = ("figure",)
 
 @dataclass(frozen=True)
 class Entry:
-    """Function that draws a picture or writes a document of a class.
+    """Function that draws a picture or writes a document of a class."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the file.
-    make : callable
-    given : callable, optional
-        Arguments of `make` for a thing; the thing itself without it.
-    each : callable, optional
-        Arguments of `make` for each of several numbered pictures of a thing.
-    when : callable, optional
-        Whether a thing has the picture.
-    """
-
-    name: str
+    name: str  # name of the file
     make: Callable[..., Any]
+    #: Arguments of `make` for a thing; the thing itself without it.
     given: Callable[[Any], tuple[Any, ...]] | None = None
+    #: Arguments of `make` for each of several numbered pictures of a thing.
     each: Callable[[Any], Iterable[tuple[Any, ...]]] | None = None
-    when: Callable[[Any], bool] | None = None
+    when: Callable[[Any], bool] | None = None  # whether a thing has the picture
 
     def of(self, thing: Any) -> list[tuple[int, str, Callable[..., Any]]]:
         """Return number, name and bound function of each picture of a thing."""

@@ -12,15 +12,9 @@ from mauvecl.host.version import VERSION
 
 @dataclass(frozen=True)
 class Entry:
-    """Appointment in a calendar.
+    """Appointment in a calendar."""
 
-    Attributes
-    ----------
-    start, stop : str
-        UTC, ISO 8601 to the second; dates without time make an entry of whole days, including the last.
-    title, text : str
-    """
-
+    #: UTC, ISO 8601 to the second; dates without time make an entry of whole days, including the last.
     start: str
     stop: str
     title: str

@@ -54,18 +54,10 @@ class FittedFlares:
 
 @dataclass(frozen=True, eq=False)
 class SingleFlareFit:
-    """Least-squares fit of single flares.
+    """Least-squares fit of single flares."""
 
-    Attributes
-    ----------
-    bank : Bank
-        Bank of the search, which defines shape, baseline and windows.
-    templates : Templates
-        Effect of flares on the sums of a frame.
-    """
-
-    bank: Bank
-    templates: Templates
+    bank: Bank  # bank of the search, which defines shape, baseline and windows
+    templates: Templates  # effect of flares on the sums of a frame
 
     def run(
         self,

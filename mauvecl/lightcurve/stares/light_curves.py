@@ -130,27 +130,18 @@ class StareExpectation:
 
 @dataclass(frozen=True, eq=False)
 class LightCurves:
-    """Light curves and spectra of a stare, DN/s without bias and dark current.
+    """Light curves and spectra of a stare, DN/s without bias and dark current."""
 
-    Attributes
-    ----------
-    bands : tuple of str
-        The first is the whole range.
-    flux, sd, mean : ndarray, shape (n_frame, n_band)
-        Drawn light, standard deviation of its noise, and light without noise.
-    spectrum, spectrum_sd, spectrum_mean : ndarray of float32, shape (n_frame, n_element)
-        The same in resolution elements.
-    element_nm : ndarray, shape (n_element,)
-    """
-
-    bands: tuple[str, ...]
+    bands: tuple[str, ...]  # the first is the whole range
+    #: Shape (n_frame, n_band); drawn light, standard deviation of its noise, and light without noise.
     flux: Float
-    sd: Float
-    mean: Float
+    sd: Float  # shape (n_frame, n_band)
+    mean: Float  # shape (n_frame, n_band)
+    #: Shape (n_frame, n_element); the same in resolution elements.
     spectrum: NDArray[np.float32]
-    spectrum_sd: NDArray[np.float32]
-    spectrum_mean: NDArray[np.float32]
-    element_nm: Float
+    spectrum_sd: NDArray[np.float32]  # shape (n_frame, n_element)
+    spectrum_mean: NDArray[np.float32]  # shape (n_frame, n_element)
+    element_nm: Float  # shape (n_element,)
 
 
 def draw_light_curves(

@@ -42,23 +42,16 @@ LEAST_VARIANCE = 1.0
 
 @dataclass(frozen=True, eq=False)
 class SumTable:
-    """Cumulants of whitened sums, which are independent and have unit variance at coefficients of one.
+    """Cumulants of whitened sums, which are independent and have unit variance at coefficients of one."""
 
-    Attributes
-    ----------
-    rows : ndarray of float32, shape (4 + n_flare, n)
-        Total at coefficients of one, then star, sky, dark, neighbours and each flare: means (0 for the total), then the
-        unique second, third and, if needed, fourth cumulants, in the order of `stare_scene.unique`; fourth ones are
-        multiplied by their multiplicity.
-    whole : ndarray of float32, shape (n_statistic * (n_statistic + 1) / 2,)
-        Lower triangular matrix that converts whitened sums to the statistics.
-    fourths : bool
-        Whether fourth cumulants are needed.
-    """
-
+    #: Shape (4 + n_flare, n); total at coefficients of one, then star, sky, dark, neighbours and each flare: means (0
+    #: for the total), then the unique second, third and, if needed, fourth cumulants, in the order of
+    #: `stare_scene.unique`; fourth ones are multiplied by their multiplicity.
     rows: Floats
+    #: Shape (n_statistic * (n_statistic + 1) / 2,); lower triangular matrix that converts whitened sums to the
+    #: statistics.
     whole: Floats
-    fourths: bool
+    fourths: bool  # whether fourth cumulants are needed
 
     @classmethod
     def of(cls, components: Components) -> Self:

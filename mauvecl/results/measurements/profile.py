@@ -37,20 +37,11 @@ SAMPLES = 33
 
 @dataclass(frozen=True, eq=False)
 class BestFit:
-    """Best fits of n frames.
+    """Best fits of n frames."""
 
-    Attributes
-    ----------
-    log_k : ndarray, shape (n,)
-    linear : ndarray, shape (n, n_linear)
-        Amplitudes.
-    gain : ndarray, shape (n,)
-        Chi-squared of the sums without a flare less that of the fit.
-    """
-
-    log_k: Float
-    linear: Float
-    gain: Float
+    log_k: Float  # shape (n,)
+    linear: Float  # shape (n, n_linear); amplitudes
+    gain: Float  # shape (n,); chi-squared of the sums without a flare less that of the fit
 
     def replaced(self, rows: NDArray[np.intp], others: BestFit) -> BestFit:
         """Return the fits with those of some frames replaced."""

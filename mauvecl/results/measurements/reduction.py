@@ -41,21 +41,11 @@ LEAST_KEPT = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class MeanSums:
-    """Response of weighted sums with unit covariance to the flares of a model.
+    """Response of weighted sums with unit covariance to the flares of a model."""
 
-    Attributes
-    ----------
-    hot : ndarray, shape (n_node, n_sum)
-        Mean sums for a blackbody of amplitude 1, at each of the model's temperatures.
-    fixed : ndarray, shape (n_linear - 1, n_sum)
-        Mean sums of the other components for unit amplitude.
-    log_k : ndarray, shape (n_node,)
-        Evenly spaced, to a few percent of a step.
-    """
-
-    hot: Float
-    fixed: Float
-    log_k: Float
+    hot: Float  # shape (n_node, n_sum); mean sums for a blackbody of amplitude 1, at each of the model's temperatures
+    fixed: Float  # shape (n_linear - 1, n_sum); mean sums of the other components for unit amplitude
+    log_k: Float  # shape (n_node,); evenly spaced, to a few percent of a step
 
     @cached_property
     def basis(self) -> tuple[Float, Float]:

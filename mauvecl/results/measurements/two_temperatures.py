@@ -39,15 +39,9 @@ APART = 4
 
 @dataclass(frozen=True, eq=False)
 class TwoTemperatures:
-    """The mean counts of a flare of two blackbodies, both temperatures free.
+    """The mean counts of a flare of two blackbodies, both temperatures free."""
 
-    Attributes
-    ----------
-    single : FlareModel
-        Model of one blackbody, optionally with lines.
-    """
-
-    single: FlareModel
+    single: FlareModel  # model of one blackbody, optionally with lines
 
     @property
     def names(self) -> tuple[str, ...]:
