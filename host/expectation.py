@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.schema.calls import validated
+from mauvecl.schema.drawable import Drawable
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Unit
 from mauvecl.schema.messages import Message
 from mauvecl.schema.physical import Duration, Exposure, SkyBrightness
 from mauvecl.schema.tables import Column, table_of
 
-from ..drawable import Drawable
 from .content_equality import ContentEquality
 from .instrument.instrument import Instrument
 from .instrument.line_spread import LineSpread

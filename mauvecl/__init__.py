@@ -9,9 +9,9 @@ import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from mauvecl import drawable
 from mauvecl.answers.verbs import HOMES
 from mauvecl.host.version import VERSION
+from mauvecl.schema import drawable
 
 if sys.platform == "win32":
     from mauvecl.device.drivers import driver_sources

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.schema.calls import validated
+from mauvecl.schema.drawable import Drawable
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import AnyUnit, Unit
 from mauvecl.schema.physical import Amplitude, BinWidth, Magnitude, Reddening, Temperature
 
-from ...drawable import Drawable
 from ..content_equality import ContentEquality
 from ..spectra.coverage import (
     check_flux,

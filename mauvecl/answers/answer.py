@@ -9,8 +9,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from mauvecl.drawable import Drawable, documents_of
 from mauvecl.host.content_equality import ContentEquality
+from mauvecl.schema.drawable import Drawable, documents_of
 from mauvecl.schema.tables import View, records
 from mauvecl.study.labels import full_label
 

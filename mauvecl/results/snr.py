@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.drawable import Drawable
 from mauvecl.host.content_equality import ContentEquality
 from mauvecl.noise import layout
 from mauvecl.noise.random_numbers import Floats, fma
 from mauvecl.noise.scene import Scene
 from mauvecl.results.counts.sparse_counts import SparseCounts
+from mauvecl.schema.drawable import Drawable
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column, table_of
 

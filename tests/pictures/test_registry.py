@@ -19,9 +19,9 @@ from refusals import refused
 import mauvecl.answers
 import mauvecl.pictures
 from mauvecl import Source
-from mauvecl.drawable import Drawable
 from mauvecl.pictures import registry
 from mauvecl.pictures.style import styled_picture
+from mauvecl.schema.drawable import Drawable
 
 ROOT = Path(__file__).parent.parent.parent
 #: The packages that lie below the pictures.

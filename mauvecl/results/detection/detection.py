@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.drawable import Drawable
 from mauvecl.host.content_equality import ContentEquality
 from mauvecl.results.counts.tally import Distribution, TailSamples, Tally
 from mauvecl.results.detection.roc import Roc
@@ -19,6 +18,7 @@ from mauvecl.results.requests.channels import ChannelPlan, Key
 from mauvecl.results.requests.fap_checks import NoThresholdError, Tails, check_atom, check_fap, countable
 from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.schema.calls import validated
+from mauvecl.schema.drawable import Drawable
 from mauvecl.schema.fields import Range
 from mauvecl.schema.messages import Message
 from mauvecl.schema.tables import INTERVAL, Column, interval, number, table_of

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.drawable import Drawable
+from mauvecl.schema.drawable import Drawable
 from mauvecl.schema.tables import Column, table_of
 from mauvecl.statistics.intervals import CONFIDENCE, Interval, clopper_pearson, clopper_pearson_ends
 
