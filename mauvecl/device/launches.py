@@ -80,7 +80,7 @@ class Launches:
             if not out_of_memory(error):
                 raise
             raise DeviceError(
-                f"{self._device.name} has too little memory for {data.nbytes} bytes of a scene: {error}"
+                f"{self._device.name} has too little memory for {data.nbytes} bytes of a scene: {error}", "memory"
             ) from error
         self._buffers.append(buffer)
         return buffer

@@ -152,7 +152,7 @@ def _devices() -> list[Any]:
         # If a variable names a folder, loaders search only that.
         folders = ", ".join(f"{name}={os.environ[name]}" for name in vendors.FOLDER_VARIABLES if os.environ.get(name))
         searched = f" ({folders})" if folders else ""
-        raise DeviceError(f"no OpenCL device found{searched}: install {driver_sources()}")
+        raise DeviceError(f"no OpenCL device found{searched}: install {driver_sources()}", "no device")
     # PoCL on the CPU comes first, because the first device is the default.
     return sorted(handles, key=lambda d: (d.platform.name != POCL, "cpu" not in _kind(d)))
 
@@ -209,7 +209,7 @@ def choose_device(wanted: str | None) -> tuple[Any, DeviceRecord]:
         if wanted == str(index) or wanted.casefold() in record.label.casefold():
             return handles[index], record
     present = "; ".join(f"{index} = {record.label}" for index, record in enumerate(records))
-    raise DeviceError(f"device {wanted!r} is not here, expected one of: {present}")
+    raise DeviceError(f"device {wanted!r} is not here, expected one of: {present}", "unknown device")
 
 
 @cache
@@ -299,7 +299,8 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
         if "unknown target CPU" in str(error):
             raise DeviceError(
                 f"{device.platform.version.strip()} does not know the processor {device.name} and cannot build for it, "
-                "expected a newer PoCL or another OpenCL driver"
+                "expected a newer PoCL or another OpenCL driver",
+                "processor",
             ) from error
         numbered = "\n".join(f"{i:4d}  {line}" for i, line in enumerate(source.splitlines(), 1))
         raise BuildError(f"a kernel did not compile on {device.name}\n{numbered}\n{error}") from error

@@ -93,7 +93,8 @@ class Tiles:
                     raise
                 if size <= self._step:
                     raise DeviceError(
-                        f"{self._device.name} has too little memory for {self._step} realisations of it: {error}"
+                        f"{self._device.name} has too little memory for {self._step} realisations of it: {error}",
+                        "memory",
                     ) from error
                 size //= 2
                 continue

@@ -109,7 +109,7 @@ class DaskWorkers:
         return self._counted[0]
 
     def _gone(self) -> DeviceError:
-        return DeviceError(f"the scheduler of cluster {self._where} is gone, expected it to stay to the end")
+        return DeviceError(f"the scheduler of cluster {self._where} is gone, expected it to stay to the end", "lost")
 
     def describe(self) -> list[DeviceRecord]:
         """Return the devices of the initial workers."""
@@ -161,7 +161,7 @@ class DaskWorkers:
             known = isinstance(error, InputError | DeviceError)
             if known or tried == MAX_TRIES:
                 reason = error if known else f"{error or 'the scheduler is gone'}"
-                awaited.set_exception(DeviceError(f"cluster {self._where} failed at {task.shard}: {reason}"))
+                awaited.set_exception(DeviceError(f"cluster {self._where} failed at {task.shard}: {reason}", "failed"))
             elif sent.status in ("cancelled", "lost") and self._client.status != "running":
                 awaited.set_exception(self._gone())
             else:

@@ -142,7 +142,8 @@ class LocalWorkers:
                     if tried == MAX_TRIES:
                         raise DeviceError(
                             f"{engine.device_name} failed {MAX_TRIES} times at {task.shard} ({error}), expected a "
-                            "device that works"
+                            "device that works",
+                            "failed",
                         ) from error
                     with self._lock:
                         self.retries += 1

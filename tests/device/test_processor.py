@@ -143,6 +143,7 @@ def test_error_names_processor_unknown_to_compiler(monkeypatch: Any) -> None:
         raise cl.RuntimeError("error: unknown target CPU 'generic'")
 
     monkeypatch.setattr(cl, "Program", refuse)
-    with pytest.raises(DeviceError, match=r"does not know the processor .*, expected a newer PoCL") as caught:
+    with pytest.raises(DeviceError) as caught:
         program.build(cl.Context([handle]), "__kernel void nothing() {}")
+    assert caught.value.kind == "processor"
     assert "\n" not in str(caught.value)

@@ -23,8 +23,10 @@ def test_device_is_chosen_by_name_or_number() -> None:
     present = devices()
     assert present[0].default
     assert "Portable" in present[0].platform
-    with pytest.raises(DeviceError, match="not here, expected one of: 0 = "):
+    with pytest.raises(DeviceError) as error:
         Engine(device="no such device")
+    assert error.value.kind == "unknown device"
+    assert present[0].label in str(error.value)
     assert Engine(device="portable").device == present[0]
     assert Engine(device="0").device == present[0]
 
@@ -77,8 +79,9 @@ def test_no_device_raises(monkeypatch: pytest.MonkeyPatch) -> None:
 
     for empty in (nothing, list):
         monkeypatch.setattr(opencl, "get_platforms", empty)
-        with pytest.raises(DeviceError, match="no OpenCL device found"):
+        with pytest.raises(DeviceError) as error:
             Engine()
+        assert error.value.kind == "no device"
 
 
 @pytest.mark.parametrize("new", [False, True])
@@ -149,11 +152,15 @@ def test_little_memory_shrinks_tiles_without_affecting_results(monkeypatch: pyte
 
 def test_too_little_memory_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     refuse_beyond(monkeypatch, 100)
-    with pytest.raises(DeviceError, match="too little memory for 64 realisations"):
+    with pytest.raises(DeviceError) as error:
         Engine().detect(toy(), [toy(flare=0.3)], realisations=20_000, seed=1)
+    assert error.value.kind == "memory"
+    assert " 64 realisations" in str(error.value)
     refuse_beyond(monkeypatch, 100, scenes=True)
-    with pytest.raises(DeviceError, match=r"too little memory for .* bytes of a scene"):
+    with pytest.raises(DeviceError) as error:
         Engine().realise(toy(), count=1, seed=1)
+    assert error.value.kind == "memory"
+    assert "scene" in str(error.value)
 
 
 def test_other_device_errors_are_not_retried(monkeypatch: pytest.MonkeyPatch) -> None:

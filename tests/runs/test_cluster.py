@@ -135,8 +135,10 @@ def test_error_on_a_worker_raises(workers: DaskWorkers) -> None:
 
     (bright,) = star(magnitude=-0.7, payload=instrument(part=True))
     impossible = RealiseRequest.of(bright, 10, seed=1, mode="stacked")
-    with pytest.raises(DeviceError, match=r"failed at realisations 0 to 9: mode = 'stacked' cannot clip"):
+    with pytest.raises(DeviceError) as error:
         workers.submit(Task(impossible, "key", Shard(0, 0, 10))).result()
+    assert error.value.kind == "failed"
+    assert "realisations 0 to 9: mode = 'stacked'" in str(error.value)
     assert workers.retries == before
 
 
@@ -325,8 +327,9 @@ def test_lost_scheduler_raises(tmp_path: Path, scene: list[Expectation]) -> None
             scheduler.kill()
 
         threading.Thread(target=kill).start()
-        with pytest.raises(DeviceError, match=r"the scheduler of cluster .* is gone, expected it to stay"):
+        with pytest.raises(DeviceError) as error:
             pool.detect(scene[0], scene[1:], realisations=1_000_000, seed=1)
+        assert error.value.kind == "lost"
         workers.stop()
         workers.close()
 
@@ -345,5 +348,6 @@ def test_scheduler_lost_during_a_fetch_raises() -> None:
     sent: Any = Lost()
     workers._sent = {sent: awaited}
     workers._came(awaited, None, 1, sent)  # type: ignore[arg-type]
-    with pytest.raises(DeviceError, match="is gone"):
+    with pytest.raises(DeviceError) as error:
         awaited.result(timeout=1)
+    assert error.value.kind == "lost"

@@ -161,8 +161,11 @@ def test_failed_launch_is_repeated(engine: Engine, scene: list[Expectation]) -> 
 def test_device_that_always_fails_raises(engine: Engine, scene: list[Expectation]) -> None:
     quiet, *flares = scene
     pool = Pool(LocalWorkers([None], make=lambda device, progress: Failing(engine, set(range(99)), [])))  # type: ignore[return-value, arg-type]
-    with pytest.raises(DeviceError, match=r"failed 3 times at realisations 0 to 4095 .*OUT_OF_RESOURCES.*expected"):
+    with pytest.raises(DeviceError) as error:
         pool.detect(quiet, flares, realisations=N, seed=5)
+    assert error.value.kind == "failed"
+    assert "3 times at realisations 0 to 4095 " in str(error.value)
+    assert "OUT_OF_RESOURCES" in str(error.value)
 
 
 AXES = {"x": {"quantity": "magnitude", "values": [6, 8, 10]}, "y": {"quantity": "amplitude", "values": [0.05, 0.2]}}
