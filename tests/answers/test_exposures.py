@@ -26,7 +26,7 @@ def study(magnitude: float = 7.4, **observation: float) -> Study:
 @pytest.mark.parametrize("frames", [1, 2, 7, 120])
 @pytest.mark.parametrize("wavelength", [280.0, 450.0])
 def test_exposure_inverts_snr(per: str, frames: int, wavelength: float) -> None:
-    """The S/N of an exposure asks for that exposure, and a little more for a frame more."""
+    """Check that the S/N of an exposure asks for that exposure, and that one frame more is a little longer."""
     asked = study(exposure_s=5.0 * frames)
     x = Case(asked).quiet
     snr = snr_at(x, wavelength, per)
@@ -38,7 +38,7 @@ def test_exposure_inverts_snr(per: str, frames: int, wavelength: float) -> None:
 
 
 def test_engine_finds_the_wanted_snr(engine: Engine) -> None:
-    """Mean S/N of realisations at the answer: 5 standard errors, and 1 % for the clipped root's curvature."""
+    """Compare the mean S/N of realisations at the answer within 5 standard errors and 1 % for the curved root."""
     (found,) = exposure_for(study(), 20.0, 300.0).exposures
     asked = study(exposure_s=found.exposure_s)
     x = Case(asked).quiet
@@ -65,7 +65,7 @@ def test_failure_of_one_star_keeps_the_others() -> None:
 
 
 def test_exposure_above_one_day_is_answered() -> None:
-    """An exposure of a day at most is a rule of `expect`; several of them add up."""
+    """Check that longer times are sums of several exposures, although `expect` allows only one day."""
     found = exposure_for(study(14.5), 10.0, 550.0)
     (answer,) = found.exposures
     assert answer.exposure_s > 86_400.0
@@ -85,7 +85,7 @@ def test_answer_is_written_and_drawn(tmp_path: Path) -> None:
 
 
 def test_each_column_is_defined_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """One more column stands in the file, in JSON and on the terminal, with its unit, description and format."""
+    """Check that an added column occurs in the file, in JSON and on the terminal with its description."""
     less = Column("frame_less", "snr_one_frame_less", "DN", "for this test", "one less", lambda value: f"<{value:.1f}>")
     monkeypatch.setattr(exposures, "COLUMNS", (*exposures.COLUMNS, less))
     answer = exposure_for(study(), 10.0, 300.0)

@@ -84,7 +84,7 @@ class Stop(Exception):  # noqa: N818
 
 @pytest.mark.long
 def test_resumed_run_gives_the_same_answer(found, tmp_path):
-    """Some peaks kept, the others drawn later by two devices of different form: the same to the last bit."""
+    """Keep some peaks and draw the others on two devices of different form; all bits agree."""
 
     def stop(done, total):
         if done > total / 3:
@@ -105,7 +105,7 @@ def test_resumed_run_gives_the_same_answer(found, tmp_path):
 
 @pytest.mark.long
 def test_sweep_over_magnitude_and_temperature_is_answered(stares):
-    """Fainter stars hide larger flares; every cell on common draws, so that each limit moves."""
+    """Check that fainter stars hide larger flares; all cells share their draws."""
     axes = [
         {"quantity": "magnitude", "values": [6.0, 8.0]},
         {"quantity": "flare_temperature", "values": [8000.0, 20_000.0]},
@@ -121,7 +121,7 @@ def test_sweep_over_magnitude_and_temperature_is_answered(stares):
 
 @pytest.mark.long
 def test_search_without_the_cycle_reports_its_false_alarms(stares):
-    """A thermal cycle that the search does not know raises the threshold, or is refused where none is high enough."""
+    """Check that an unknown thermal cycle raises the threshold, or that the search is refused."""
     quick = {"count": 10, "positions": 2, "fitted": 0, "widths": 2, "sizes": 2}
     changes = {"stare": {"cycles": {"temperature": 0.5}}, "injections": quick}
     with refused("false_alarms"):
@@ -136,7 +136,7 @@ def test_search_without_the_cycle_reports_its_false_alarms(stares):
 
 @pytest.mark.long
 def test_temperature_drift_hides_no_flare(stares):
-    """Limits and recovered energies with an unknown drift of 0.3 deg C per hour are those without it."""
+    """Compare limits and recovered energies with and without an unknown drift of 0.3 deg C per hour."""
     quick = {"count": 80, "positions": 8, "fitted": 40, "widths": 2, "sizes": 3, "low": 1e33, "high": 3e34}
     plain, drifting = (
         inject(
@@ -153,7 +153,7 @@ def test_temperature_drift_hides_no_flare(stares):
 
 
 def test_cosmic_rays_and_saturation_are_reported(stares):
-    """Cosmic rays are drawn if the study has them, and hide flares; saturating flares are reported."""
+    """Check that cosmic rays of the study hide flares, and that saturating flares are reported."""
     quick = {"count": 10, "positions": 2, "fitted": 0, "widths": 1, "sizes": 2, "low": 1e33, "high": 1e39}
     plain, struck = (
         inject(study(injections=quick, search={"nulls": 5}, stare={"duration_s": 2500.0, "gaps": []}, **more), stares)
@@ -165,7 +165,7 @@ def test_cosmic_rays_and_saturation_are_reported(stares):
 
 
 def test_intervals_widen_if_positions_differ():
-    """Binomial where all positions are alike, of the positions alone where each finds all or nothing."""
+    """Compare with the binomial interval for equal positions, and with that of positions for all or nothing."""
     rng = np.random.default_rng(2)
     alike = InjectedCompleteness((1.0,), np.array([0.5]), np.ones((1, 1)), rng.random((1, 20, 100)))
     exact = clopper_pearson(round(alike.completeness[0, 0] * 2000), 2000)
@@ -184,7 +184,7 @@ def test_intervals_widen_if_positions_differ():
 
 @pytest.mark.long
 def test_inject_command_writes_its_files(tmp_path):
-    """The verb with flags: its JSON, its files, its record."""
+    """Run the command with flags and check its JSON, files and record."""
     words = (
         "inject --star G2V --magnitude 7.4 --duration 4000 --injections 20 --alarms-per day --false-alarms 0.5 --json"
     )
@@ -199,7 +199,7 @@ def test_inject_command_writes_its_files(tmp_path):
 
 
 def test_sizes_can_be_energies():
-    """In erg, which are beyond what other numbers may be."""
+    """Accept sizes in erg, which exceed the range of all other numbers."""
     asked = Study().with_settings(["injections.low=1e33", "injections.high=1e35"])
     assert (asked.injections.low, asked.injections.high) == (1e33, 1e35)
 

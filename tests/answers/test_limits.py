@@ -40,7 +40,7 @@ FEW = {"statistics": ("matched",), "realisations": 20_000}
 @pytest.mark.long
 @pytest.mark.parametrize("power", [0.5, 0.9])
 def test_limiting_magnitude_has_the_requested_power(engine: Engine, power: float) -> None:
-    """By a fresh simulation, within three half-widths of its 95 % interval: four statistics, 1e-4 by chance."""
+    """Compare with a fresh simulation within three half-widths of its 95 % interval; fails once in 1e4 seeds."""
     asked = study(limit={"power": power})
     result = limiting_magnitude(asked, engine)
     assert [limit.statistic for limit in result.limits] == list(STATISTICS)
@@ -62,7 +62,7 @@ def test_limiting_magnitude_has_the_requested_power(engine: Engine, power: float
 
 
 def test_limit_inverts_detect(engine: Engine) -> None:
-    """At the limiting magnitude of an amplitude the smallest amplitude is that one, and the exposure the shortest."""
+    """Check that the smallest amplitude and the shortest exposure at the limiting magnitude are those given."""
     only = {"statistics": ("matched",)}
     (limit,) = limiting_magnitude(study(run=only), engine).limits
     there = study(run=only, star=[{"library": "G2V", "magnitude": limit.value.value}])
@@ -89,7 +89,7 @@ def test_limits_are_monotone(engine: Engine, harder: dict[str, Any]) -> None:
 
 
 def test_cooler_detector_gains_as_predicted(engine: Engine) -> None:
-    """13 C has 0.58 of the dark of 21 C: the limit moves as the closed form's."""
+    """Compare 13 and 21 deg C, whose dark currents have a ratio of 0.58, with the closed form."""
     few = {"statistics": ("matched",)}
     (warm,), (cool,) = (
         limiting_magnitude(study(run=few, observation={"temperature_c": t}), engine).limits for t in (21.0, 13.0)
@@ -123,7 +123,7 @@ def test_failure_of_one_star_keeps_the_others(engine: Engine) -> None:
 
 @pytest.mark.long
 def test_limit_above_one_day_is_found(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of some 1e5 frames, which are halved and not walked through."""
+    """Search some 1e5 frames by bisection."""
     asks, simulated = [], LimitSearch.simulated
 
     def counted(self: LimitSearch, value: float, seed: int) -> Interval:
@@ -157,7 +157,7 @@ def test_shortest_exposure_is_one_frame(engine: Engine) -> None:
 
 
 def test_assumptions_move_the_limit_as_predicted() -> None:
-    """More light or less noise is fainter; each end is the limit of an instrument changed so."""
+    """Check the sign of each change, and each end against the limit of a changed instrument."""
     asked = study(run=FEW)
     table = what_matters(asked)
     assert (np.diff(table["span"]) <= 0).all()

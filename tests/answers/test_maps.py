@@ -50,7 +50,7 @@ def alone(asked: Study, engine: Engine, x: float | str, y: float | str) -> list[
     ],
 )
 def test_each_cell_equals_its_own_detection(engine: Engine, x: dict, y: dict) -> None:
-    """To the bit, because all cells share their draws."""
+    """Compare all bits, which agree because all cells share their draws."""
     asked = study(x, y)
     found = detection_map(asked, engine)
     assert found.probability.shape == (2, len(found.y), len(found.x))
@@ -61,7 +61,7 @@ def test_each_cell_equals_its_own_detection(engine: Engine, x: dict, y: dict) ->
 
 
 def test_probability_decreases_with_magnitude(engine: Engine) -> None:
-    """A brighter star or a larger flare is seen as often or more, on common draws to the threshold's own error."""
+    """Check that brighter stars and larger flares are detected as often or more, but for the threshold's error."""
     found = detection_map(study(MAGNITUDE, AMPLITUDE), engine)
     slack = 5e-3
     assert (np.diff(found.probability, axis=2) < slack).all()

@@ -33,7 +33,7 @@ def jump(engine: Engine) -> MeasureAnswer:
 
 
 def test_correct_model_covers_and_simple_model_is_rejected(jump: MeasureAnswer) -> None:
-    """400 fits of drawn pixels. False failures: 11 quantities whose coverage is 93 to 97 %, 2e-6 each."""
+    """Fit 400 drawn exposures. 11 quantities may have a coverage of 93 to 97 %: each fails in 2e-6 of seeds."""
     simple, right = jump.flares
     assert (simple.model, right.model) == ("blackbody", "balmer")
     rows = right.rows()
@@ -87,7 +87,7 @@ def test_detected_flares_near_the_threshold_are_too_bright(engine: Engine) -> No
 @pytest.mark.long
 @pytest.mark.parametrize("amplitude", [1e-4, 0.01, 30.0])
 def test_faint_and_bright_flares_have_tables_and_pictures(amplitude: float, engine: Engine, tmp_path: Path) -> None:
-    """Without limits on one side or both, or with pixels that saturate."""
+    """Include flares without limits on one side or both, and with saturated pixels."""
     study = study_of("measure.fits=20", f"flare.amplitudes=[{amplitude}]", spectrum={"balmer_jump": 2.0})
     answer = measure(study, engine)
     assert len(answer.table) == sum(len(one.truth) for one in answer.flares)
@@ -98,7 +98,7 @@ def test_faint_and_bright_flares_have_tables_and_pictures(amplitude: float, engi
 
 @pytest.mark.long
 def test_flares_are_measured_along_a_stare(engine: Engine, tmp_path: Path) -> None:
-    """A cooling flare, in bins and by a joint fit. False failures: pulls beyond chi-squared's 1e-9 quantiles."""
+    """Measure a cooling flare in bins and by a joint fit; pulls beyond chi-squared's 1e-9 quantiles fail."""
     events = [{"peak_s": 100.0, "amplitude": 2.0, "half_width_s": 40.0, "cooling": {"end_k": 7000.0, "fold_s": 80.0}}]
     settings = (
         "measure.fits=20",
@@ -153,7 +153,7 @@ def test_joint_fits_need_one_flare(engine: Engine) -> None:
 
 
 def test_two_temperatures_are_fitted_where_the_flare_has_two(engine: Engine, tmp_path: Path) -> None:
-    """The hotter blackbody is the second one, however the flare is given; pictures have a column per model."""
+    """Check that the hotter blackbody is always the second, and that pictures have a column per model."""
     spectrum = {"second_temperature_k": 8000.0, "second_area": 20.0}
     settings = "measure.fits=20", "flare.amplitudes=[3.0]", "nuisances={}"
     answer = measure(study_of(*settings, temperature_k=30_000.0, spectrum=spectrum), engine)
@@ -226,7 +226,7 @@ def test_measure_command_writes_its_files(tmp_path: Path) -> None:
 
 
 def test_expected_regions_close(jump: MeasureAnswer) -> None:
-    """Amplitudes meet at the lowest and highest temperature, where chi-squared has risen at any amplitude."""
+    """Check that regions end where chi-squared has risen for every amplitude."""
     for one in jump.flares:
         kelvin, low, high = one.region(5.99)
         width = high - low

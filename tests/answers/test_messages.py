@@ -31,7 +31,7 @@ def test_json_has_no_nan_and_no_infinity() -> None:
 
 @pytest.mark.parametrize(("magnitude", "dark"), [(7.4, False), (20.0, False), (24.0, True), (25.0, True)])
 def test_star_without_light_is_reported(magnitude: float, dark: bool) -> None:
-    """Less than one electron in all pixels of an exposure is said; S/N of 0 does not stand without a word."""
+    """Report a star that makes less than one electron in an exposure, since its S/N is 0."""
     study = Study().with_settings([f"star=[{{library = 'G2V', magnitude = {magnitude}}}]"])
     messages = simulate(study).messages
     assert bool(of_kind(messages, "no light")) == dark

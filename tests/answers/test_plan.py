@@ -51,7 +51,7 @@ def answer(study: Study) -> PlanAnswer:
 
 
 def test_plan_numbers_are_consistent(answer: PlanAnswer) -> None:
-    """From the tables alone: hours, rates and shares give the flares, their interval and the false alarms."""
+    """Compute flares, their interval and false alarms from the tables of hours, rates and shares alone."""
     table, stars, energies = answer.table, answer.stars, answer.by_energy
     for k, name in enumerate(table["target"][:2]):
         mine = energies[energies["target"] == name]

@@ -61,7 +61,7 @@ def test_prior_that_excludes_the_expectation_is_reported(engine: Engine, verb: s
 
 
 def test_prior_that_excludes_a_swept_value_is_reported(engine: Engine) -> None:
-    """The prior contains the study's temperature, and one of the two that are swept over."""
+    """Use a prior that contains the study's temperature and one of two swept ones."""
     sweep = {"axes": [{"quantity": "detector_temperature", "values": [20.0, 10.0]}]}
     prior = {"detector_temperature": {"uniform": [18.0, 22.0]}}
     (sentence,) = said("detect", engine, processes=prior, sweep=sweep)

@@ -80,7 +80,7 @@ def question(magnitude: float, changes: dict[str, float], **sections: Any) -> St
 @pytest.mark.parametrize("verb", VERBS)
 @pytest.mark.parametrize("low_nm", [250.0, 300.0])
 def test_star_that_saturates_is_reported(engine: Engine, tmp_path: Path, verb: str, low_nm: float) -> None:
-    """Where some pixels are left, and where few or none are."""
+    """Include stars that leave some pixels, few pixels and none below saturation."""
     ask, needs = VERBS[verb]
     # A limit of magnitude searches its own star: one that no bright one satisfies.
     flare = {"flare": {"amplitudes": [1e-5]}} if verb == "limit of magnitude" else {}
@@ -94,7 +94,7 @@ def test_star_that_saturates_is_reported(engine: Engine, tmp_path: Path, verb: s
 
 @pytest.mark.parametrize("verb", ["simulate", "detect", "map", "realise", "gaussian"])
 def test_flare_that_saturates_alone_is_reported(engine: Engine, tmp_path: Path, verb: str) -> None:
-    """The star does not saturate; its flare does, and the message names the flare."""
+    """Check that the message names the flare if the star alone does not saturate."""
     ask, needs = VERBS[verb]
     range_nm = {"output_min_nm": 300.0, "output_max_nm": 340.0}
     study = question(3.3, range_nm, **(needs | {"flare": FLARING}))
@@ -106,7 +106,7 @@ def test_flare_that_saturates_alone_is_reported(engine: Engine, tmp_path: Path, 
 
 
 def test_many_messages_are_summarised(engine: Engine) -> None:
-    """A map of 64 cells, each with a flare that saturates: one on all cells, a dozen sentences, one on the others."""
+    """Summarise the saturating flares of 64 cells: a common message, a dozen single ones, and one for the rest."""
     axes = {"x": {"quantity": "amplitude", "values": [12.0 + 0.1 * n for n in range(32)]},
             "y": {"quantity": "exposure", "values": [5.0, 10.0]}}  # fmt: skip
     study = question(3.3, {"output_min_nm": 300.0, "output_max_nm": 340.0}, map=axes)

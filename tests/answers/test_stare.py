@@ -141,7 +141,7 @@ def test_lightkurve_reads_the_fits_file(found, tmp_path):
 
 @pytest.mark.long
 def test_search_finds_only_the_injected_flares(stares):
-    """False alarms: one in a star-month; three flares of S/N 8, 32 and 96, and one of 3 that may be missed."""
+    """Search flares of S/N 8, 32, 96 and 3, of which the last may be missed, at one false alarm per star-month."""
     study = Study().with_settings(
         ['star=[{library="G2V", magnitude=7.4, distance_pc=37}]', "stare.gaps=[[2500, 3000]]"]
     )

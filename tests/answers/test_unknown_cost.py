@@ -153,7 +153,7 @@ def test_page_asks_the_same_question(tmp_path: Path) -> None:
     ("text", "key"), [("dark=", "nuisance"), ("=0.1", "nuisance"), ("dark=much", "nuisances.dark"), ("dust=1", "file")]
 )
 def test_invalid_nuisances_raise(text: str, key: str) -> None:
-    """Without a value, a name, a number, or a file of that name."""
+    """Refuse nuisances without a value, a name or a number, and missing files."""
     with refused(key):
         detect(Study().with_changes({"nuisances": nuisances_of(Study(), [text])}, None))
 
@@ -167,7 +167,7 @@ def test_invalid_nuisance_flags_name_the_flag(flag: str, tmp_path: Path) -> None
 
 
 def test_usual_unknowns_follow_the_observation() -> None:
-    """Around the study's own temperature; what it draws itself stays; without a sky none is unknown."""
+    """Check that they are centred on the study's temperature, and that the study's own processes stay."""
     asked = study(usual=True).with_settings(
         ["observation.temperature_c=13", "processes.jitter={uniform=[0.0, 0.01]}", "nuisances.dark=0.3"]
     )
@@ -194,7 +194,7 @@ def test_documentation_lists_the_usual_unknowns() -> None:
 
 
 def test_priors_are_drawn_jointly_on_both_instruments() -> None:
-    """Priors are refused where noise must be drawn apart: nobody meets that here, at any usual setting."""
+    """Check that no usual setting needs noise to be drawn separately, which priors do not allow."""
     payloads, temperatures = ("mauve", "mauve-electrons"), (-20.0, 0.0, 13.0, 21.0, 25.0)
     for payload, temperature, exposure in itertools.product(payloads, temperatures, (5.0, 50.0, 600.0)):
         mauve = instrument(payload, part=True, temperature_c=temperature, output_max_nm=310.0)
@@ -212,7 +212,7 @@ SEEDS = itertools.count(2026)
 
 @pytest.mark.long
 def test_false_alarms_with_drawn_unknowns_are_as_requested(engine: Engine) -> None:
-    """40 random scenes with the documented unknowns drawn, 2e4 draws each.
+    """Draw the documented unknowns in 40 random scenes, 2e4 times each.
 
     Marginalised: the simulated threshold on fresh draws, for which its own error counts as much as theirs, for every
     statistic; and what the closed form, which integrates over what is drawn, says of that threshold. Of 40 comparisons
@@ -257,7 +257,7 @@ def test_false_alarms_with_drawn_unknowns_are_as_requested(engine: Engine) -> No
 
 
 def test_table_has_a_picture(tmp_path: Path) -> None:
-    """The table repeats a row of METHODS section 7, and the smallest amplitude has the requested power."""
+    """Compare a row with METHODS section 7, and check the power at the smallest amplitude."""
     found = unknown_table(study())
     rows = {row["unknown"]: row for row in found.table}
     assert rows["the dark level (+-0.1 deg C)"]["marginalised"] == pytest.approx(3.06, rel=0.01)

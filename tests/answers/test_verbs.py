@@ -42,7 +42,7 @@ def test_command_line_has_every_verb_in_order() -> None:
 
 @pytest.mark.parametrize("name", QUICK)
 def test_progress_ends_at_its_total(name: str, engine: Engine) -> None:
-    """By the positions of the arguments, which are the same for all verbs."""
+    """Pass all arguments by position, since all verbs have the same."""
     seen: list[tuple[int, int]] = []
     drawing = None if name == "plan" else engine
     answer = VERBS[name].ask(Study().with_settings(FEW + QUICK[name]), drawing, lambda *told: seen.append(told))

@@ -43,7 +43,7 @@ def test_tables_give_the_same_hours(found: VisibleAnswer) -> None:
 
 
 def test_windows_by_orbit(found: VisibleAnswer) -> None:
-    """About one window an orbit, and a mean orbit's exposure."""
+    """Check that there is about one window per orbit, as long as the mean exposure."""
     table = found.window_table
     mine = table[table["target"] == "eps Eri"]
     assert (np.diff(mine["orbit"]) >= 0).all()
@@ -95,7 +95,7 @@ def test_calendar_near_the_epoch_has_windows() -> None:
 
 
 def test_calendar_escapes_any_text() -> None:
-    """Long names, commas, other alphabets."""
+    """Include long names, commas and other alphabets."""
     entry = Entry("2027-01-01", "2027-01-02", "α Cen; " + "long, " * 30, "two\nlines \\ and more")
     content = calendar_bytes([entry], "a, b")
     assert max(map(len, content.split(b"\r\n"))) <= 75

@@ -26,7 +26,7 @@ NUISANCES: dict[str, dict[str, Any]] = {
 def test_lowered_statistic_is_reported_if_simulation_lowers_it(
     engine: Engine, unknown: str, temperature_k: float
 ) -> None:
-    """By the simulated means, where they differ by more than five standard errors: by chance once in 1e6."""
+    """Compare with simulated means that differ by more than five standard errors; fails once in 1e6 seeds."""
     study = small(
         star=[{"library": "G2V", "magnitude": 7.4}],
         flare={"amplitudes": [0.3], "temperature_k": temperature_k},
@@ -46,7 +46,7 @@ def test_lowered_statistic_is_reported_if_simulation_lowers_it(
 
 
 def test_cases_include_lowered_and_raised_statistics(engine: Engine) -> None:
-    """The test above meets both, and a lowered one has no detections where matched has all."""
+    """Check that the test above meets both, and that a lowered statistic detects nothing."""
     found = {}
     for temperature_k in (4000.0, 10_000.0):
         study = small(
@@ -65,7 +65,7 @@ def test_cases_include_lowered_and_raised_statistics(engine: Engine) -> None:
 
 @pytest.mark.parametrize("temperature_k", [4000.0, 10_000.0])
 def test_maps_and_limits_report_the_same_as_detect(engine: Engine, temperature_k: float) -> None:
-    """In every cell of a map the same as `detect`, and a limit that cannot be has it as the cause."""
+    """Compare the messages of all cells of a map with `detect`, and the stated cause of an impossible limit."""
     sections = {
         "star": [{"library": "G2V", "magnitude": 7.4}],
         "flare": {"amplitudes": [0.3], "temperature_k": temperature_k},

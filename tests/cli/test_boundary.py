@@ -116,7 +116,7 @@ def test_names_are_not_parsed_as_markup(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("path", [None, ""])
 def test_linker_is_found_without_path(path: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """PoCL looks for it on PATH alone, and ends the process where it finds none."""
+    """Find the linker although PATH is unset, since PoCL would end the process."""
     from mauvecl.device.program import load_opencl
 
     monkeypatch.setenv("PATH", "x")
@@ -159,7 +159,7 @@ def refused(*words: str, folder: Path) -> str:
     ids=lambda words: words[-1],
 )
 def test_invalid_file_names_exit_with_code_2(words: tuple[str, ...], name: str, tmp_path: Path) -> None:
-    """Over-long names were OSError 36."""
+    """Refuse over-long names, which raised OSError 36."""
     refused(*words, name, folder=tmp_path)
 
 
@@ -202,7 +202,7 @@ def test_extreme_numbers_in_instruments_raise(tmp_path: Path) -> None:
     ids=["arrays", "tables", "a dotted key", "a dotted table", "a few more than any study"],
 )
 def test_deep_nesting_is_refused(text: str, tmp_path: Path) -> None:
-    """RecursionError, or 3.8 GB for a key of 50000 parts."""
+    """Refuse keys of 50 000 parts, which raised RecursionError or took 3.8 GB."""
     (tmp_path / "deep.toml").write_text(text)
     refused("simulate", "deep.toml", folder=tmp_path)
     refused(*OBSERVE, "--instrument", "deep.toml", folder=tmp_path)
@@ -210,7 +210,7 @@ def test_deep_nesting_is_refused(text: str, tmp_path: Path) -> None:
 
 
 def test_too_many_frames_are_refused(tmp_path: Path) -> None:
-    """Frames of a nanosecond overflowed the kernels' 32 bits."""
+    """Refuse frames of a nanosecond, whose number overflowed the kernels' 32 bits."""
     assert "frames" in refused(*OBSERVE, "--set", "observation.changes.frame_s=1e-9", folder=tmp_path)
 
 
@@ -226,7 +226,7 @@ def test_long_chains_of_instruments_are_refused(tmp_path: Path) -> None:
     "content", ["[" * 100_000, "null", "[]", '{"attributes": []}', '{"attributes": {"study": "a = 1e999"}}']
 )
 def test_invalid_manifests_are_refused(content: str, tmp_path: Path) -> None:
-    """Nested JSON raised RecursionError. A manifest alone is foreign; next to shards it is a damaged one of mauvecl."""
+    """Refuse nested JSON. A manifest without shards is foreign; one next to shards is a damaged one of mauvecl."""
     for folder, name in (("store", "zarr.json"), ("run/checkpoint", "manifest.json")):
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / name).write_text(content)
@@ -245,7 +245,7 @@ def test_invalid_manifests_are_refused(content: str, tmp_path: Path) -> None:
 
 
 def test_only_regular_files_are_read(tmp_path: Path) -> None:
-    """/dev/zero took all memory, and a pipe was waited for without end."""
+    """Refuse /dev/zero, which took all memory, and pipes, which were waited for without end."""
     os.mkfifo(tmp_path / "pipe")
     for kind in ("toml", "ecsv", "csv", "txt"):
         (tmp_path / f"zero.{kind}").symlink_to("/dev/zero")
@@ -295,7 +295,7 @@ def test_unusable_weights_raise(weights: str, tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_output_that_is_a_folder_is_refused(tmp_path: Path) -> None:
-    """IsADirectoryError."""
+    """Refuse a folder in place of a file, which raised IsADirectoryError."""
     for name in ("study.toml", "observation-1.fits", "observation-1.ecsv", "run.json"):
         (tmp_path / name / name).mkdir(parents=True)
         refused(*OBSERVE, "-o", name, folder=tmp_path)
@@ -324,7 +324,7 @@ def test_invalid_collection_addresses_are_refused(address: str, tmp_path: Path) 
 
 
 def test_two_flags_for_one_key_are_refused(tmp_path: Path) -> None:
-    """--flares was silently ignored if -a was given."""
+    """Refuse --flares with -a, of which one was silently ignored."""
     (tmp_path / "flares.csv").write_text("amplitude\n0.1\n")
     assert "--flares and --amplitude" in refused(*DETECT, "--flares", "flares.csv", folder=tmp_path)
 
@@ -369,7 +369,7 @@ def test_duration_is_estimated_for_local_runs_only() -> None:
 
 
 def test_stores_larger_than_the_disk_need_insist(tmp_path: Path) -> None:
-    """`realise -n 1e12` are petabytes; it began."""
+    """Refuse `realise -n 1e12`, which needs petabytes."""
     words = ("realise", "--star", "G2V", "-m", "7", "-a", "0.1", "-t", "5")
     usage = mock.Mock(free=10 << 20)
     with mock.patch.object(foresight.shutil, "disk_usage", return_value=usage):

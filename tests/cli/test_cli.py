@@ -98,7 +98,7 @@ def test_detect_writes_files_and_record(answered: tuple[Path, str]) -> None:
 
 @pytest.mark.long
 def test_detect_takes_all_statistics(tmp_path: Path) -> None:
-    """Six statistics against noisy exposures and by estimated variances, and the study that says so."""
+    """Ask for six statistics with noisy references and estimated variances, and read the written study."""
     words = ("detect", "--star", "G2V", "-m", "7.4", "-a", "0.1", "-n", "20000", "--fap", "0.01", "--no-pictures")
     shown = run(*words, "--statistic", "all", "--reference", "stack:3", "--variances", "estimated", folder=tmp_path)
     for statistic in STATISTICS:
@@ -144,7 +144,7 @@ def test_study_defines_weights(tmp_path: Path, engine: Engine) -> None:
 
 
 def test_flags_override_the_study_file(tmp_path: Path) -> None:
-    """A user's own spectrum named in a study, with flags on top; JSON alone on standard output."""
+    """Combine a study with the user's own spectrum and flags; with --json, standard output holds nothing else."""
     wavelength = np.arange(170.0, 1100.0, 2.0)
     np.savetxt(tmp_path / "mine.txt", np.column_stack([wavelength, 1e-11 * np.ones_like(wavelength)]))
     (tmp_path / "study.toml").write_text(
@@ -193,7 +193,7 @@ fap = 0.1
 
 @pytest.mark.long
 def test_study_has_processes(tmp_path: Path, engine: Engine) -> None:
-    """As the engine given them in Python, and written back as they were read."""
+    """Compare with the engine's processes in Python, and with the study that is written back."""
     (tmp_path / "study.toml").write_text(PROCESSES)
     study = Study.read(tmp_path / "study.toml")
     processes = Processes(
@@ -241,7 +241,7 @@ def test_simulation_equals_the_realisation_of_the_engine() -> None:
 
 @pytest.mark.long
 def test_components_of_a_simulation_have_their_variances() -> None:
-    """Photon and read noise apart: 197 pixels x 30 realisations, each sum of squares within 5 standard errors."""
+    """Compare photon and read noise separately: 197 pixels x 30 realisations, within 5 standard errors."""
     from scenes import instrument, star
 
     from mauvecl.noise.components import components
@@ -268,7 +268,7 @@ def test_snr_writes_its_tables(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_snr_answers_the_budgets_of_the_paper_and_sweeps(tmp_path: Path) -> None:
-    """Without arguments the paper's three stars at 50 s and 600 s; with a sweep every combination, or a list."""
+    """Check the paper's three stars without arguments, and all combinations and lists of a sweep."""
     shown = run("snr", "-n", "500", folder=tmp_path).stdout
     for name in ("B2IV V = 3.03", "K3V V = 3.7", "G2V V = 7.4"):
         assert len([line for line in shown.splitlines() if name in line and " 600 " in line]) == 8
@@ -310,7 +310,7 @@ def test_wrong_template_loses_snr(engine: Engine) -> None:
 
 
 def test_limit_writes_its_table(tmp_path: Path) -> None:
-    """The table, its files, and the study that gives the same bits again."""
+    """Check the table, its files, and that the written study gives the same bits."""
     words = ("--star", "G2V", "-a", "0.24", "-n", "20000", "--fap", "0.01", "--statistic", "matched")
     shown = run("limit", *words, folder=tmp_path).stdout
     assert "Limit of magnitude" in shown
@@ -404,7 +404,7 @@ LONG = (
 
 @pytest.mark.long
 def test_interrupted_run_is_resumed_to_the_same_bits(tmp_path: Path) -> None:
-    """Ctrl-C, the end of a batch job, kill -9: each next run goes on, and the last writes the tables of one alone."""
+    """Resume after Ctrl-C, SIGTERM and SIGKILL; the last run writes the tables of an undisturbed one."""
     command, shards, kept = [*SMALL_SHARDS, *LONG, "--resume", "--keep-after", "0"], tmp_path / "out" / "checkpoint", 0
 
     def counted() -> int:
@@ -442,7 +442,7 @@ def test_import_loads_no_heavy_package() -> None:
 
 
 def test_help_imports_no_study() -> None:
-    """Models of a study take longer to build than all else that `mauvecl --help` does."""
+    """Check that `mauvecl --help` does not build the models of a study, which would take most of its time."""
     code = "import sys; sys.argv[1:] = ['--help']; from mauvecl.cli.app import app; app(standalone_mode=False)"
     code += "; print('pydantic' in sys.modules, 'mauvecl.study.study' in sys.modules)"
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

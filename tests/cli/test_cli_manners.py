@@ -42,7 +42,7 @@ def test_help_has_an_example(name: str) -> None:
 
 
 def test_list_of_verbs_is_not_truncated() -> None:
-    """The first sentence of each fits into 80 columns: none ends in dots."""
+    """Check that the first sentence of each verb fits into 80 columns."""
     shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "80"}).output
     assert "Commands:" in shown
     assert "..." not in shown.partition("Commands:")[2]
@@ -50,7 +50,7 @@ def test_list_of_verbs_is_not_truncated() -> None:
 
 @pytest.mark.parametrize("name", VERBS)
 def test_defaults_in_help_equal_those_of_the_study(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each verb without arguments, up to the study that it would answer."""
+    """Run each verb without arguments as far as its study."""
     asked: list[Study] = []
 
     def noted(study: Study, **_: Any) -> None:
@@ -119,7 +119,7 @@ def test_pipes_have_no_colour_and_errors_go_to_stderr(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_json_is_alone_on_standard_output(tmp_path: Path) -> None:
-    """What OpenCL drivers print goes past Python: hence a process of its own."""
+    """Run a separate process, because OpenCL drivers do not print through Python."""
     words = (
         "detect",
         "--star",
@@ -185,7 +185,7 @@ for words in json.loads(sys.argv[1]):
 
 
 def test_mistakes_load_no_heavy_package(tmp_path: Path) -> None:
-    """What a user waits for after a typing error is imports, and nothing else: none of those that take long."""
+    """Check that an error appears before any package is imported that takes long."""
     code = TRIED.replace("HEAVY", repr(HEAVY))
     asked = [["--version"], *MISTAKES]
     done = subprocess.run(

@@ -25,7 +25,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 def test_time_left_is_unknown_after_few_realisations(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
-    """The first tile's rate says little: 1 of 1e12 in 11 s would be 348 thousand years."""
+    """Wait for more than the first tile, by whose rate 1e12 realisations would take 348 000 years."""
     with Meter() as meter:
         for done in (0, 1):
             meter(done, 10**12)
@@ -49,7 +49,7 @@ def test_time_left_is_estimated(done: int, left: str, clock: Clock, capsys: pyte
 
 
 def test_late_progress_is_ignored(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
-    """A smaller number of the same work is old news: the rate goes on from the beginning."""
+    """Ignore a smaller number than before; the rate continues from the start."""
     with Meter() as meter:
         meter(0, 1000)
         for done in (400, 390, 500):

@@ -52,7 +52,7 @@ def full_from(step: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_answer_is_printed_if_the_disk_is_full(
     verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Nothing is written, nothing half written, and a table that was there is still there."""
+    """Check that no file is incomplete and that an earlier table is unchanged."""
     out = tmp_path / "out"
     out.mkdir()
     (out / f"{verb}.ecsv").write_text("of an earlier run")
@@ -68,7 +68,7 @@ def test_answer_is_printed_if_the_disk_is_full(
 def test_each_file_is_whole_or_missing_if_the_disk_fills(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Those before it are as ever, those after it as they were."""
+    """Check that earlier files are complete and later ones unchanged."""
     words = [*VERBS["simulate"], "--no-pictures", "--output"]
     app([*words, str(tmp_path / "whole")], standalone_mode=False)
     plain = capsys.readouterr().out
@@ -117,7 +117,7 @@ def test_export_to_a_full_disk_keeps_the_earlier_file(name: str, small_disk: Pat
 
 
 def test_output_folder_is_locked_while_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tables too, and of verbs that draw nothing."""
+    """Include verbs that draw nothing."""
     out = tmp_path / "out"
     out.mkdir()
     with locked(out, "output folder"), refused("lock"):
@@ -208,7 +208,7 @@ def names(folder: Path) -> set[str]:
 
 @pytest.mark.long
 def test_files_of_the_previous_run_are_removed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Pictures and tables of the run before are removed, what a user changed or put there is not."""
+    """Remove pictures and tables of the previous run, but not the files of the user."""
     out = tmp_path / "out"
     app(["simulate", "--star", "G2V", "--star", "K3V", "-m", "7", "-t", "5", "-o", str(out)], standalone_mode=False)
     assert {"observation-2.ecsv", "observation-2.png", "observation-1.png"} <= names(out)

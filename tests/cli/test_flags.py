@@ -38,7 +38,7 @@ def all_flags() -> dict[str, dict[str, Any]]:
 
 
 def test_flags_equal_those_of_the_file() -> None:
-    """To accept a change: python tests/cli/test_flags.py."""
+    """Compare with the file; `python tests/cli/test_flags.py` accepts a change."""
     assert all_flags() == json.loads(FILE.read_text(encoding="utf-8"))
 
 

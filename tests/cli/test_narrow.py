@@ -48,7 +48,7 @@ def test_help_fits_80_columns(words: tuple[str, ...], tmp_path: Path, monkeypatc
 def test_parts_of_a_table_repeat_only_the_labels(
     labels: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Months of a year in 80 columns: each month once, and in each part what its rows are."""
+    """Print a year in 80 columns: each month occurs once, and each part repeats the labels of its rows."""
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setenv("FORCE_COLOR", "1")
     months = [f"2027-{month:02d}" for month in range(1, 13)]

@@ -41,7 +41,7 @@ def test_plan_writes_its_files(tmp_path: Path) -> None:
 
 
 def test_table_of_targets_is_distinguished_from_an_answer(tmp_path: Path) -> None:
-    """As `mauvecl plan targets.ecsv` takes it: only what an answer wrote holds a study."""
+    """Accept both in place of a study file; only the table of an answer holds a study."""
     for name, meta in (("targets", {}), ("plan", {"study": "[plan]"})):
         Table({"name": ["eps Eri"]}, meta=meta).write(tmp_path / f"{name}.ecsv")
     assert not holds_study(tmp_path / "targets.ecsv")

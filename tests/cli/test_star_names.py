@@ -31,7 +31,7 @@ def spectrum(folder: Path, name: str) -> str:
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_star_is_accepted_in_place_of_the_study(verb: str, tmp_path: Path) -> None:
-    """Every verb takes one as far as its magnitude, which is wrong here."""
+    """Give every verb a star with a wrong magnitude, which its message names."""
     for star in ("G2V,M3V", spectrum(tmp_path, "noname")):
         code, _, told = ended(verb, star, "-m", "99", folder=tmp_path)
         assert (code, told) == (2, "mauvecl: --magnitude 99.0, expected -30 to 40 mag\n"), star

@@ -47,7 +47,7 @@ def numeric() -> list[tuple[str, str]]:
 
 
 def test_every_numeric_flag_refuses_text(tmp_path: Path) -> None:
-    """One sentence with the flag, the value and what was expected, whatever flag has no number behind it."""
+    """Check that the message has flag, value and expectation for every numeric flag."""
     flags = numeric()
     assert len(flags) > 60
     for flag, verb in sorted({flag: verb for verb, flag in flags}.items()):

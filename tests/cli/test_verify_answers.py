@@ -36,7 +36,7 @@ def ask(verb: str, folder: Path) -> Path:
 @pytest.mark.long
 @pytest.mark.parametrize("verb", [*VERBS, *MORE])
 def test_every_changed_or_missing_file_is_noticed(verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of every verb; without the packages for stores."""
+    """Check every verb, also without the packages for stores."""
     for package in ("zarr", "h5py", "xarray"):
         monkeypatch.setitem(sys.modules, package, None)
     out = ask(verb, tmp_path)
@@ -58,7 +58,7 @@ def test_every_changed_or_missing_file_is_noticed(verb: str, tmp_path: Path, mon
 
 
 def test_study_of_the_user_is_not_an_answer(tmp_path: Path) -> None:
-    """A study next to a user's own table was written by no run: nothing is missing there."""
+    """Report nothing for a user's study and table, which no run wrote."""
     (tmp_path / "study.toml").write_text("[run]\nfap = 0.01\n", encoding="utf-8")
     header = "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: amplitude, datatype: float64}\n"
     (tmp_path / "flares.ecsv").write_text(f"{header}amplitude\n0.1\n", encoding="utf-8")
@@ -68,7 +68,7 @@ def test_study_of_the_user_is_not_an_answer(tmp_path: Path) -> None:
 
 
 def test_every_value_of_the_record_is_verified(tmp_path: Path) -> None:
-    """Each entry of the record changed or removed, and digests of files changed along with the files."""
+    """Change and remove each entry of the record, and digests together with their files."""
     out = ask("exposure", tmp_path)
     place = out / "run.json"
     text = place.read_text(encoding="utf-8")
@@ -86,7 +86,7 @@ def test_every_value_of_the_record_is_verified(tmp_path: Path) -> None:
 
 
 def test_verify_refuses_foreign_folders(tmp_path: Path) -> None:
-    """Flags of stores are refused for an answer, and a folder of neither kind is; files of a user do not matter."""
+    """Refuse flags of stores for an answer, and folders that hold neither; other files have no effect."""
     out = ask("exposure", tmp_path)
     (out / "notes.txt").write_text("mine", encoding="utf-8")
     assert verify_answer(out) == []
@@ -97,7 +97,7 @@ def test_verify_refuses_foreign_folders(tmp_path: Path) -> None:
 
 
 def test_repeated_run_is_verified(tmp_path: Path) -> None:
-    """Another answer in the same folder takes the place of the first with its digests."""
+    """Replace an answer and its digests by another answer in the same folder."""
     out = ask("exposure", tmp_path)
     first = json.loads((out / "run.json").read_text(encoding="utf-8"))
     run(*VERBS["exposure"], "--no-pictures", "--set", "run.seed=5", "--output", "out", folder=tmp_path)

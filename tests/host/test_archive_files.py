@@ -122,7 +122,7 @@ def test_short_spectra_need_an_extension(name: str, options: dict[str, Any], sen
 
 
 def test_short_spectra_suffice_for_a_narrower_range() -> None:
-    """VB 8 from 290 nm, for an instrument from 350 nm: the same light as extended by another star."""
+    """Compare VB 8, which starts at 290 nm, with its extension by another star, for an instrument from 350 nm."""
     red = Instrument.load("mauve").with_(output_min_nm=350.0)
     short, extended = (Source.read(HERE / "vb8_stiswfcnic_004.fits", extend=one) for one in (None, "M3V"))
     one, other = (expect(star, red, exposure=5.0) for star in (short, extended))
@@ -143,7 +143,7 @@ def test_messages_of_archive_files() -> None:
 
 
 def test_start_and_step_in_one_row() -> None:
-    """IUE's file: 640 fluxes from 1750 A in steps of 2.662668 A, zero from 3350 A on."""
+    """Read IUE's 640 fluxes from 1750 A in steps of 2.662668 A, which are zero from 3350 A."""
     read = read_spectrum(HERE / "lwp11854.mxlo")
     with fits.open(HERE / "lwp11854.mxlo") as hdus:
         row = hdus[1].data[0]
@@ -154,7 +154,7 @@ def test_start_and_step_in_one_row() -> None:
 
 
 def test_gaia_arrays_in_a_cell() -> None:
-    """336 + 2 i nm, W m-2 nm-1: 100 erg s-1 cm-2 A-1 each."""
+    """Read fluxes of 100 erg s-1 cm-2 A-1 at 336 + 2 i nm from W m-2 nm-1."""
     star = Source.read(f"{HERE / 'XP_SAMPLED_RAW_dr3int6.csv'}[4]", extend="K5V")
     with (HERE / "XP_SAMPLED_RAW_dr3int6.csv").open() as file:
         row = next(row for row in csv.DictReader(file) if row["source_id"] == "4")
@@ -177,7 +177,7 @@ def test_surface_or_relative_fluxes_need_a_magnitude() -> None:
 
 
 def test_calspec_files_that_start_within_the_line_function_are_continued() -> None:
-    """Three start at 180.02-180.10 nm and P330E at 199.95: a whole file, cut there."""
+    """Cut a whole file where three of CALSPEC's begin (180.02-180.10 nm) and P330E does (199.95 nm)."""
     star = Source.read(HERE / "18sco_stis_004.fits")
     mauve = Instrument.load("mauve")
     whole = expect(star, mauve, exposure=50.0)

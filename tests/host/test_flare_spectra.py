@@ -84,7 +84,7 @@ def test_relative_lines_carry_their_fraction_and_absolute_ones_their_flux() -> N
 
 
 def test_balmer_lines_have_the_wavelengths_of_hydrogen() -> None:
-    """Rydberg constant of hydrogen, 1.09677583e7 m-1 (CODATA)."""
+    """Compare with the Rydberg constant of hydrogen, 1.09677583e7 m-1 (CODATA)."""
     for n, name in enumerate(("H alpha", "H beta", "H gamma", "H delta", "H epsilon", "H8"), 3):
         assert LINES_NM[name] == pytest.approx(1e9 / (1.09677583e7 * (0.25 - 1 / n**2)), abs=0.02)
     assert EmissionLine.named("h_ALPHA").wavelengths_nm == (LINES_NM["H alpha"],)
@@ -92,7 +92,7 @@ def test_balmer_lines_have_the_wavelengths_of_hydrogen() -> None:
 
 
 def test_great_flare_of_ad_leo_is_read() -> None:
-    """The numbers of the published spectra at 912 and 1497 s: colours, the ultraviolet."""
+    """Compare colours and ultraviolet of the published spectra at 912 and 1497 s."""
     for seconds, ratio, ultraviolet in ((912, 1.41, 4.0e-9), (1497, 1.96, 9.2e-10)):
         flare = ad_leo(seconds)
         near = [np.mean(flare.flux(np.linspace(a, b, 201))) for a, b in ((359.5, 363.5), (415.0, 419.0))]

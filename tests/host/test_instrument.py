@@ -192,7 +192,7 @@ def curve_file(tmp_path: Path, length: str, value: str, wavelengths: str = "2000
 def test_curve_units_in_any_spelling(
     tmp_path: Path, length: str, value: str, wavelengths: str, expected: float
 ) -> None:
-    """Where A is Angstrom of a wavelength and ampere of a sensitivity."""
+    """Read A as Angstrom of a wavelength and as ampere of a sensitivity."""
     curve = Curve.read(curve_file(tmp_path, length, value, wavelengths))
     np.testing.assert_allclose(curve.wavelength_nm, [200.0, 500.0, 800.0])
     np.testing.assert_allclose(curve.value, expected)
@@ -214,7 +214,7 @@ def test_spectrum_as_curve_raises(tmp_path: Path, length: str, value: str, refus
 
 @pytest.mark.parametrize("name", CURVES)
 def test_instrument_without_throughput_raises(name: str) -> None:
-    """By any curve that is 0 over the band, or by two that are 0 where the other is not: every S/N would be 0."""
+    """Refuse a curve that is 0 over the band, and two curves of which one is always 0, since all S/N would be 0."""
     mauve = Instrument.load("mauve")
     with refused("throughput"):
         mauve.with_(**{name: 0.0})

@@ -29,14 +29,14 @@ def near_ultraviolet(name: str) -> float:
 
 
 def test_library_stars_agree_with_their_neighbours() -> None:
-    """From G5V to M4V the ratio falls by class; one twice its warmer neighbour would be a fault of its file."""
+    """Check that the ratio falls with class from G5V to M4V; a ratio twice the warmer neighbour's is a fault."""
     order = ["G5V", "G8V", "K1V", "K2.5V", "K5V", "K6V", "M0V", "M1V", "M3V", "M4V"]
     ratios = [near_ultraviolet(name) for name in order]
     assert all(own < 2 * warm for warm, own in pairwise(ratios))
 
 
 def test_noise_dominated_ultraviolet_is_reported() -> None:
-    """M5V and M6V are brighter at 300 nm than M4V: their files say that this is noise, and so does every answer."""
+    """Report the ultraviolet of M5V and M6V, which is brighter than M4V's because of noise."""
     limits = {"M0V": 0.0, "M1V": 240.0, "M3V": 0.0, "M4V": 240.0, "M5V": 300.0, "M6V": 300.0}
     for name, limit in limits.items():
         told = Source.from_library(name).messages
@@ -55,7 +55,7 @@ def test_noise_dominated_ultraviolet_is_reported() -> None:
 
 
 def test_colours_are_those_of_the_classes() -> None:
-    """B - V of Pickles' own table (1998, table 2) to 0.03, Vega's zero, and red stars red in Gaia's colour."""
+    """Compare B - V with Pickles (1998, table 2) to 0.03, and check Vega's zero and Gaia's colour of red stars."""
     for name, colour in (("B5V", -0.14), ("A5V", 0.17), ("F0V", 0.31), ("G0V", 0.59), ("G2V", 0.63), ("G5V", 0.68)):
         star = Source.from_library(name)
         assert star.magnitude("B") - star.magnitude("V") == pytest.approx(colour, abs=0.03)
@@ -75,14 +75,14 @@ def test_each_star_has_a_photosphere_temperature_with_source() -> None:
 
 
 def test_galex_in_both_systems() -> None:
-    """AB less Vega is 1.64 by this Vega and curve; catalogues' conversions say 1.70 (Bianchi 2011)."""
+    """Compare AB less Vega, 1.64 with this Vega and curve, with the 1.70 of catalogues (Bianchi 2011)."""
     star = Source.from_library("G2V").at_magnitude(12.0, "GALEX NUV Vega")
     assert star.magnitude("GALEX NUV", "vega") == pytest.approx(12.0, abs=1e-6)
     assert star.magnitude("GALEX NUV") - 12.0 == pytest.approx(1.69, abs=0.08)
 
 
 def test_unscaled_library_star_needs_a_magnitude() -> None:
-    """Templates are kept at V = 0, and would be as bright as Vega; Vega itself is as it is seen."""
+    """Require a magnitude for templates, which are kept at V = 0; Vega itself needs none."""
     mauve = Instrument.load("mauve")
     for row in catalogue.library_table():
         star = Source.from_library(row["name"])
@@ -112,12 +112,12 @@ def test_bands_state_source_and_system(name: str) -> None:
 
 
 def test_magnitude_of_the_sun() -> None:
-    """V = -26.76 +- 0.02 (Willmer 2018): ties Vega, the band and the absolute scale together."""
+    """Compare with V = -26.76 +- 0.02 (Willmer 2018), which ties Vega, band and absolute scale together."""
     assert Source.from_library("Sun").magnitude("V") == pytest.approx(-26.76, abs=0.02)
 
 
 def test_response_of_v_is_per_photon() -> None:
-    """Pickles spectra come normalised to V = 0: per photon they agree in every class, per energy they do not."""
+    """Check that Pickles spectra, normalised to V = 0, agree in every class only for photons."""
     v, vega = bands.band("V"), Source.from_library("Vega")
 
     def magnitude(star: Source, power: int) -> float:
@@ -139,7 +139,7 @@ def test_response_of_v_is_per_photon() -> None:
 
 
 def test_every_spectrum_and_band_names_its_source_file() -> None:
-    """By package, wheel and digests, as the headers' own words have it."""
+    """Check package, wheel and digests as in the headers of the files."""
     library = Path(catalogue.__file__).parent / "library"
     table = Table.read(library / "inputs.ecsv", format="ascii.ecsv")
     assert all(re.fullmatch("[0-9a-f]{64}", digest) for digest in (*table["sha256"], *table.meta["wheels"].values()))

@@ -52,7 +52,7 @@ def test_light_and_noise_equal_those_of_the_summed_spectrum(share: float) -> Non
 
 
 def test_flare_snr_equals_that_of_the_summed_spectrum() -> None:
-    """The matched filter has the S/N sqrt(sum(delta^2 / v)), v with the photons of all stars."""
+    """Compare with sqrt(sum(delta^2 / v)), where v includes the photons of all stars."""
     quiet, flare, whole = seen(STAR, B, C), seen(STAR.flaring(0.081), B, C), seen(blend(1.0))
     delta = seen(STAR.flaring(0.081)).recorded_light_dn - seen(STAR).recorded_light_dn
     expected = np.sqrt(np.sum(delta**2 / whole.variance_dn2))
@@ -62,7 +62,7 @@ def test_flare_snr_equals_that_of_the_summed_spectrum() -> None:
 
 
 def test_dilution_follows_from_magnitudes() -> None:
-    """Stars of one type share the light as their magnitudes say."""
+    """Check that stars of one type share the light by their magnitudes."""
     x = seen(STAR, Neighbour("twin", 1.0, 8.4, "V", "G2V"), Neighbour("faint", 1.0, 9.9, "V", "G2V"), share=0.5)
     assert x.target_share == pytest.approx(1 / (1 + 0.5 * (10**-0.4 + 10**-1.0)), rel=1e-9)
 

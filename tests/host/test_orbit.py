@@ -43,7 +43,7 @@ def verification() -> list[tuple[str, str, list[list[float]]]]:
 
 
 def test_positions_equal_those_of_the_sgp4_verification() -> None:
-    """Of the satellites whose lines have right checksums: the gravity model and the reading of each field."""
+    """Check gravity model and fields with all satellites whose lines have correct checksums."""
     seen = 0
     for first, second, rows in verification():
         try:
@@ -59,7 +59,7 @@ def test_positions_equal_those_of_the_sgp4_verification() -> None:
 
 
 def test_track_matches_the_verification_vectors() -> None:
-    """A satellite in low orbit, by the times of a plan: the text of its epoch is good to 20 m."""
+    """Compare a low orbit at the times of a plan; the text of its epoch is accurate to 20 m."""
     first, second, rows = next(one for one in verification() if one[0][2:7] == "06251")
     elements = Elements(first, second, "SGP4-VER")
     minutes = np.array([row[0] for row in rows])
@@ -92,7 +92,7 @@ def test_frames_agree_with_astropy(day: Track) -> None:
 
 @pytest.mark.long
 def test_orbit_has_the_documented_values(orbit: Orbit, day: Track) -> None:
-    """TIME.md, section 5."""
+    """Compare with TIME.md, section 5."""
     from mauvecl.host.orbit.radiation import proton_map
     from mauvecl.host.orbit.visibility import in_shadow
 
@@ -117,7 +117,7 @@ def test_orbit_has_the_documented_values(orbit: Orbit, day: Track) -> None:
 
 
 def test_mean_orbit_begins_at_the_satellite(orbit: Orbit) -> None:
-    """It begins where SGP4 has the satellite, keeps its local time, and says what it is."""
+    """Check that it begins at SGP4's position, keeps its local time, and is described as a mean orbit."""
     near = TimeGrid("2026-09-14T15:00", 0.1, 30.0)
     mean, exact = (Orbit(orbit.elements, kind).track(near) for kind in ("mean", "tle"))
     apart = np.linalg.norm(mean.of_date_km - exact.of_date_km, axis=1)
@@ -131,7 +131,7 @@ def test_mean_orbit_begins_at_the_satellite(orbit: Orbit) -> None:
 
 
 def test_mean_orbit_follows_sgp4_for_a_fortnight(orbit: Orbit) -> None:
-    """Its node, and its place along the orbit but for drag, which SGP4 has and it has not."""
+    """Compare node and place along the orbit, except for drag, which only SGP4 has."""
     fortnight = TimeGrid("2026-09-28T00:00", 0.1, 30.0)
     mean, exact = (Orbit(orbit.elements, kind).track(fortnight) for kind in ("mean", "tle"))
     assert np.degrees(np.arccos((mean.normal * exact.normal).sum(axis=1))).max() < 0.1
@@ -170,7 +170,7 @@ def test_elements_from_a_file(tmp_path: Path, orbit: Orbit) -> None:
 
 @pytest.mark.parametrize("start", ["2027-01-01", "2027-01-01T11:59:59", "2027-01-01T12:00:01", "2027-01-01T23:59:59.5"])
 def test_days_begin_at_midnight(start: str) -> None:
-    """However astropy divides a date into two numbers."""
+    """Check all divisions of a date into two numbers by astropy."""
     times = TimeGrid(start, 1.0, 3600.0)
     midnight, fraction = times.first
     assert midnight % 1 == 0.5

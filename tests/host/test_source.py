@@ -58,7 +58,7 @@ def test_each_spectrum_is_usable_and_has_an_origin(name: str) -> None:
 
 
 def test_ultraviolet_quality_of_known_stars() -> None:
-    """HD 40307 from HST: 2.1e-4, 4.6e-3 and 0.069 of its visual flux (independent reduction)."""
+    """Compare HD 40307 from HST with an independent reduction: 2.1e-4, 4.6e-3 and 0.069 of its visual flux."""
     star = Source.from_library("K3V")
     assert star.name == "K2.5V"
 
@@ -78,7 +78,7 @@ def test_names_ignore_case_and_blanks() -> None:
 @pytest.mark.parametrize("band", ALIASES)
 @pytest.mark.parametrize("name", ["B2IV", "G2V", "K3V"])
 def test_photometry_equals_synphot(name: str, band: str) -> None:
-    """Photons to the last bit and magnitudes to 1e-13 as of synphot's observation, for whole and for ending spectra."""
+    """Compare photons to the last bit and magnitudes to 1e-13 with synphot, also for spectra that end in the band."""
     from synphot import Empirical1D, Observation, SpectralElement, units
 
     whole, vega, record = Source.from_library(name), Source.from_library("Vega").to_synphot(), bands.band(band)
@@ -113,7 +113,7 @@ def test_blackbody_equals_astropy_to_the_last_bit(kelvin: float) -> None:
 
 
 def test_vega_has_its_catalogued_magnitude_and_ten_is_fainter(sun: Source) -> None:
-    """V = .03 (Johnson et al. 1966), T = 0 (Sullivan et al. 2015), G = .023 (Riello et al. 2021), AB elsewhere."""
+    """Compare V = .03 (Johnson et al. 1966), T = 0 (Sullivan et al. 2015), G = .023 (Riello et al. 2021), AB."""
     vega = Source.from_library("Vega")
     for band, catalogued in (("B", 0.03), ("V", 0.03), ("TESS", 0.0), ("Gaia G", 0.023), ("GALEX NUV Vega", 0.0)):
         assert vega.magnitude(band) == pytest.approx(catalogued, abs=1e-9)
@@ -154,7 +154,7 @@ def test_scaling_to_a_magnitude_in_any_system(sun: Source, system: bands.System)
     ],
 )
 def test_stars_have_their_catalogued_magnitudes(name: str, band: str, catalogued: float, error: float) -> None:
-    """With Vega at zero all but the Sun's V are off by more than that; 18 Sco stands with its file below."""
+    """Check V of the stars, all of which but the Sun's would be wrong with Vega at zero."""
     assert Source.from_library(name).magnitude(band) == pytest.approx(catalogued, abs=error)
 
 
@@ -179,7 +179,7 @@ def test_added_flare_is_a_blackbody(sun: Source) -> None:
 
 
 def test_replacing_flare_hides_photosphere(sun: Source) -> None:
-    """For a star that is a blackbody, the flux is the area-weighted sum of two blackbodies, exactly."""
+    """Compare with the exact area-weighted sum of two blackbodies, for a star that is a blackbody."""
     cool, hot, filling = (blackbody(grid(), t) for t in (5000.0, 10_000.0, 5000.0))
     star = Source.from_arrays(grid(), cool)
     ratio = bands.photons(grid(), hot, "Kepler") / bands.photons(grid(), cool, "Kepler")
@@ -189,7 +189,7 @@ def test_replacing_flare_hides_photosphere(sun: Source) -> None:
 
 
 def test_replacing_flare_uses_the_photosphere_of_the_star(sun: Source) -> None:
-    """The library's temperature where none is given; a spectrum of one's own has none."""
+    """Use the library's temperature if none is given; the user's own spectrum has none."""
     assert (sun.temperature_k, Source.from_library("K2.5V").temperature_k) == (5636.0, 4783.0)
     own = sun.flaring(0.1, geometry="replaces")
     np.testing.assert_array_equal(
@@ -218,7 +218,7 @@ def test_dust_dims_the_blue_most(sun: Source) -> None:
 
 
 def test_calspec_file_is_read(sun: Source) -> None:
-    """18 Sco, the paper's G2V star: the whole file, unmodified, and close to the library's G2V."""
+    """Read the unmodified file of 18 Sco, the paper's G2V star, and compare it with the library's G2V."""
     star = Source.read(DATA / "spectra" / "18sco_stis_004.fits")
     assert star.name == "18SCO"
     # V = 5.50 (SIMBAD); 5.456 with Vega at zero.
@@ -318,7 +318,7 @@ def test_invalid_text_raises(tmp_path: Path, text: str, refusal: tuple[str, ...]
     ],
 )
 def test_short_spectra_raise_for_the_nominal_range(kept: slice, refusal: tuple[str, ...]) -> None:
-    """And used by an instrument whose pixels see what is there."""
+    """Refuse them, but accept them for an instrument whose pixels they cover."""
     star = Source.from_arrays(grid()[kept], GOOD[kept])
     mauve = Instrument.load("mauve")
     with refused(*refusal):
@@ -356,7 +356,7 @@ def test_sources_are_frozen_and_digested(sun: Source) -> None:
 
 
 def test_other_numbers_of_the_span() -> None:
-    """A bright star may start where the line function hardly reaches, 180.1 nm, and not at 190 nm."""
+    """Accept a bright star from 180.1 nm, where the line function hardly reaches, but not from 190 nm."""
     hot = blackbody(grid(), 30_000.0)
     whole = Source.from_arrays(grid(), hot, name="hot")
     finer = np.append(180.1, grid()[11:])
@@ -376,7 +376,7 @@ def test_other_numbers_of_the_span() -> None:
 
 
 def test_extension_by_another_star(sun: Source) -> None:
-    """The library's Sun cut at both ends and extended by itself, at another brightness, is the library's Sun."""
+    """Cut the library's Sun at both ends and extend it by itself at another brightness."""
     kept = (sun.wavelength_nm > 250) & (sun.wavelength_nm < 650)
     mauve = Instrument.load("mauve")
     short = (sun.wavelength_nm[kept], 1e-3 * sun.flux_flam[kept])
@@ -421,14 +421,14 @@ def test_measured_noise_is_kept_and_reported_once() -> None:
 
 
 def test_mean_too_far_below_zero_raises() -> None:
-    """A level of -1e-13 is ten errors of a point, and hundreds of a pixel's: no noise of the spectrum explains it."""
+    """Refuse a level of -1e-13, ten errors of a point, which noise does not explain."""
     star = Source.from_arrays(*noisy(-1e-13), name="wrong")
     with refused("bin_nm", "3"):
         expect(star.at_magnitude(2.0), Instrument.load("mauve"), exposure=50.0)
 
 
 def test_standard_error_equals_the_scatter_of_means() -> None:
-    """Against the scatter over 200 spectra of white noise.
+    """Compare with the scatter of 200 spectra with white noise.
 
     200 draws tell a standard deviation to 5 %, and the error told, a mean over 20 of them, is right to 3 %: 0.75 to
     1.25 is beyond four deviations and fails by chance less than once in 1e3 for any of ten pixels, of a fixed seed.

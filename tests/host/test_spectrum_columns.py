@@ -106,7 +106,7 @@ NOT_FLUX = [
 
 @pytest.mark.parametrize("extra", NOT_FLUX)
 def test_flux_column_is_never_confused_with_another(tmp_path: Path, extra: str) -> None:
-    """Between wavelength and flux, where a reader that drops unknown names would take it."""
+    """Place another column between wavelength and flux, where a reader that drops unknown names would take it."""
     assert is_right(read(tmp_path, text({"nm": NM, extra: ERRORS, "flux": FLUX})))
     units = {"wavelength": (NM, "nm"), extra: (ERRORS, None), "flux": (FLUX, "FLAM")}
     made = [fits.Column(name, "D", array=values, unit=unit) for name, (values, unit) in units.items()]
@@ -308,7 +308,7 @@ UNITS = {
 @pytest.mark.parametrize("form", ["ecsv", "fits", "text", "name"])
 @pytest.mark.parametrize("case", UNITS)
 def test_units_are_normalised_alike_in_all_formats(tmp_path: Path, case: str, form: str) -> None:
-    """astropy itself refuses ANGSTROMS, FLAM, microns and Angstroem, and reads A as ampere."""
+    """Include spellings that astropy refuses, such as FLAM, and A, which it reads as ampere."""
     length, density, wavelength, flux = UNITS[case]
     if form == "ecsv":
         head = "".join(
@@ -398,7 +398,7 @@ def test_any_table_is_read_correctly_or_raises(
     remark: bool,
     prose: str,
 ) -> None:
-    """Tables of random columns in random order: the spectrum or one sentence, and nothing else."""
+    """Read tables of random columns in random order; each gives the spectrum or an InputError."""
     columns = [(wave, WAVES[wave]), (flux, FLUXES[flux])]
     columns += [
         (name, 0.3 * (k + 1) * FLUX if one else NM + 3.0 * (k + 1))
@@ -437,7 +437,7 @@ Teff 5777; wave, flux; Wavelength (nm) Flux (erg/s/cm2/A)"""
 def test_prose_in_a_header_changes_nothing(
     tmp_path: Path, lines: list[str], remark: str, mark: str, columns: tuple[np.ndarray, ...]
 ) -> None:
-    """Lines that hold words for wavelength, flux, errors and units: the first two columns, or one sentence."""
+    """Add prose with words for wavelength, flux, errors and units; the first two columns are read, or it raises."""
     head = "\n".join(remark + line for line in lines)
     try:
         star = read(tmp_path, text({str(k): one for k, one in enumerate(columns)}, mark, head))

@@ -156,7 +156,7 @@ def test_fits_in_many_forms(tmp_path: Path, form: str) -> None:
 
 
 def test_wavelengths_of_logarithmic_images_equal_those_of_astropy(tmp_path: Path) -> None:
-    """Log-linear (IRAF's DC-FLAG) and CTYPE WAVE-LOG, checked against astropy's own WCS."""
+    """Compare IRAF's DC-FLAG and CTYPE WAVE-LOG with astropy's WCS."""
     from astropy.wcs import WCS
 
     nm = 10 ** np.linspace(2.2, 3.0, 500)
@@ -176,7 +176,7 @@ def test_wavelengths_of_logarithmic_images_equal_those_of_astropy(tmp_path: Path
 
 
 def test_air_becomes_vacuum_where_the_file_says_air(tmp_path: Path) -> None:
-    """Against Birch & Downs 1994, as VALD converts (Morton 2000, ApJS 130, 403), to 1e-7; and what says nothing."""
+    """Compare with Birch & Downs 1994 as in VALD (Morton 2000, ApJS 130, 403) to 1e-7."""
     air = FROM_AIR[NM > 205]
     flux = FLUX[NM > 205]
     full = np.append(10 * NM[NM <= 205][:-1], air), np.append(FLUX[NM <= 205][:-1], flux)
@@ -234,7 +234,7 @@ def test_assumed_units_are_reported(tmp_path: Path) -> None:
 
 
 def test_angstrom_that_spans_the_range_as_numbers_is_not_nm(tmp_path: Path) -> None:
-    """An SED from X-rays to the infrared, in Angstrom, without a word: never read as nm in silence."""
+    """Refuse a spectrum from X-rays to the infrared without units, whose Angstrom could be taken for nm."""
     angstrom = np.geomspace(5.0, 55_000.0, 3000)
     for low, high, sentence in (
         (0.0, 1e9, ("wavelength_unit", "200-700")),
@@ -267,7 +267,7 @@ def test_angstrom_that_spans_the_range_as_numbers_is_not_nm(tmp_path: Path) -> N
 def test_angstrom_without_a_unit_gets_a_single_hint(
     tmp_path: Path, low: float, high: float, extend: str | None
 ) -> None:
-    """The range of the AD Leo great flare and others: taken as nm, nearly all light would be another star's."""
+    """Check one hint for ranges such as that of the AD Leo flare, where nm would give another star's light."""
     angstrom = np.geomspace(low, high, 1500)
     (tmp_path / "flare.dat").write_text(lines(angstrom, 1e-13 + 1e-17 * angstrom))
     with refused("wavelength_unit", "`wavelength_unit='Angstrom'`") as caught:
@@ -365,7 +365,7 @@ def test_unusable_fits_raises(tmp_path: Path, kind: str) -> None:
 
 
 def test_damaged_files_raise_or_are_read(tmp_path: Path) -> None:
-    """Whole files with bytes changed at random, by a fixed seed: nothing but `InputError` may come out."""
+    """Change random bytes of whole files with a fixed seed; only InputError may be raised."""
     rng = np.random.default_rng(14)
     for content in (WHOLE, FITS["linear image"], FITS["start and step"], PLAIN.encode(), gzip.compress(WHOLE)):
         for _ in range(60):
@@ -432,7 +432,7 @@ def test_coverage_is_checked_before_ends_are_dropped(tmp_path: Path) -> None:
 
 
 def test_yaml_alias_bomb_raises(tmp_path: Path) -> None:
-    """A header of 1 KiB that stands for 10**9 values, and one of astropy's own aliases, which is not."""
+    """Refuse a header of 1 KiB that expands to 10**9 values, but read one with aliases of astropy's."""
     levels = ["a0: &a0 [x,x,x,x,x,x,x,x,x,x]"]
     levels += [f"a{k}: &a{k} [{','.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 9)]
     meta = "\n".join(f"# meta: {{{', '.join(levels)}}}".splitlines())

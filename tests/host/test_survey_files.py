@@ -268,7 +268,7 @@ def test_ab_magnitudes_in_tables(tmp_path: Path) -> None:
 
 
 def test_checksums_are_verified(tmp_path: Path) -> None:
-    """Each damaged byte of a file with DATASUM and CHECKSUM is noticed; files without them are read as before."""
+    """Damage each byte of a file with DATASUM and CHECKSUM; files without them are read as before."""
     angstrom = np.arange(1700.0, 10_000.0, 20.0)
     columns = {"WAVELENGTH": ("D", angstrom, "Angstrom"), "FLUX": ("D", light(angstrom), "FLAM")}
     path = written(tmp_path, [fits.PrimaryHDU(), table(columns, "SCI")], checksum=True)

@@ -40,7 +40,7 @@ def month() -> Visibility:
     [(0.0, (0.622, 0.567, 0.511)), (90 - 39.1, (0.703, 0.607, 0.518))],
 )
 def test_visible_share_of_a_circular_orbit(from_plane_deg: float, shares: tuple[float, ...]) -> None:
-    """TIME.md, section 5, to 0.5 %: 1 - arccos(cos(rho + x) / cos b) / pi."""
+    """Compare with TIME.md, section 5, to 0.5 %: 1 - arccos(cos(rho + x) / cos b) / pi."""
     position, _ = circular(AXIS_KM, 1.2, 0.4, np.linspace(0, 2 * np.pi, 20_000, endpoint=False))
     normal = unit(np.cross(position[0], position[5000]))
     target = np.cos(np.radians(from_plane_deg)) * unit(position[0]) + np.sin(np.radians(from_plane_deg)) * normal
@@ -54,7 +54,7 @@ def test_visible_share_of_a_circular_orbit(from_plane_deg: float, shares: tuple[
 
 @pytest.mark.parametrize("margin", [0.0, 10.0, 20.0])
 def test_targets_near_the_pole_are_always_visible(margin: float) -> None:
-    """Always visible within 22.0 - x deg of the orbit's pole."""
+    """Check targets within 22.0 - x deg of the orbit's pole."""
     position, _ = circular(AXIS_KM, 0.0, 0.0, np.linspace(0, 2 * np.pi, 400, endpoint=False))
     from_pole = np.arange(0.0, 30.0, 0.05)
     seen = constraints.clear_of_earth(position, direction(0.0, 90 - from_pole), margin).all(axis=0)
@@ -62,7 +62,7 @@ def test_targets_near_the_pole_are_always_visible(margin: float) -> None:
 
 
 def test_constraints_agree_with_m4opt() -> None:
-    """The same angles as m4opt has them (its version 2.3.1, `m4opt.constraints`), by astropy's horizontal frame.
+    """Compare angles with `m4opt.constraints` 2.3.1, by astropy's horizontal frame.
 
     The Earth's limb: altitude + arccos(R_earth / distance); its altitude is over the ellipsoid's horizon, up to 0.2 deg
     from the sphere's. Sun and Moon: `get_body` for the place, and `separation`.
@@ -101,7 +101,7 @@ def test_constraints_agree_with_m4opt() -> None:
 
 
 def test_limits_apply_to_the_angles(month: Visibility) -> None:
-    """Each limit, in float32 and by cosines, against angles in float64."""
+    """Compare each limit, computed with cosines in float32, with angles in float64."""
     track, target = month.track, month.target
     part = slice(0, 3000)
     at = track.position_km[part]
@@ -143,7 +143,7 @@ def test_windows_sum_to_the_visible_time(month: Visibility) -> None:
 
 
 def test_fraction_allowed_by_each_limit(month: Visibility) -> None:
-    """The limits together leave no more than each alone, and what none would take away is there."""
+    """Check that all limits together allow no more than each alone."""
     assert (month.share <= np.min(list(month.kept_by.values()), axis=0) + 1e-12).all()
     free = Limits(earth_limb_deg=None, sun_deg=None, moon_deg=None, declination_deg=None, proton_flux=None)
     assert Visibility.of(month.track, month.target, free).share == pytest.approx(1.0)
@@ -178,7 +178,7 @@ def test_short_windows_are_dropped(month: Visibility) -> None:
 
 
 def test_shadow_of_a_circular_orbit() -> None:
-    """Cylinder: arccos(sqrt(1 - (R/a)^2) / cos beta) / pi of the orbit, to the penumbra's width."""
+    """Compare with a cylinder, arccos(sqrt(1 - (R/a)^2) / cos beta) / pi, to the width of the penumbra."""
     position, _ = circular(AXIS_KM, 0.0, 0.0, np.linspace(0, 2 * np.pi, 50_000, endpoint=False))
     for beta in (0.0, 17.0, 28.0, 60.0, 75.0):
         sun = np.broadcast_to(direction(30.0, beta), position.shape)
@@ -195,7 +195,7 @@ def test_polygon_across_the_date_line() -> None:
 
 
 def test_flux_map_interpolates_between_cells() -> None:
-    """At a cell its value, halfway the mean of two, over the date line and at the poles nothing odd."""
+    """Check cells, points halfway between them, the date line and the poles."""
     flux = proton_map()
     grid = flux.flux[10]
     row, column = np.unravel_index(np.argmax(grid), grid.shape)
@@ -211,7 +211,7 @@ def test_flux_map_interpolates_between_cells() -> None:
 
 @pytest.mark.long
 def test_zodiacal_light_over_the_year() -> None:
-    """As `Sky.at` has it, target by target and day by day."""
+    """Compare with `Sky.at` for each target and day."""
     times = TimeGrid("2027-01-01", 360.0, 86_400 * 30)
     bodies = Orbit.load().track(times).bodies
     for name in ("eps Eri", "Vega"):
@@ -228,7 +228,7 @@ def test_zodiacal_light_over_the_year() -> None:
 
 
 def test_temperature_follows_its_equation() -> None:
-    """A step from shadow to sunlight nears its end by exp(-t / tau); balance stays."""
+    """Check exp(-t / tau) after a step from shadow to sunlight, and that balance is kept."""
     thermal = Thermal(20.0, 10.0, 600.0)
     assert thermal.temperature_c(np.full(50, 1.0), 30.0) == pytest.approx(20.0)
     light = np.r_[np.zeros(5000), np.ones(100)]
@@ -266,7 +266,7 @@ def _simbad(monkeypatch: pytest.MonkeyPatch, query_tap: Callable[[str], object])
 
 
 def test_answer_of_simbad_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Columns of its TAP service: degrees, mas; what it does not have is masked; blanks, quotes."""
+    """Read degrees and mas of the TAP service, masked values, blanks and quotes."""
     asked = []
 
     def answer(query: str) -> Table:
@@ -293,7 +293,7 @@ def test_answer_of_simbad_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_network_failure_raises(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With a network that fails, one that never answers, and without astroquery."""
+    """Simulate a network that fails, one that never answers, and missing astroquery."""
     from mauvecl.host.orbit import targets
 
     def fails(_: str) -> None:

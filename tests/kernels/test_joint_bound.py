@@ -85,7 +85,7 @@ BOUNDS = [(np.log10(1.5), 1.5), (-0.5, 0.5), (-2.5, 3.3), (-1.0, 1.0), (-4.5, 3.
 @pytest.mark.parametrize("varying", [False, True], ids=["steady", "factors on light and dark"])
 @pytest.mark.parametrize("what", ["Pearson", "tails"])
 def test_worst_draws_that_the_region_allows(what: str, varying: bool) -> None:
-    """A search for what Pearson's test sees soonest, and for the worst tail, among all that is drawn jointly."""
+    """Search all jointly drawn cases for the smallest number of draws that shows a difference, and the worst tail."""
     tried = 0
 
     def merit(point: np.ndarray) -> float:
@@ -107,7 +107,7 @@ def test_worst_draws_that_the_region_allows(what: str, varying: bool) -> None:
 
 @pytest.mark.parametrize("name", ["mauve", "mauve-electrons"])
 def test_nominal_payload_at_all_settings(name: str) -> None:
-    """Nine temperatures, 1 to 100 frames: jointly, and by the estimate never noticed before 5e13 draws."""
+    """Check nine temperatures and 1 to 100 frames: none is distinguishable before 5e13 draws by the estimate."""
     below = 0
     for temperature in (-40, -30, -20, -9, 0, 9, 15, 21, 25):
         (x,) = star(payload=instrument(name, temperature_c=float(temperature)), exposure=5.0)
@@ -122,7 +122,7 @@ def test_nominal_payload_at_all_settings(name: str) -> None:
 
 
 def test_smallest_poisson_means() -> None:
-    """1.5 DN of Gaussian noise and .14 counts: gamma_3 is .038, yet 2e9 draws tell; the tail is off by a fifth."""
+    """Check 1.5 DN of noise with .14 counts, where gamma_3 is small but 2e9 draws show a tail off by a fifth."""
     noise = Noise(1.5, 0.14, 1.0, 0.0, 1.0, 0.37)
     p, q = noise.both(varying=False)
     assert noise.cumulants.shape()[0][0] < 0.04
@@ -139,7 +139,7 @@ def test_smallest_poisson_means() -> None:
 
 @pytest.mark.parametrize("quartic", [False, True])
 def test_factors_follow_the_cumulants(quartic: bool) -> None:
-    """The twin's draw under factors on light and dark is the polynomial of the cumulants at these factors."""
+    """Compare the reference's draw under factors on light and dark with the polynomial of the scaled cumulants."""
     x = toy(8, 1, dark=288.0 if quartic else 2225.0, read=12.0, photon_noise="poisson")
     processes = Processes(qe_scale=Uniform(1.4, 1.4), detector_temperature=Uniform(12.0, 12.0))
     scene, index = prepare([x], processes=processes), np.arange(3000, dtype=np.uint64)
@@ -160,7 +160,7 @@ def test_factors_follow_the_cumulants(quartic: bool) -> None:
 
 
 def test_cumulants_at_factors() -> None:
-    """`scaled` is what an expectation of other light and dark has."""
+    """Compare `scaled` with the cumulants of an expectation with other light and dark."""
     for noise in ("gaussian", "poisson"):
         x = toy(8, 3, photon_noise=noise)
         other = replace(

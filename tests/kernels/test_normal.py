@@ -110,7 +110,7 @@ def probes_fast(engine: Engine) -> Probes:
 
 
 def test_fused_multiply_add_rounds_once() -> None:
-    """The twin's float32 fma against exact rational arithmetic."""
+    """Compare the reference's float32 fma with exact rational arithmetic."""
     from fractions import Fraction
 
     generator = np.random.default_rng(8)

@@ -15,7 +15,7 @@ Words = tuple[int, ...]
 
 @pytest.mark.parametrize(("counter", "key", "answer"), PHILOX_VECTORS)
 def test_philox_gives_the_known_answers(probes: Probes, counter: Words, key: Words, answer: Words) -> None:
-    """Random123's, which the self-test keeps."""
+    """Compare with Random123's known answers, which the self-test contains."""
     out = probes.philox(np.array([counter], np.uint32), np.array([key], np.uint32))[0]
     np.testing.assert_array_equal(out, [*answer, *answer])
     twin = random_numbers.philox(np.array(counter, np.uint32), key[1] << 32 | key[0])

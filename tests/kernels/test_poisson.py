@@ -19,7 +19,7 @@ MEANS = [0.0, 0.5, 5.0, 64.0, 2225.0, 22250.0, 222500.0]
 
 @pytest.mark.parametrize("mean", [*MEANS, 1e-9, 0.01, 1.0, 999.5, 1e6, 1e7])
 def test_alias_table_has_the_probabilities_of_scipy(mean: float) -> None:
-    """The words of each outcome, counted exactly, are scipy's probabilities to one word in 2**32."""
+    """Count the words of each outcome exactly and compare with scipy to one word in 2**32."""
     table = alias_table(mean)
     words = table.words_per_column()
     assert words.sum() == 2**32
@@ -110,7 +110,7 @@ def draws_to_tell(mean: float, offset: float, slope: float, cubic: float) -> flo
 
 @pytest.mark.parametrize("mean", [SMALLEST_EXPANDED, 2225.0, 22250.0, 1e6])
 def test_expansion_cannot_be_distinguished_from_exact_draws(mean: float) -> None:
-    """By what the scene gives the device; without its last term 2e10 draws of a mean of 1000 would."""
+    """Check the device's expansion; without its last term, 2e10 draws of a mean of 1000 would show it."""
     scene = prepare([toy(4, 1, dark=mean)], recipe="apart")
     (source,) = scene.dark_counts[:1]
     assert source["bits"] == 0
@@ -122,7 +122,7 @@ def test_expansion_cannot_be_distinguished_from_exact_draws(mean: float) -> None
 
 @pytest.mark.parametrize("mean", [SMALLEST_EXPANDED, 2225.0, 22250.0])
 def test_rounded_normal_fails(mean: float) -> None:
-    """The test above can fail: the same number of draws from a rounded normal, or without the last term."""
+    """Check that the test above fails for a rounded normal and without the last term."""
     half = int(10 * np.sqrt(mean))
     n = np.arange(-half, half)
     rounded = np.diff(stats.norm.cdf(np.append(n, half) - 0.5, 0.0, np.sqrt(mean)))
@@ -145,7 +145,7 @@ def probes_fast(engine: Engine) -> Probes:
 
 
 def test_moments_of_the_table() -> None:
-    """Mean, variance, skewness and kurtosis, from the exact word counts."""
+    """Compare mean, variance, skewness and kurtosis from the exact word counts."""
     for mean in (5.0, 2225.0, 22250.0):
         table = alias_table(mean)
         p = table.words_per_column() / 2**32

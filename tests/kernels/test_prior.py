@@ -98,7 +98,7 @@ def moments(x: np.ndarray, weight: np.ndarray) -> tuple[float, float, float, flo
 
 @pytest.mark.parametrize(("name", "prior"), PRIORS)
 def test_drawn_factors_have_the_moments_of_the_prior(probes: Probes, name: str, prior: Prior) -> None:
-    """Every cell of the table integrated: no draws, no chance."""
+    """Integrate every cell of the table, without draws."""
     t, w = np.polynomial.legendre.leggauss(3)
     edges = np.append(0.0, nodes()[:-1])
     half = np.diff(edges)[:, None] / 2
@@ -117,7 +117,7 @@ CHANCES = [1e-9, 1e-7, 1e-5, 1e-3, 0.1]
 
 @pytest.mark.parametrize(("name", "prior"), PRIORS)
 def test_drawn_factors_have_the_tails_of_the_prior(probes: Probes, name: str, prior: Prior) -> None:
-    """As much lies beyond the device's value as its word says, within 0.1 % and what float32 resolves of the spread."""
+    """Compare the probability beyond the device's value with its word, to 0.1 % and the resolution of float32."""
     found = factors(name, prior)
     for upper in (False, True):
         for chance, value in zip(CHANCES, drawn(probes, name, prior, np.array(CHANCES), upper), strict=True):
@@ -160,7 +160,7 @@ def outside(prior: Prior, value: float, upper: bool) -> float:
 
 
 def test_reference_has_the_same_bits(probes: Probes) -> None:
-    """At the ends of words, octaves and cells, and at random words."""
+    """Compare at the ends of words, octaves and cells, and at random words."""
     table = Factors.of(Processes(qe_scale=Normal(1.0, 0.01, 0.5, 1.5)), CONDITIONS).tables[0]
     ends = np.concatenate([[2**k - 1, 2**k, 2**k + 1] for k in range(1, 32)]).astype(np.uint32)
     word, finer = (grid.ravel() for grid in np.meshgrid(np.concatenate([[0], ends, ~ends, [2**32 - 1]]), ends))
