@@ -45,10 +45,10 @@ def flip(path: Path, place: int = 100) -> None:
 
 
 class Painter(Engine):
-    """Draws nothing by chance and needs no OpenCL: rows that tell their number, for tests that fork."""
+    """Engine without chance and OpenCL, whose rows contain their number, for tests that fork."""
 
     def __init__(self) -> None:
-        """Without a device."""
+        """Make an engine without a device."""
 
     def realise(
         self, x: Any, *, start: int, count: int, seed: int, out: NDArray[Any] | None = None, **how: Any

@@ -1,4 +1,4 @@
-"""What the documentation names, imports and links exists; `test_docs_run.py` runs what it shows."""
+"""Names, imports and links in the documentation exist; `test_docs_run.py` runs its snippets."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_every_page_is_in_the_contents() -> None:
 
 
 def test_documented_names_exist() -> None:
-    """Files, and where it says `file: name`, the name's definition in it."""
+    """Check files, and the definition of each name in `file: name`."""
     named = [(page.name, *found) for page in all_pages() for found in NAMED.findall(page.read_text(encoding="utf-8"))]
     missing = [(page, file) for page, file, _ in named if not list(ROOT.glob(file))]
     assert not missing
@@ -62,7 +62,7 @@ def test_documented_names_exist() -> None:
 
 
 def test_imports_of_pages_and_scripts_exist() -> None:
-    """Every import of mauvecl on a page, in a bench, a tool, or a program that a test starts."""
+    """Check imports of mauvecl in pages, benches, tools, and programs that tests start."""
     files = [*all_pages(), *(path for folder in ("bench", "tools", "tests") for path in (ROOT / folder).rglob("*.py"))]
     seen = 0
     for path in files:
@@ -118,6 +118,6 @@ def test_notebooks_have_no_output() -> None:
 
 
 def test_links_have_text() -> None:
-    """A link without text is filled in when the documentation is built, and is nothing at all in the repository."""
+    """Refuse links without text, which appear only in the built documentation."""
     empty = re.compile(r"\[\]\([^)]*\)")
     assert not [str(page) for page in all_pages() if empty.search(page.read_text(encoding="utf-8"))]

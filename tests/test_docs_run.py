@@ -236,7 +236,7 @@ def test_snippets_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_skipped_snippets_exist_on_pages() -> None:
-    """What is reduced, brought or left out is on a page; no exception stays behind its snippet."""
+    """Check that every exception still belongs to a snippet."""
     every = [(page.name, kind, snippet) for page in PAGES for kind, snippet in snippets(page)]
     commands = [snippet.removeprefix("mauvecl ") for _, kind, snippet in every if kind == "command"]
     python = "".join(snippet for _, kind, snippet in every if kind == "python")

@@ -26,7 +26,7 @@ def test_examples_of_docstrings_run(name: str) -> None:
 
 
 def test_main_names_have_examples() -> None:
-    """Of what the package's front door shows."""
+    """Check the main names of the package."""
     finder = doctest.DocTestFinder(recurse=False)
     for name in ("Source", "Sky", "Instrument", "expect", "Engine", "Study"):
         thing = getattr(mauvecl, name)
@@ -34,7 +34,7 @@ def test_main_names_have_examples() -> None:
 
 
 def test_every_public_name_is_imported() -> None:
-    """Each from its home, and typed as such where it is imported."""
+    """Check the home of each name, and its import for type checkers."""
     import mauvecl
 
     for name in mauvecl.__all__:

@@ -1,4 +1,4 @@
-"""What goes in from other packages, and out to them."""
+"""Input from other packages, and output to them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_synphot_spectrum_round_trips() -> None:
 
 
 def test_synphot_blackbody_is_read() -> None:
-    """stsynphot's grids hand out synphot SourceSpectrum objects, as this is one."""
+    """Read a synphot SourceSpectrum, as stsynphot's grids return."""
     from synphot import SourceSpectrum
     from synphot.models import BlackBodyNorm1D
 
@@ -40,7 +40,7 @@ def test_synphot_blackbody_is_read() -> None:
 
 
 def test_stsynphot_spectrum_is_read(recwarn: pytest.WarningsRecorder) -> None:
-    """Its parser, on expressions that need none of its data files."""
+    """Read the result of its parser for expressions that need no data files."""
     parser = pytest.importorskip("stsynphot.spparser")
     found = Source.from_synphot(parser.parse_spec("rn(bb(9000),box(5500,100),15,abmag)"))
     assert found.at_magnitude(8.0).magnitude("V") == pytest.approx(8.0, abs=1e-6)
@@ -85,7 +85,7 @@ def test_lightkurve_flares_are_read() -> None:
 
 
 def test_altaipony_table_is_read(tmp_path: Path) -> None:
-    """The columns that its FlareLightCurve.flares writes to CSV."""
+    """Read the columns that FlareLightCurve.flares writes to CSV."""
     file = tmp_path / "flares.csv"
     file.write_text(ALTAIPONY)
     table = read_flares(file)

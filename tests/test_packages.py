@@ -47,7 +47,7 @@ build_wheel(sys.argv[1])
 
 
 class Packages(NamedTuple):
-    """A tree of sources and the packages built from it."""
+    """Tree of sources and the packages that are built from it."""
 
     tree: Path
     wheel: bytes
@@ -95,7 +95,7 @@ def unpacked(packages: Packages, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 def test_same_files_give_the_same_packages(packages: Packages, tmp_path: Path) -> None:
-    """In another folder, with other times and permissions of the files."""
+    """Build in another folder, with other times and permissions of the files."""
     tree = copied(tmp_path / "elsewhere")
     for number, path in enumerate(sorted(tree.rglob("*"))):
         if not path.is_symlink():
@@ -123,7 +123,7 @@ def test_wheel_holds_the_package_and_nothing_else(packages: Packages, tmp_path: 
 
 
 def test_licences_are_in_both(packages: Packages, tmp_path: Path) -> None:
-    """Next to the data, and among those of the package."""
+    """Look for licences next to the data and among those of the package."""
     texts = [ROOT / "LICENSE", *(ROOT / "host" / "stars" / "library" / "licenses").iterdir()]
     assert len(texts) == 4
     (tmp_path / WHEEL).write_bytes(packages.wheel)

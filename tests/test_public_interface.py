@@ -117,7 +117,7 @@ def test_nothing_public_is_gone() -> None:
 
 
 def test_additions_are_listed() -> None:
-    """To accept: python tests/test_public_interface.py."""
+    """Compare with the list; `python tests/test_public_interface.py` accepts additions."""
     assert not sorted(set(public_interface()) - set(FILE.read_text(encoding="utf-8").splitlines()))
 
 
@@ -136,7 +136,7 @@ def test_listing_covers_every_kind() -> None:
 
 
 def main() -> None:
-    """Add what is new, and keep what is promised."""
+    """Add new lines to the list and keep all others."""
     promised = set(FILE.read_text(encoding="utf-8").splitlines()) if FILE.exists() else set()
     FILE.write_text("\n".join(sorted(promised | set(public_interface()))) + "\n", encoding="utf-8")
 

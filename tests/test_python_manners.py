@@ -1,4 +1,4 @@
-"""Python as astronomers write it: names, one flare, 1e5, equality, text, pickle, pictures in axes of one's own."""
+"""Common Python usage: names, single flares, 1e5, equality, text, pickles, and pictures in given axes."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def test_tables_have_units() -> None:
 
 @pytest.mark.parametrize("name", ["Source", "Expectation", *ANSWERS])
 def test_pictures_are_drawn_into_given_axes(engine: Engine, name: str) -> None:
-    """Into the second of three axes, whose figure stays the caller's: nothing outside them changes."""
+    """Draw into the second of three axes; nothing outside of them changes."""
     import matplotlib.pyplot as plt
 
     made = ANSWERS[name](engine, {}) if name in ANSWERS else things()[name](7.0)

@@ -1,4 +1,4 @@
-"""Tables as they are written: what astropy makes of them, to the last byte."""
+"""Tables as text equal those that astropy writes, to the last byte."""
 
 from __future__ import annotations
 

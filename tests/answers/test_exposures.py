@@ -1,4 +1,4 @@
-"""Exposures for a wanted S/N: there and back, against the engine, and refusals."""
+"""Exposures for a wanted S/N: inversion, comparison with the engine, and refusals."""
 
 from __future__ import annotations
 

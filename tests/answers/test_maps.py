@@ -1,4 +1,4 @@
-"""Maps: each cell is what a detection of that cell alone gives, and harder is never easier."""
+"""Maps: each cell equals its own detection, and probabilities fall with magnitude."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What would be measured: forecasts, simulated fits, detected flares, too simple models."""
+"""Forecasts, simulated fits, detected flares, and models that are too simple."""
 
 from __future__ import annotations
 

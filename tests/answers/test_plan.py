@@ -1,4 +1,4 @@
-"""Plans: each number of the report is in a table and follows from the others; what is missing is said."""
+"""Plans: each number of the report is in a table and follows from the others; missing values are reported."""
 
 import re
 from pathlib import Path

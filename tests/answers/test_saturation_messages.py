@@ -1,4 +1,4 @@
-"""Every verb that has a star says where the star, or a flare, saturates: in its messages, or in its refusal."""
+"""Every verb with a star reports where the star or a flare saturates, in messages or refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One simulated stare: its light, its files, what it refuses."""
+"""One simulated stare: its light, its files, and refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Visibility as an answer: its tables agree with each other and with the host, its calendar is one."""
+"""Visibility answers: tables agree with each other and with the host, and the calendar is valid."""
 
 import tomllib
 from pathlib import Path

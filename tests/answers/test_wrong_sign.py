@@ -1,4 +1,4 @@
-"""Weighted sums that a flare lowers are named: their detection probability of 0 says nothing of the flare."""
+"""Reports of weighted sums that a flare lowers, whose detection probability of 0 says nothing of the flare."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever fails ends at one boundary: a sentence, an exit code of its kind, and never a bare traceback."""
+"""Every failure of the command line ends with one sentence and the exit code of its kind, without a traceback."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every verb of the command line has in common: help by examples, completion, no colour in pipes, JSON alone."""
+"""Common properties of all verbs: help with examples, completion, no colour in pipes, and JSON alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Spectrum files on the command line and in studies: what was assumed stands in the answer's first lines."""
+"""Spectrum files on the command line and in studies; the first lines of an answer state assumptions."""
 
 from __future__ import annotations
 

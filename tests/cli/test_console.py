@@ -1,4 +1,4 @@
-"""What the terminal shows while it works: one unit, a rate, and a time left that can be believed."""
+"""Progress on the terminal: one unit, a rate, and a credible remaining time."""
 
 from __future__ import annotations
 

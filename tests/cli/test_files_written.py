@@ -1,4 +1,4 @@
-"""Files of a verb are whole or missing, whatever the disk does, and the answer is printed."""
+"""Files of a verb are complete or missing, whatever the disk does, and the answer is printed."""
 
 from __future__ import annotations
 

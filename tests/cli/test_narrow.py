@@ -1,4 +1,4 @@
-"""A terminal of 80 columns: help, and the headings of tables."""
+"""Help and headings of tables in a terminal of 80 columns."""
 
 from __future__ import annotations
 

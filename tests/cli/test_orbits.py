@@ -1,4 +1,4 @@
-"""The verbs that look from the orbit, as they are typed."""
+"""Commands that look from the orbit."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Stars in place of a study, and names that people try."""
+"""Stars in place of a study, and common names of stars."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Flags' values as people write them."""
+"""Values of flags in common spellings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`mauvecl verify` on the folders of all verbs: whatever is changed or removed afterwards is noticed."""
+"""`mauvecl verify` notices every change and removal in the folders of all verbs."""
 
 from __future__ import annotations
 

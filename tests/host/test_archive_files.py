@@ -1,4 +1,4 @@
-"""Whole files of the archives, not changed by a byte: each is read right, or refused in a sentence that is true."""
+"""Unmodified files of the archives are read correctly or refused for the true reason."""
 
 from __future__ import annotations
 

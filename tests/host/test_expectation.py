@@ -1,4 +1,4 @@
-"""The whole deterministic chain, and the closed forms of its noise."""
+"""Expectations of the host, and the closed forms of their noise."""
 
 from __future__ import annotations
 

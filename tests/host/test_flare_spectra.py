@@ -1,4 +1,4 @@
-"""Spectra of flares: their light, their totals, and observed ones."""
+"""Spectra of flares: light, totals, and observed spectra."""
 
 from __future__ import annotations
 

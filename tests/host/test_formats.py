@@ -1,4 +1,4 @@
-"""The corners of user files: masks, the archives' spelling of units, axes that run the other way."""
+"""Special cases of user files: masks, the archives' spellings of units, and descending axes."""
 
 from __future__ import annotations
 

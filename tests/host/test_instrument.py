@@ -1,4 +1,4 @@
-"""The payload's numbers, and what a user's instrument file may and may not say."""
+"""Values of the payload, and the content of users' instrument files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stars by any of their names, in every place that takes one."""
+"""Names of stars, wherever a star can be given."""
 
 from __future__ import annotations
 

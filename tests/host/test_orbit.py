@@ -1,4 +1,4 @@
-"""The orbit: against SGP4's own vectors, astropy's frames, and closed forms of circular orbits."""
+"""The orbit, compared with SGP4's verification vectors, astropy's frames, and closed forms."""
 
 from itertools import pairwise
 from pathlib import Path

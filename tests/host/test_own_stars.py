@@ -1,4 +1,4 @@
-"""Stars of one's own: kept from files, and fetched from a server of this machine that plays the archives."""
+"""The user's own stars: kept from files, and fetched from a local server in place of the archives."""
 
 from __future__ import annotations
 

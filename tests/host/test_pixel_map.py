@@ -1,4 +1,4 @@
-"""Detectors whose pixels differ: what a map changes, files there and back, sentences for what cannot be."""
+"""Detectors whose pixels differ: effects of a map, its files, and refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The response matrix against brute-force quadrature written here, and what it must conserve."""
+"""The response matrix, compared with quadrature, and its conserved quantities."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Zodiacal light: the table's cells, the helio-ecliptic position against an independent one, and what is refused."""
+"""Zodiacal light: cells of the table, the helio-ecliptic position, and refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sources: the embedded library, files that users bring, magnitudes, flares, dust, and what is refused."""
+"""Sources: the embedded library, users' files, magnitudes, flares, dust, and refusals."""
 
 from __future__ import annotations
 

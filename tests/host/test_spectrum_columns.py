@@ -1,4 +1,4 @@
-"""Which columns are read, and in what scale: by name and unit, never a wrong one without a word.
+"""Choice of columns and units by name; a wrong column is never used silently.
 
 Every case holds the same spectrum, which is not straight, so that a wrong column, unit or order shows at each point. A
 file is read right or refused in one sentence.

@@ -1,4 +1,4 @@
-"""One spectrum in every form that a user may bring it: each is read alike, or refused in one sentence."""
+"""The same spectrum in every form of file is read alike or refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files in the layouts of HST/COS, LAMOST, DESI and SDSS, written with astropy as their data models say, and checksums.
+"""Files in the layouts of HST/COS, LAMOST, DESI and SDSS, written by astropy from their data models; checksums.
 
 Layouts: COS Data Handbook 5.1, section 2.4.3 (hst-docs.stsci.edu/cosdhb); LAMOST,
 https://dr5.lamost.org/v3/doc/data-production-description (image) and DR8 and later (table COADD); DESI,

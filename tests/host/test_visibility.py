@@ -1,4 +1,4 @@
-"""Visibility: closed forms of circular orbits, other definitions of the same limits, windows and how they add up."""
+"""Visibility: closed forms of circular orbits, other packages' limits, windows and their sums."""
 
 import sys
 import threading

@@ -1,4 +1,4 @@
-"""The joint draw over the whole region that its condition allows: the worst corners, found by a search."""
+"""The joint draw in the whole region that its condition allows; a search finds the worst corners."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What Python lays out is what the device reads."""
+"""The device reads the memory layout that Python defines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Box-Muller: accuracy against float64, extreme words, and the twin's bits."""
+"""Box-Muller: accuracy against float64, extreme words, and the bits of the reference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What tests of searches share: a star's survey, made once."""
+"""Surveys of stars that several tests share."""
 
 from __future__ import annotations
 

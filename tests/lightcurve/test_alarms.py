@@ -1,4 +1,4 @@
-"""Flares of one stare as they are found: each once, however bright; the same whatever else is there."""
+"""Alarms of one stare: each flare is found once, however bright, whatever other flares there are."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ def test_frames_are_those_of_the_windows(orbit: Orbit, night: OrbitStare) -> Non
 
 
 def test_temperature_follows_the_orbit(orbit: Orbit, night: OrbitStare) -> None:
-    """Between both ends, falling in shadow, rising in sunlight, and no matter when the stare begins."""
+    """Check that it stays between both ends, falls in shadow, rises in sunlight, and depends on no start time."""
     stare, dark = night.stare, night.in_shadow
     assert dark.any()
     assert not dark.all()

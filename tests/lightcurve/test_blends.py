@@ -1,4 +1,4 @@
-"""Flares that overlap: found, counted and measured together, whatever their number, distance and place."""
+"""Overlapping flares are found, counted and measured together, whatever their number, distance and place."""
 
 from __future__ import annotations
 

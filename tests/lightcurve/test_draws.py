@@ -1,4 +1,4 @@
-"""What is drawn of stares: by pixels against an own recipe and the engine's exposures, by cumulants against pixels."""
+"""Drawn stares: pixels against an independent recipe and the engine's exposures, cumulants against pixels."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def stares(engine: Engine) -> Stares:
 
 @pytest.mark.parametrize("magnitude", [7.4, -0.7], ids=["plain", "at saturation"])
 def test_frames_sum_to_exposures_of_the_engine(engine: Engine, stares: Stares, magnitude: float) -> None:
-    """The same draws, so the same counts, but where a float's last bit decides a whole DN: hardly one frame in 1e5."""
+    """Compare counts of the same draws, of which float32 rounds hardly one in 1e5 frames to another DN."""
     one, long = (
         star(magnitude=magnitude, amplitudes=(0.24,), exposure=s, payload=instrument(part=True)) for s in (5.0, 50.0)
     )
@@ -66,7 +66,7 @@ def recipe(components: Components, stare: Stare, flare: np.ndarray, n: int, seed
 
 @pytest.mark.parametrize("method", METHODS)
 def test_moments_equal_those_of_the_recipe(stares: Stares, method: Any) -> None:
-    """Means, covariances within a frame and between frames: 27 numbers within 6 standard errors, 1e-7 by chance."""
+    """Compare means and covariances within and between frames: 27 numbers within 6 standard errors, 1e-7 by chance."""
     quiet, *flares = star(
         magnitude=4.0, amplitudes=(0.5, 1.0), exposure=5.0, payload=instrument(output_min_nm=300.0, output_max_nm=306.0)
     )
@@ -109,7 +109,7 @@ SCENES: dict[str, Any] = {
 @pytest.mark.long
 @pytest.mark.parametrize("name", SCENES)
 def test_sums_by_cumulants_are_distributed_as_by_pixels(stares: Stares, name: str) -> None:
-    """1e7 frames each way, each sum and two mixtures of them.
+    """Compare each sum and two mixtures of them, in 1e7 frames drawn each way.
 
     Weights differ from pixel to pixel, as those of a search do: sums of pixels with one weight are whole DN by pixels.
     Kolmogorov-Smirnov on fine bins (p > 1e-6), six tails at +-4, 4.5, 5 sigma and moments within 5.5 standard errors:
@@ -166,7 +166,7 @@ def mixture_cumulants(components: Components, coefficients: Any, mixture: Any, s
 
 
 def test_components_equal_the_expectations(stares: Stares) -> None:
-    """Means and variances of any mixture of star, sky, dark and flares are those of an expectation made for it."""
+    """Compare means and variances of mixtures of star, sky, dark and flares with their expectations."""
     quiet, *flares = star(amplitudes=(0.5, 2.0), exposure=5.0, payload=instrument(part=True), neighbours=NEAR)
     assert quiet.target_share < 0.7
     rng = np.random.default_rng(2)

@@ -70,7 +70,7 @@ def events(rng: np.random.Generator, most: int) -> tuple[EventChoice, ...]:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_drawn_light_carries_the_stated_energy(seed: int) -> None:
-    """Random stars, distances, bands, shapes, temperatures and coolings.
+    """Draw stars, distances, bands, shapes, temperatures and cooling at random.
 
     The light is that from which every frame is drawn: coefficients of the frames times spectra of one amplitude.
     """
@@ -112,7 +112,7 @@ def test_drawn_light_carries_the_stated_energy(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(10))
 def test_replacing_flare_carries_the_energy_it_adds(seed: int) -> None:
-    """The light of the hot patch less that of the photosphere, for stars that are blackbodies."""
+    """Integrate the light of the hot patch less that of the photosphere, for stars that are blackbodies."""
     from mauvecl.host.stars.blackbody import blackbody
 
     rng = np.random.default_rng(100 + seed)
@@ -130,7 +130,7 @@ def test_replacing_flare_carries_the_energy_it_adds(seed: int) -> None:
 
 
 def test_fast_cooling_flare_keeps_its_energy() -> None:
-    """Cooling within a frame, and flares shorter than one."""
+    """Include cooling within a frame and flares shorter than a frame."""
     for half, fold in ((0.5, 0.5), (1.0, 20.0), (60.0, 0.5), (300.0, 3000.0)):
         flare = Event(20_001.3, half, 0.4, Cooling(20_000.0, 6_000.0, fold))
         kelvin = temperatures_of([flare])

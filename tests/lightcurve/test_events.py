@@ -1,4 +1,4 @@
-"""Flares of a stare: what they add to frames, with one temperature or cooling."""
+"""Contributions of a stare's flares to frames, with one temperature or cooling."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from mauvecl.schema.physical import DAY_S
 
 
 def test_bank_of_the_documentation_has_its_rate():
-    """Eight filters a factor of two apart: .41 to .48 tests a frame, the median of a day at 3.73 (TIME.md)."""
+    """Compare eight filters a factor of two apart with TIME.md: .41 to .48 tests a frame, median of a day 3.73."""
     bank = Bank(tuple(30 * 2.0**k for k in range(8)), ONE, DAVENPORT, 5.0, KNOWN)
     grid = TemplateGrid.from_bank(bank)
     assert 0.41 < grid.trials_per_frame(3.5) < grid.trials_per_frame(3.73) < 0.51
@@ -29,14 +29,14 @@ def test_bank_of_the_documentation_has_its_rate():
 
 
 def test_rate_of_one_filter_equals_the_closed_form():
-    """Frames that know nothing of each other: both phases of a template shorter than a frame are the same filter."""
+    """Use independent frames: both phases of a template shorter than a frame are the same filter."""
     alone = TemplateGrid.from_bank(Bank((0.02,), ONE, DAVENPORT, 5.0, KNOWN))
     assert alone.trials_per_frame(5.0) == pytest.approx(1.0, rel=1e-4)
 
 
 @pytest.mark.parametrize("widths", [HALF_WIDTHS_S, (20.0, 40.0, 80.0, 160.0)])
 def test_rate_agrees_with_importance_sampling(widths):
-    """The same rate from one alarm a day to one in 10^10 days, of one sum and of three temperatures.
+    """Compare one alarm a day to one in 10^10 days, for one sum and for three temperatures.
 
     An upper bound, up to a tenth above; four standard errors of the sampled rate, some 8 % each, which thresholds of
     one bank share: fails by chance once in 10^4 runs.
@@ -51,7 +51,7 @@ def test_rate_agrees_with_importance_sampling(widths):
 
 
 def test_rate_agrees_with_counts():
-    """At some alarms a day, where maxima come in clumps: a fifth above at most.
+    """Compare some alarms a day, where maxima come in clumps: the rate is a fifth too large at most.
 
     600 stares of six hours: 4 standard errors fail by chance once in 10^4 runs.
     """

@@ -1,4 +1,4 @@
-"""Stares: frames and gaps, curves over frames, what is not known of them."""
+"""Frames and gaps of stares, curves over frames, and unknowns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Injections: against flares put into pixels by NumPy alone, gains of the theory's table, what is recovered."""
+"""Injections, compared with flares put into pixels by NumPy, with the theory's gains, and by recovery."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def day():
 @pytest.mark.long
 @pytest.mark.parametrize("half_width", TABLE)
 def test_half_are_found_at_the_critical_amplitude(day, half_width):
-    """Within 5 % of the table. The median of 1000 amplitudes has an error of 0.7 %: once in 10^6 runs it fails."""
+    """Compare with the table to 5 %; the median of 1000 amplitudes is known to 0.7 %, which fails once in 10^6."""
     bank, cut = day
     rng = np.random.default_rng(int(half_width))
     n, frames = 1000, 300 if half_width < 100 else 700
@@ -138,7 +138,7 @@ def all_filters(one):
 @pytest.mark.long
 @pytest.mark.parametrize("rays", [None, RAYS], ids=["no rays", "cosmic rays"])
 def test_completeness_of_five_cells_agrees_with_numpy(injections, stares, rays):
-    """Against NumPy alone, cell by cell and all together. Six times 4 standard errors: fails once in 10^3 runs.
+    """Compare single cells and all together with NumPy alone; six times 4 standard errors fail once in 10^3 runs.
 
     All together notice flares that come out a sixth too bright, and frames without the rays.
     """
@@ -170,7 +170,7 @@ def test_completeness_of_five_cells_agrees_with_numpy(injections, stares, rays):
 
 
 def test_draws_are_common_and_addressed_by_counter(injections, stares):
-    """Draws depend neither on the requested half-widths nor on the part of the stares, to the last bit."""
+    """Check that draws depend neither on the half-widths nor on the part of the stares, to the last bit."""
     asked = injections.request(4)
     every = stares.reduced(asked)["critical"]
     alone = stares.reduced(replace(injections, half_widths_s=(40.0,)).request(4))["critical"]
@@ -185,7 +185,7 @@ def test_draws_are_common_and_addressed_by_counter(injections, stares):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_filters_of_all_flares_equal_those_of_each_alone(injections, seed, monkeypatch):
-    """Flares of random half-widths and times: filters of all at once are those of each in the frames around it."""
+    """Filter random flares together, and each in the frames around it."""
     rng = np.random.default_rng([26, seed])
     widths = tuple(np.sort(10 ** rng.uniform(0.8, 2.5, 4)))
     peak = float(rng.uniform(-50.0, 950.0))
@@ -204,7 +204,7 @@ def test_filters_of_all_flares_equal_those_of_each_alone(injections, seed, monke
 
 @dataclass(frozen=True)
 class Kept:
-    """What a reduction is called with."""
+    """Reduction that keeps its arguments."""
 
     adds: ClassVar[bool] = False
 
@@ -220,7 +220,7 @@ def drawn_at(injections, stares, position):
 
 
 def test_critical_amplitude_agrees_with_the_search(injections, stares):
-    """A hair above it the largest value among the templates reaches the threshold, a hair below it does not."""
+    """Check that the largest value reaches the threshold just above this amplitude, but not just below it."""
     injecting, drawn = drawn_at(injections, stares, 11)
     critical = stares.reduced(injections.request(11))["critical"].T
     for site, roots in zip(injecting.sites, critical, strict=True):
@@ -230,7 +230,7 @@ def test_critical_amplitude_agrees_with_the_search(injections, stares):
 
 
 def test_sums_equal_those_of_the_values(injections, stares):
-    """The frames that fits see give the values that the search has."""
+    """Check that the frames given to fits have the values of the search."""
     injecting, drawn = drawn_at(injections, stares, 7)
     site, amplitudes = injecting.sites[1], np.array([0.01, 0.03])
     value, direction, template = injecting.best(site, drawn, amplitudes)
@@ -242,7 +242,7 @@ def test_sums_equal_those_of_the_values(injections, stares):
 
 @pytest.mark.long
 def test_flares_equal_those_drawn_by_the_engine(injections, stares):
-    """Values of templates against frames with the flare in every pixel, on the same stares: means and variances.
+    """Compare means and variances of templates with frames that have the flare in every pixel.
 
     A flare whose own photons, and the jitter of its light, are most of the noise. Fails by chance once in 10^3 runs:
     4 standard errors of both at three half-widths.
@@ -269,7 +269,7 @@ def test_flares_equal_those_drawn_by_the_engine(injections, stares):
 
 
 def test_sums_over_frames_are_exact(injections, stares):
-    """In float64 nothing is rounded, so that no processor's order of adding them up shows in what is found."""
+    """Check that sums in float64 are exact, so that their order cannot matter."""
     injecting, drawn = drawn_at(injections, stares, 30)
     for site in injecting.sites:
         filters = site.filters.T.astype(np.float64)
@@ -287,7 +287,7 @@ def test_sums_over_frames_are_exact(injections, stares):
 @pytest.mark.long
 @pytest.mark.parametrize(("half_width", "snr"), [(30.0, 30.0), (200.0, 30.0)])
 def test_recovered_flares_have_their_parameters(half_width, snr):
-    """Pulls of all parameters, and coverage. Fails by chance once in 10^4 runs: 4 standard errors of each."""
+    """Check pulls and coverage of all parameters within 4 standard errors; fails once in 10^4 runs."""
     stare = Stare.of(9000.0)
     one, templates = survey(stare, Baseline(), (12.0, 40.0, 150.0, 400.0))
     rng = np.random.default_rng(31)

@@ -83,7 +83,7 @@ def lit_frames(cooling: Cooling, stare: Stare) -> tuple[list[Expectation], np.nd
 def test_temperature_is_measured_with_correct_errors(
     cooling: Cooling, unknown: dict[str, float] | None, engine: Engine
 ) -> None:
-    """Drawn pixels of 20 stares. Pulls of ln T have mean 0 and variance 1 over all bins.
+    """Check that pulls of ln T over all bins of 20 stares have mean 0 and variance 1.
 
     False failures: 1e-6 on each side of both, and of the coverage (94 to 96 %). The truth of a bin is the fit to its
     frames without noise, which lies between the temperatures of its frames.
@@ -121,7 +121,7 @@ def test_temperature_is_measured_with_correct_errors(
 
 
 def test_known_conditions_and_gaps_are_respected() -> None:
-    """Frames without noise: 9000 K in every bin, with the right area and luminosity, and no bin over a gap."""
+    """Measure frames without noise: 9000 K, area and luminosity in every bin, and no bin over a gap."""
     how = {"thermal": 3.0, "throughput": Sinusoid(0.2, 300.0), "variability": Sinusoid(0.05, 200.0), "orbit_s": 400.0}
     stare = Stare.of(300.0, gaps=[(90.0, 115.0)], **how)  # type: ignore[arg-type]
     lit, _ = lit_frames(STEADY, stare)
@@ -156,7 +156,7 @@ START: dict[str, Any] = {"peak_s": 50.0, "half_width_s": 30.0}
 
 
 def test_joint_fit_recovers_shape_and_cooling_without_noise() -> None:
-    """Known changes of throughput and detector temperature, a gap; constant temperatures where none falls."""
+    """Include known changes of throughput and temperature, a gap, and flares that do not cool."""
     how = {"thermal": 3.0, "throughput": Sinusoid(0.2, 300.0), "orbit_s": 400.0}
     stare = Stare.of(300.0, gaps=[(90.0, 115.0)], **how)  # type: ignore[arg-type]
     lit, _ = lit_frames(FALLING, stare)
@@ -183,7 +183,7 @@ def test_joint_fit_recovers_shape_and_cooling_without_noise() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("unknown", [None, {"dark": np.inf, "light": 0.02}], ids=["known", "unknown"])
 def test_joint_fits_have_correct_errors(unknown: dict[str, float] | None, engine: Engine) -> None:
-    """Drawn pixels of 20 stares: squared distances from the truth by the covariances are chi-squared of 120.
+    """Compare squared distances from the truth in 20 stares with chi-squared of 120 degrees of freedom.
 
     False failures: 1e-6 on each side, and as much for chi-squared of the fits.
     """
@@ -202,7 +202,7 @@ def test_joint_fits_have_correct_errors(unknown: dict[str, float] | None, engine
 
 @pytest.mark.long
 def test_intervals_of_a_joint_fit_agree_with_its_errors() -> None:
-    """Without noise and for a bright flare the likelihood is nearly normal, so that profile and curvature agree."""
+    """Compare profile and curvature for a bright flare without noise, whose likelihood is nearly normal."""
     lit, _ = lit_frames(FALLING, Stare.of(300.0))
     found = fit_cooling(np.array([one.recorded_dn for one in lit]), quiet(), model(), levels=(0.6827,), **START)
     low, high = ((ends[0, 0] - found.estimates[0]) / found.errors[0] for ends in (found.low, found.high))
@@ -249,7 +249,7 @@ def test_derivatives_of_joint_fits_agree_with_differences(shape: str) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("scale", [1.0, 0.1], ids=["bright", "faint"])
 def test_ends_of_joint_fits_agree_with_a_search(scale: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Newton's steps to the ends of intervals, and roots of chi-squared minimised at fixed quantities."""
+    """Compare Newton's steps with roots of chi-squared minimised at fixed quantities."""
     frames = noisy_frames(scale)
     fast = fit_cooling(frames, quiet(), model(), levels=(0.95,), **START)
     monkeypatch.setattr(cooling_fit, "_newton_end", lambda *_: None)
@@ -262,7 +262,7 @@ def test_ends_of_joint_fits_agree_with_a_search(scale: float, monkeypatch: pytes
 
 
 def test_flare_without_cooling_has_no_newton_step() -> None:
-    """At an end temperature equal to that at the peak, the cooling time has no effect."""
+    """Check an end temperature equal to that at the peak, where the cooling time has no effect."""
     data = cooling_fit._data(noisy_frames(1.0), quiet(), model(), None, Stare.of(300.0), shape_of("davenport2014"), ())
     theta = np.array([52.0, *np.log([40.0, 1.5, 12_000.0, 1.0, 80.0])])
     whitening, limits = data.whitening(theta), (np.full(6, -np.inf), np.full(6, np.inf))
@@ -286,7 +286,7 @@ def test_impossible_joint_fits_raise() -> None:
 
 
 def test_stares_without_a_flare_have_no_bins(engine: Engine) -> None:
-    """200 frames of noise. False failures: below 1e-9, for 20 000 runs of frames at 8 standard deviations."""
+    """Search 200 frames of noise; one run in 1e9 has a frame beyond 8 standard deviations."""
     raw = engine.realise(quiet(), count=200, seed=3)
     with refused("snr_per_bin", value=8.0):
         measure_along(raw, quiet(), model(), snr_per_bin=8.0)
@@ -308,7 +308,7 @@ def test_bad_frames_raise() -> None:
 
 
 def test_skipped_wavelengths_change_no_fit_along_a_stare() -> None:
-    """Pixels at 300-350 nm hold nothing of the flare: fits without them, in bins and jointly, find it."""
+    """Remove the flare from 300-350 nm and skip these pixels in binned and joint fits."""
     lit, _ = lit_frames(STEADY, Stare.of(150.0))
     nm, gap = quiet().wavelength_nm, (300.0, 350.0)
     spoiled = np.array([np.where((nm >= gap[0]) & (nm <= gap[1]), 0.0, one.recorded_dn) for one in lit])
@@ -325,7 +325,7 @@ def test_skipped_wavelengths_change_no_fit_along_a_stare() -> None:
     ids=["few", "known", "unknown"],
 )
 def test_intervals_of_joint_fits_cover(unknown: bool, count: int, engine: Engine) -> None:
-    """Drawn pixels of stares, with unknown levels that are the same in all frames of a stare.
+    """Draw pixels with unknown levels that are equal in all frames of a stare.
 
     False failures: coverages of 63 to 73 and 92 to 98 %, 1e-6 on each side for each of nine quantities.
     """
@@ -347,7 +347,7 @@ def test_intervals_of_joint_fits_cover(unknown: bool, count: int, engine: Engine
 
 
 def test_unknown_levels_do_not_mislead_the_start_of_joint_fits() -> None:
-    """60 stares with normal noise and unknown levels of dark and star: the peak, known to 0.5 s, is always found."""
+    """Fit 60 stares with unknown levels of dark and star: the peak is always found to 0.5 s."""
     nuisances = Nuisances.of(quiet(), {"dark": np.inf, "light": 0.02})
     lit, _ = lit_frames(FALLING, Stare.of(300.0))
     rng = np.random.default_rng(5)

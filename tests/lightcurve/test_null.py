@@ -1,4 +1,4 @@
-"""False alarms: the common rule, the null by counting and by importance sampling, random stares."""
+"""False alarms of the common rule, by counting, by importance sampling, and in random stares."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from mauvecl.study.searches import SearchChoice
 
 
 class TestInARow:
-    """Three consecutive points above three sigma."""
+    """Tests of the rule of three consecutive points above three sigma."""
 
     def test_simulated_rate_agrees_with_theory(self):
         assert consecutive_alarm_rate(3, 3.0, 5.0) == pytest.approx(4.245e-5, rel=5e-4)
 
     def test_rate_equals_that_of_the_chain(self):
-        """Runs that begin, by the states of a Markov chain: how many of the last points were above."""
+        """Compute the rate of runs from a Markov chain whose state is the number of preceding points above."""
         above, points, frames = float(special.ndtr(-1.5)), 3, 200
         state, alarms = np.array([1.0, 0.0, 0.0, 0.0]), 0.0
         for _ in range(frames):
@@ -38,7 +38,7 @@ class TestInARow:
         assert consecutive_alarm_rate(points, 1.5, 86_400 / frames) == pytest.approx(alarms, rel=1e-12)
 
     def test_alarms_of_noise_are_counted(self):
-        """As many as the rate says: fails by chance once in 10^4 runs (4 standard errors of a Poisson count)."""
+        """Compare counts with the rate within 4 standard errors of a Poisson count; fails once in 10^4 runs."""
         noise = np.random.default_rng(4).standard_normal((500, 17280), dtype=np.float32)
         expected = 500 * consecutive_alarm_rate(3, 2.0, 5.0)
         assert abs(consecutive_alarms(noise, 3, 2.0).sum() - expected) < 4 * np.sqrt(expected)
@@ -56,7 +56,7 @@ def test_rates_convert_between_day_month_and_year():
 
 
 def test_counted_null_is_inverted():
-    """The rate at the threshold of a rate is that rate, within a count."""
+    """Check that the rate at the threshold of a rate is that rate, within a count."""
     null = CountedRate(np.sort(np.random.default_rng(1).gumbel(size=1000)), 0.5)
     cut = null.threshold(0.3)
     assert null.rate(cut.value).value == pytest.approx(0.3, rel=0.02)
@@ -77,7 +77,7 @@ def short():
 class TestSampled:
     @pytest.mark.long
     def test_rate_agrees_with_counting(self, short):
-        """Where both can say. Fails by chance once in 10^3 runs: 4 standard errors at six thresholds."""
+        """Compare six thresholds within 4 standard errors; fails once in 10^3 runs."""
         search, tail = short
         rng = np.random.default_rng(5)
         maxima = search.largest(rng.standard_normal((2000, search.stare.n_frames, 2), dtype=np.float32)).maximum
@@ -89,7 +89,7 @@ class TestSampled:
 
     @pytest.mark.long
     def test_repeated_estimates_scatter_by_their_errors(self):
-        """Twelve seeds of the default bank at half an orbit: their scatter, and a direct draw of the noise.
+        """Compare the scatter of twelve seeds of the default bank with their errors, and with drawn noise.
 
         Chi-squared of 11 degrees at three thresholds, and the mean of the seeds within 4 standard errors at two where
         alarms can be counted: fails by chance once in 10^3 runs. The stated error of the rate at one false alarm per
@@ -113,7 +113,7 @@ class TestSampled:
             assert abs(p.mean() - q) < 4 * np.hypot(p.std() / np.sqrt(12), np.sqrt(q * (1 - q) / n))
 
     def test_rate_of_one_filter_equals_the_closed_form(self):
-        """Independent frames: templates shorter than a frame leave P = 1 - (1 - Q)^n."""
+        """Compare independent frames with P = 1 - (1 - Q)^n."""
         stare = Stare.of(500.0)
         search = Search(Bank((0.02,), ONE, DAVENPORT, 5.0, KNOWN), stare)
         tail = sample_rate(search, seed=1, draws=50)
@@ -158,7 +158,7 @@ def stares():
 
 @pytest.mark.long
 def test_false_alarms_in_random_stares_are_as_requested(stares):
-    """Alarms are as requested within 4 standard errors in 50 random stares: once in 10^4 runs it fails by chance.
+    """Count alarms in 50 random stares within 4 standard errors; fails once in 10^4 runs.
 
     The cycle is marginalised in time, or the dark in each frame. The plain statistic, which takes all for known,
     alarms nearly always.
@@ -189,7 +189,7 @@ def test_false_alarms_in_random_stares_are_as_requested(stares):
 
 
 def test_false_alarms_with_unknown_noise_are_as_requested(stares):
-    """A star whose level drifts, a detector some degrees warmer or colder: the null is that of the stares drawn.
+    """Draw drifting stars and detectors some degrees warmer or colder, which the null includes.
 
     Counted at thresholds that 30 to 8 % of them exceed: three times 4 standard errors, once in 10^4 runs. The null of
     the known noise has a sixtieth of the alarms at the last.

@@ -32,7 +32,7 @@ def maxima(survey: Survey, count: int) -> np.ndarray:
 @pytest.mark.long
 @pytest.mark.parametrize("star", ['{library="M3V", magnitude=9.0}', '{library="K3V", magnitude=4.5}'])
 def test_false_alarms_stay_as_promised_with_drifts(star: str) -> None:
-    """At most the wanted rate within 4.5 standard deviations: fails by chance in 3e-6 of runs.
+    """Count at most the wanted rate within 4.5 standard deviations; fails in 3e-6 of runs.
 
     Thresholds are bounds from above, and frames in drifts have less noise, so that there may be somewhat fewer alarms.
     """
@@ -52,7 +52,7 @@ def test_search_that_does_not_marginalise_alarms_in_nearly_every_stare() -> None
 
 
 def test_drifts_move_marginalised_sums_by_less_than_their_noise() -> None:
-    """The same noise with and without drifts: sums of frames differ by far less than a standard deviation."""
+    """Draw the same noise with and without drifts; sums of frames hardly differ."""
     survey = survey_star(case('{library="M3V", magnitude=9.0}', HEAVY)).survey
     steady = replace(survey, stare=replace(survey.stare, pointing=None))
     found = [
@@ -66,7 +66,7 @@ def test_drifts_move_marginalised_sums_by_less_than_their_noise() -> None:
 
 
 def test_flares_lose_light_in_drifts() -> None:
-    """The mean excess of a flare at constant amplitude in a frame is its share of the light that is left."""
+    """Compare the mean excess of a flare of constant amplitude with the share of the light that is left."""
     survey = survey_star(case('{library="M3V", magnitude=9.0}', HEAVY)).survey
     n = survey.stare.n_frames
     amplitudes = np.array([[0.0], [50.0]])

@@ -1,4 +1,4 @@
-"""Rates of flares: published relations, AltaiPony's convention, tables, other bands; what a campaign recovers."""
+"""Rates of flares: published relations, AltaiPony's convention, tables, other bands, and recovery."""
 
 from pathlib import Path
 
@@ -31,7 +31,7 @@ from mauvecl.study.cases import cases
 
 
 def test_davenport2019_rates_equal_published_values() -> None:
-    """TIME.md, section 3."""
+    """Compare with TIME.md, section 3."""
     found = davenport2019(mass_msun=0.5, age_myr=100)
     assert float(found.per_day_above(1e33)) == pytest.approx(0.074131, abs=5e-7)
     # Fewer flares of older stars.
@@ -39,7 +39,7 @@ def test_davenport2019_rates_equal_published_values() -> None:
 
 
 def test_rates_follow_the_convention_of_altaipony() -> None:
-    """dN/dE = beta E^-alpha, integrated by hand."""
+    """Integrate dN/dE = beta E^-alpha by hand."""
     law = PowerLaw(alpha=1.8, log10_beta=27.0, band="TESS")
     energy = np.geomspace(1e33, 1e34, 200_001)
     between = np.trapezoid(10**27.0 * energy**-1.8, energy)
@@ -58,7 +58,7 @@ def test_presets_equal_published_values() -> None:
 
 
 def test_rates_convert_between_bands() -> None:
-    """Blackbodies: the same flares, other energies; there and back."""
+    """Convert energies of blackbodies to another band and back."""
     law = davenport2019(mass_msun=0.5, age_myr=100)
     factor = band_factor("Kepler", "bolometric", 9000.0)
     assert factor == pytest.approx(5.670374419e-5 * 9000.0**4 / in_band("Kepler", 9000.0))
@@ -102,7 +102,7 @@ def test_yield_without_scatter_is_poisson() -> None:
 
 
 def test_yield_with_scatter_agrees_with_simulation() -> None:
-    """Against 200 000 draws; its quantiles scatter by half a per cent."""
+    """Compare with 200 000 draws, whose quantiles are known to half a per cent."""
     rng = np.random.default_rng(11)
     draws = rng.poisson(20.0 * 10 ** (0.4 * rng.standard_normal(200_000)))
     found = Yield.of_expected(20.0, 0.4)
@@ -111,7 +111,7 @@ def test_yield_with_scatter_agrees_with_simulation() -> None:
 
 
 def test_gain_in_a_long_stretch_equals_the_closed_form() -> None:
-    """Far from the ends it is sqrt(.72148 t_half / 5 s): TIME.md, section 4; taking off a line costs little."""
+    """Compare with sqrt(.72148 t_half / 5 s) far from the ends (TIME.md, section 4); a fitted line costs little."""
     widths, gain = _gains(shape_of("davenport2014"), 20_000.0, 5.0)
     i = int(np.argmin(np.abs(widths - 60.0)))
     middle = gain[i, 6:18]
@@ -122,7 +122,7 @@ def test_gain_in_a_long_stretch_equals_the_closed_form() -> None:
 
 
 def test_closed_form_completeness_agrees_with_white_noise() -> None:
-    """What a matched filter of the right width finds in drawn stretches, against the completeness in closed form.
+    """Compare with matched filters of the correct width in drawn stretches.
 
     2000 stretches: three standard deviations are 3.4 % at most; of five energies one misses them once in some 70 tests
     with other seeds; this one is fixed.
@@ -156,7 +156,7 @@ def test_completeness_is_written_as_a_table() -> None:
 
 
 def test_frame_signal_equals_the_sum_over_pixels() -> None:
-    """The matched S/N of one frame, as the noise budget has it."""
+    """Compare with the matched S/N of one frame from its noise budget."""
     from mauvecl import Study
 
     study = Study().with_settings(["observation.exposure_s=5", "flare.amplitudes=[0.01]"])
@@ -169,7 +169,7 @@ def test_frame_signal_equals_the_sum_over_pixels() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("alpha", [1.6, 2.1])
 def test_power_law_is_recovered_from_drawn_flares(alpha: float) -> None:
-    """Flares drawn from a power law and put through the completeness give back exponent and rate.
+    """Draw flares from a power law, apply the completeness, and fit exponent and rate.
 
     350 campaigns of some 60 recovered flares, with an error of their energies: 68 +- 5 % within one sigma. By chance a
     right method misses these bounds in one such count of 22 (2 sigma of the binomial), and there are two of them here;
@@ -195,7 +195,7 @@ def test_power_law_is_recovered_from_drawn_flares(alpha: float) -> None:
 
 @pytest.mark.parametrize(("name", "factor"), [("M3V", 1.187), ("G2V", 1.049)])
 def test_published_energies_become_those_of_light(name: str, factor: float) -> None:
-    """One flare, of one equivalent duration, has one rate, by whichever energy it is looked up."""
+    """Check that a flare of one equivalent duration has one rate in every kind of energy."""
     from mauvecl.host.stars.source import Source
     from mauvecl.lightcurve.flares.energies import quiescent_luminosity
 

@@ -1,4 +1,4 @@
-"""Searches: what the filters compute, what a bank loses, what it gains over the common rule."""
+"""Searches: values of filters, losses of a bank, and gains over the common rule."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def filtered(search, sums, curves):
 
 @pytest.mark.parametrize("level", [KNOWN, Baseline(window_s=600.0), Baseline(cycle=True, window_s=600.0)])
 def test_filters_are_least_squares_over_gaps(level):
-    """Correlations by FFT against a fit for each template, with gaps, unequal variances, and a level that moves."""
+    """Compare correlations by FFT with a fit for each template, with gaps, unequal variances and a varying level."""
     stare = Stare.of(6000.0, gaps=[(1000, 1500), (3000, 3050)])
     rng = np.random.default_rng(1)
     curves = np.array([np.sin(stare.start_s / 600), np.cos(stare.start_s / 600)]) if level.cycle else np.zeros((0, 1))
@@ -58,7 +58,7 @@ def test_filters_are_least_squares_over_gaps(level):
 
 
 def test_template_is_the_filter():
-    """`template` gives the weights behind a value, of variance one."""
+    """Check that `template` returns the weights of a value, which give unit variance."""
     stare = Stare.of(3000.0, gaps=[(900, 1100)])
     bank = Bank((41.0,), np.array([[0.6, 0.8]]), DAVENPORT, 5.0, Baseline(window_s=400.0))
     search = Search(bank, stare)
@@ -83,7 +83,7 @@ def test_largest_finds_the_flare():
 
 @pytest.mark.parametrize("level", [KNOWN, Baseline()])
 def test_bank_loses_little_in_time(level):
-    """Half-widths of 10-1800 s at any place of their frames lose at most 1.3 % of S/N (spectra: 0.7 %)."""
+    """Check a loss of 1.3 % of S/N at most for half-widths of 10-1800 s at any phase (spectra: 0.7 %)."""
     bank = Bank(HALF_WIDTHS_S, ONE, DAVENPORT, 5.0, level)
     stare = Stare.of(60_000.0)
     search = Search(bank, stare)
@@ -108,7 +108,7 @@ def day():
 
 
 def test_largest_value_of_a_day(day):
-    """Quantiles 3.73, 4.20, 4.67, and 0.41-0.48 independent tests a frame. Fails by chance once in 10^4 runs."""
+    """Compare quantiles with 3.73, 4.20, 4.67 and 0.41-0.48 independent tests a frame; fails once in 10^4 runs."""
     rng = np.random.default_rng(18)
     days = 400
     parts = [day.largest(rng.standard_normal((50, 17280, 1), dtype=np.float32)) for _ in range(days // 50)]

@@ -1,4 +1,4 @@
-"""Stares on the device against their NumPy twin, bit for bit, and against their own splits."""
+"""Stares of the device, compared bit by bit with the NumPy reference and with their own splits."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_stares_equal_the_reference(stares: Stares, name: str, method: Any) -> N
 @pytest.mark.long
 @pytest.mark.parametrize("method", ["pixels", "cumulants"])
 def test_splitting_changes_no_bit(engine: Engine, method: Any) -> None:
-    """Whatever the tile, the neighbours or the call: a stare follows from seed and number, a frame from its time."""
+    """Check that stares depend on seed and number alone, and frames on their time, however calls are divided."""
     components, stare, flare, amplitudes, _ = case("electrons")
     how: dict[str, Any] = {"seed": SEED, "method": method}
     whole = Stares(engine.open_device).frames(
@@ -136,7 +136,7 @@ class Beside:
 @pytest.mark.parametrize("method", ["pixels", "cumulants"])
 @pytest.mark.parametrize("name", ["plain", "all that wobbles", "unknown alone"])
 def test_sums_for_flares_equal_the_reference(stares: Stares, name: str, method: Any) -> None:
-    """Normals of their own, the light that the frames have; whatever share of the stares is drawn."""
+    """Check their own normals and the light of the frames, for any share of drawn stares."""
     components, stare, *_ = case(name)
     asked = StaresRequest(
         components, stare, COUNT, SEED, start=FIRST, method=method, reduction=Beside(), glow=True

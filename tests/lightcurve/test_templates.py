@@ -24,7 +24,7 @@ def star(request):
 
 @pytest.mark.parametrize("case", CASES)
 def test_sums_have_covariance_one(star, case):
-    """W C W^T = 1 for finite spreads; what is projected out changes no sum."""
+    """Check W C W^T = 1 for finite spreads, and that projected directions change no sum."""
     quiet, flares = star
     nuisances = frame_nuisances(quiet, Stare.of(100.0), CASES[case])
     t = Templates.of(quiet, flares, TEMPERATURES_K, nuisances=nuisances)
@@ -39,7 +39,7 @@ def test_sums_have_covariance_one(star, case):
 
 @pytest.mark.parametrize("case", CASES)
 def test_few_temperatures_lose_little_snr(star, case):
-    """Flares of 6000-20 000 K between the temperatures of the templates; 1.3 % of the S/N may be lost in time."""
+    """Use flares of 6000-20 000 K between the templates; time may cost 1.3 % of the S/N."""
     quiet, flares = star
     nuisances = frame_nuisances(quiet, Stare.of(100.0), CASES[case])
     t = Templates.of(quiet, flares, TEMPERATURES_K, nuisances=nuisances)

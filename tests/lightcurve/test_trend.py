@@ -1,4 +1,4 @@
-"""What unknowns do beyond first order: random drifts and cycles, the null drawn by NumPy alone; flares in them."""
+"""Unknowns beyond first order: random drifts and cycles, nulls drawn by NumPy alone, and flares."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def random_stare(rng):
 
 @pytest.mark.long
 def test_false_alarms_with_random_drifts_and_cycles():
-    """Alarms are as requested within 4 standard errors in 12 random stares: once in 10^4 runs it fails by chance.
+    """Count alarms in 12 random stares within 4 standard errors; fails once in 10^4 runs.
 
     With unknowns three times as far out, at the threshold for one false alarm per star-month, fewer than 7 alarms,
     where a chance of one in 10^5 has as many for the 0.6 that are expected.
@@ -84,7 +84,7 @@ def test_false_alarms_with_random_drifts_and_cycles():
 
 @pytest.mark.long
 def test_thresholds_allow_for_residual_variability():
-    """Cycles and drifts that the search does not marginalise over: the threshold rises with them, or is refused.
+    """Check that unmodelled cycles and drifts raise the threshold, or that the search is refused.
 
     In six random stares, alarms at the threshold for two stares in ten are as often as asked for, within a factor of
     1.3 and 4 standard errors: once in 10^4 runs it fails by chance. At the threshold for no unknowns many more do.
@@ -119,7 +119,7 @@ def drifting():
 
 
 def test_amplitudes_are_recovered(drifting):
-    """Within thousandths of a standard deviation of the prior, for drifts to four of them."""
+    """Compare amplitudes up to four standard deviations of the prior, to thousandths of one."""
     one, _ = drifting
     sums, z = drawn(one, np.random.default_rng(2), 6, 2.0)
     found = one.trend.fitted(sums - one.known)
@@ -127,7 +127,7 @@ def test_amplitudes_are_recovered(drifting):
 
 
 def test_trend_of_zero_changes_nothing():
-    """Unknowns of light alone, or a temperature in whose dark no bend is seen: sums are left as they are."""
+    """Check that unknowns of light alone, or of an unbent dark, leave sums unchanged."""
     for unknowns in ({"drifts": {"star": 0.01}}, {"drifts": {"temperature": 1e-4}}, {}):
         one, _ = survey(Stare.of(6000.0, **unknowns), Baseline(), (25.0,), part=True)
         assert one.trend is None
@@ -135,7 +135,7 @@ def test_trend_of_zero_changes_nothing():
 
 @pytest.mark.parametrize("size", [20.0, 100.0, 1000.0])
 def test_flares_equal_those_without_a_drift(drifting, size):
-    """A flare's value and energy with the drift, for three drifts, are those in the same noise without one.
+    """Compare values and energies of flares with three drifts and without one, in the same noise.
 
     Within 1 % or half a standard deviation, for flares that a search finds at 20 to 1000.
     """

@@ -1,4 +1,4 @@
-"""Whether draws that should know nothing of each other do: by recipe, and by every mixture of recipes in a group."""
+"""Independence of draws, for every method and every mixture of methods in a group."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hits of cosmic rays that together carry a frame to saturation: what is drawn is cut off as single frames are."""
+"""Cosmic rays that together saturate a frame are clipped as in single frames."""
 
 from __future__ import annotations
 

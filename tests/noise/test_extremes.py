@@ -1,4 +1,4 @@
-"""Words and counters at their ends, through the production kernels."""
+"""Extreme words and counters in the production kernels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What priors draw, as nodes: against the priors' own moments, and a mixture against its parts drawn."""
+"""Distributions of factors as nodes, compared with the priors' moments and with drawn mixtures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Optional processes: each draws what it says, from a stream of its own, and moves nothing else."""
+"""Optional processes: each has its distribution and its own stream, and changes nothing else."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Near and beyond saturation: what is drawn, and the closed forms of it."""
+"""Draws and closed forms near and beyond saturation."""
 
 from __future__ import annotations
 

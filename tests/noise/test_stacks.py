@@ -1,4 +1,4 @@
-"""Stacks against their frames: where rounding is not noise, frames are drawn one by one."""
+"""Stacks against their frames; frames are drawn singly where rounding does not act as noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The great flare of AD Leo (1985) through Mauve: what a blackbody, a Balmer jump and the optical alone make of it.
+"""The great flare of AD Leo (1985) seen by Mauve: fits of a blackbody, of a Balmer jump, and of the optical alone.
 
 In Python, and by the command line, which takes the flare for as bright as it was observed.
 
@@ -24,7 +24,7 @@ QUIET, GAP_NM = DATA / "flares" / "adleo_quiescent2.dat", (322.0, 368.0)
 
 
 def test_blackbody_is_rejected_and_jump_is_measured(engine: Engine) -> None:
-    """200 exposures of 50 s; of the good fits 1 % have p < 0.01, more than 40 % of them once in 1e40."""
+    """Fit 200 exposures of 50 s; 1 % of good fits have p < 0.01, more than 40 % of them once in 1e40."""
     star = Source.read(QUIET, wavelength_unit="Angstrom", extend="M3V")
     mauve = Instrument.load("mauve")
     quiet = expect(star, mauve, exposure=50.0)
@@ -60,7 +60,7 @@ def ad_leo_words(seconds: int) -> tuple[str | Path, ...]:
 
 
 def test_command_line_measures_the_flare(tmp_path: Path) -> None:
-    """200 exposures of 50 s; of the good fits 1 % have p < 0.01, more than 40 % of them once in 1e40.
+    """Measure 200 exposures of 50 s; 1 % of good fits have p < 0.01, more than 40 % of them once in 1e40.
 
     The spectra of `fit` are added on another grid, so that intervals agree to a few percent of an error.
     """
@@ -87,7 +87,7 @@ def test_command_line_measures_the_flare(tmp_path: Path) -> None:
 
 
 def test_flare_as_observed_has_no_other_amplitude(tmp_path: Path) -> None:
-    """A sweep over amplitudes, and a flare without a file, cannot be as bright as observed."""
+    """Refuse a sweep over amplitudes, and a flare without a file."""
     code, _, told = ended(*ad_leo_words(912), "--sweep", "amplitude=0.1,0.2", folder=tmp_path)
     assert code == 2
     assert "amplitude" in told

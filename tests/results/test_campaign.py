@@ -22,7 +22,7 @@ def test_day_of_single_frames_has_its_false_alarms() -> None:
 
 @pytest.mark.parametrize(("stack", "step"), [(2, 1), (10, 1), (10, 5)])
 def test_overlap_lies_between_the_bounds(stack: int, step: int) -> None:
-    """Overlapping stacks alarm together: less often than independent ones, more often than stacks end to end."""
+    """Check that overlapping stacks alarm less often than independent ones and more often than adjacent ones."""
     found, apart = campaign(1e-3, 600, stack, step=step), campaign(1e-3, 600, stack)
     assert found.overlapping is not None
     assert found.tests == (600 - stack) // step + 1
@@ -31,7 +31,7 @@ def test_overlap_lies_between_the_bounds(stack: int, step: int) -> None:
 
 
 def test_two_overlapping_stacks_equal_the_exact_probability() -> None:
-    """Two stacks of two frames that share one: the bivariate normal with correlation one half."""
+    """Compare two stacks of two frames that share one with a bivariate normal of correlation 1/2."""
     found = campaign(0.05, 3, 2, step=1)
     cut = stats.norm.isf(0.05)
     both = stats.multivariate_normal([0, 0], [[1, 0.5], [0.5, 1]]).cdf([cut, cut])
@@ -43,7 +43,7 @@ def test_two_overlapping_stacks_equal_the_exact_probability() -> None:
 
 @pytest.mark.long
 def test_long_campaigns_are_joined_from_stretches() -> None:
-    """Ten times the frames: the chance of no alarm to the tenth power, to four standard errors."""
+    """Check that ten times the frames take P(no alarm) to the tenth power, to four standard errors."""
     one, ten = campaign(1e-5, 40_005, 10, step=1), campaign(1e-5, 400_050, 10, step=1, seed=2)
     assert one.overlapping is not None
     assert ten.overlapping is not None
@@ -65,7 +65,7 @@ def test_false_alarm_probability_per_test_is_the_inverse(wanted: float, frames: 
 
 
 def test_overlapping_stacks_allow_more_per_test() -> None:
-    """There and back through other draws: 20 000 campaigns leave 0.05 to 6 %, four standard errors of both."""
+    """Invert with other draws: 20 000 campaigns give 0.05 to 6 %, four standard errors of both."""
     one = per_test(0.05, 600, 10, step=1, seed=1)
     assert one.overlapping is not None
     assert one.overlapping.low <= one.overlapping.value <= one.overlapping.high

@@ -1,4 +1,4 @@
-"""Where the simulation leaves the closed form: each cause shown where it rules, and predicted."""
+"""Departures of the simulation from the closed form: each cause is predicted where it dominates."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def found(engine: Engine, *, magnitude: float = 7.4, exposure: float = 5.0, **op
 
 
 def test_nominal_payload_is_gaussian(engine: Engine) -> None:
-    """Nothing differs at 50 s: six values beyond 4 standard errors once in 2500 seeds; no cause is worth 1 %."""
+    """Check that nothing differs at 50 s; six values exceed 4 standard errors once in 2500 seeds."""
     for d in found(engine, exposure=50.0, statistics=tuple(STATISTICS)).values():
         assert not d.differs
         assert d.why == ""
@@ -34,7 +34,7 @@ def test_nominal_payload_is_gaussian(engine: Engine) -> None:
 
 
 def test_skew_is_predicted(engine: Engine) -> None:
-    """A few dark counts and little read noise: Poisson's tail, predicted to a fifth of its effect."""
+    """Predict Poisson's tail for few dark counts and little read noise, to a fifth of its effect."""
     d = found(engine, read_noise_dn=1.0, dark_scale_dn_per_s=0.2, magnitude=14.0)["chi2"]
     assert d.why == "skew of the noise"
     assert d.ratio - 1 == pytest.approx(d.skew, rel=0.2, abs=4 * d.error)
@@ -42,7 +42,7 @@ def test_skew_is_predicted(engine: Engine) -> None:
 
 
 def test_clipping_is_predicted(engine: Engine) -> None:
-    """A bias of five DN below twelve of read noise: what is cut at zero moves every sum."""
+    """Predict the effect of clipping at zero, for a bias of 5 DN and a read noise of 12 DN."""
     rows = found(engine, bias_dn=5.0, dark_scale_dn_per_s=0.0, magnitude=12.0)
     assert {d.why for d in rows.values()} == {"clipping"}
     assert rows["uv_excess"].ratio - 1 == pytest.approx(rows["uv_excess"].clipping, rel=0.05)
@@ -51,7 +51,7 @@ def test_clipping_is_predicted(engine: Engine) -> None:
 
 
 def test_rounding_is_predicted(engine: Engine) -> None:
-    """Noise below the ADC's step: most counts are the same, and their sum hardly scatters."""
+    """Predict the effect of rounding, for noise below the ADC's step."""
     range_nm = {"output_min_nm": 200.0, "output_max_nm": 260.0}
     d = found(engine, read_noise_dn=0.35, dark_scale_dn_per_s=0.0, magnitude=20.0, **range_nm)["chi2"]
     assert d.why == "rounding"
@@ -60,7 +60,7 @@ def test_rounding_is_predicted(engine: Engine) -> None:
 
 
 def test_estimated_variances_are_predicted(engine: Engine) -> None:
-    """Where photons rule, a low count has a low variance: chi-squared's null is no longer one."""
+    """Predict chi-squared's null for estimated variances, where low counts have low variances."""
     kind = {"read_noise_dn": 3.0, "dark_scale_dn_per_s": 0.0, "magnitude": 6.0}
     assert found(engine, **kind, comparison=Comparison(0, True))["chi2"].why == "variances estimated from the counts"
     assert not found(engine, **kind)["chi2"].differs
@@ -78,7 +78,7 @@ def test_causes_equal_those_of_the_answer() -> None:
 
 
 def test_undrawn_unknowns_are_reported(engine: Engine) -> None:
-    """A prior that nothing scatters by leaves fewer false alarms than the closed form expects."""
+    """Report fewer false alarms than in the closed form if a prior is not drawn."""
     quiet, flare = star(amplitudes=(0.24,))
     found = engine.detect(quiet, [flare], realisations=100_000, seed=1, nuisances={"dark": 0.1})
     rows = {d.statistic: d for d in departures(found, 0.01)}

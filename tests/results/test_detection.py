@@ -1,4 +1,4 @@
-"""Detection: calibrated nulls, probabilities against closed forms, inversions, and honest refusals."""
+"""Detection: calibrated nulls, probabilities against closed forms, inversions, and refusals."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def ks_probability(d: Distribution, sf: object) -> float:
 @pytest.mark.long
 @pytest.mark.parametrize("statistic", STATISTICS)
 def test_null_follows_its_closed_form(found: Detection, statistic: str) -> None:
-    """At 1e6 realisations of a star where Gaussian limits hold; fails by chance once in 1e6 seeds."""
+    """Compare 1e6 realisations of a star for which Gaussian limits hold; fails once in 1e6 seeds."""
     d = found.distribution(statistic)
     # The smoothed sum is a generalised chi-squared, which test_smoothing.py looks at.
     exact = stats.norm() if statistic in ("matched", "uv_excess") else stats.chi2(found.dof(statistic))
@@ -59,7 +59,7 @@ def test_null_follows_its_closed_form(found: Detection, statistic: str) -> None:
 @pytest.mark.parametrize("statistic", STATISTICS)
 @pytest.mark.parametrize("flare", range(len(AMPLITUDES)))
 def test_flare_follows_its_closed_form(found: Detection, statistic: str, flare: int) -> None:
-    """The whole distribution under a flare, binned on its own grid: the same test."""
+    """Compare the whole distribution under a flare, on its own grid, by the same test."""
     assert ks_probability(found.distribution(statistic, flare), found.closed_form(statistic, flare).sf) > 1e-6
 
 
@@ -67,7 +67,7 @@ def test_flare_follows_its_closed_form(found: Detection, statistic: str, flare: 
 @pytest.mark.parametrize("statistic", STATISTICS)
 @pytest.mark.parametrize("fap", [1e-2, 1e-3])
 def test_detection_probabilities_agree_with_the_closed_form(found: Detection, statistic: str, fap: float) -> None:
-    """Within 4 standard errors, binomial and of the threshold: 48 values, one chance failure in 500 seeds at most."""
+    """Compare 48 values within 4 standard errors, binomial and of the threshold; fails once in 500 seeds at most."""
     for flare, p in enumerate(found.detection_probability(fap, statistic)):
         theory = found.closed_form(statistic, flare)
         null = found.closed_form(statistic, template=flare)
@@ -84,7 +84,7 @@ def test_detection_probabilities_agree_with_the_closed_form(found: Detection, st
 
 @pytest.mark.long
 def test_flares_of_the_paper_are_ordered(found: Detection) -> None:
-    """More flare is never harder to see, and the right template is never beaten (Neyman & Pearson)."""
+    """Check that larger flares are detected more often, and the correct template most often (Neyman & Pearson)."""
     probability = {s: [p.value for p in found.detection_probability(1e-3, s)] for s in STATISTICS}
     for values in probability.values():
         assert all(a <= b + 1e-3 for a, b in pairwise(values))
@@ -126,7 +126,7 @@ def test_roc_equals_its_definition(found: Detection) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("flare", range(len(AMPLITUDES)))
 def test_area_under_the_roc_equals_its_closed_form(found: Detection, flare: int) -> None:
-    """Of two unit normals a distance d apart it is Phi(d / sqrt(2)): 4 half-widths of DeLong's, 6e-15 by chance."""
+    """Compare with Phi(d / sqrt(2)) within 4 half-widths of DeLong's interval; fails in 6e-15 of seeds."""
     null, with_flare = (found.closed_form("matched", f, template=flare) for f in (None, flare))
     exact = stats.norm.cdf((with_flare.mean - null.mean) / np.hypot(null.std, with_flare.std))
     area = found.roc("matched", flare).area
@@ -135,7 +135,7 @@ def test_area_under_the_roc_equals_its_closed_form(found: Detection, flare: int)
 
 
 def test_delong_interval_agrees_with_repeated_draws() -> None:
-    """200 pairs of samples: at least 178 intervals hold the exact area, fewer once in 1e4 runs of new seeds."""
+    """Check that 178 of 200 intervals contain the exact area; fails once in 1e4 new seeds."""
     rng, grid, held = np.random.default_rng(8), Grid(0, 0.0, 1.0), 0
     exact = stats.norm.cdf(1.0 / np.sqrt(2.0))
     for _ in range(200):
@@ -182,7 +182,7 @@ def test_table_has_all_rows(found: Detection) -> None:
 
 
 def test_saturated_pixels_are_left_out(engine: Engine) -> None:
-    """Pixels saturated without a flare have no news; the rest still gives a calibrated null."""
+    """Check that pixels saturated without a flare do not enter, and that the others give a calibrated null."""
     payload = instrument(part=True)
     quiet, flare = star(magnitude=-0.17, amplitudes=(0.05,), exposure=10.0, payload=payload)
     assert 0 < quiet.saturated.sum() < 10
@@ -198,7 +198,7 @@ def test_saturated_pixels_are_left_out(engine: Engine) -> None:
 
 
 def test_wider_wings_than_the_grid_are_counted(engine: Engine) -> None:
-    """On the null's grid a strong flare lies beyond its end, and is still above every threshold."""
+    """Count a strong flare beyond the end of the null's grid above every threshold."""
     quiet, flare = star(magnitude=3.0, amplitudes=(0.24,), payload=instrument(part=True))
     found = engine.detect(quiet, [flare], realisations=2000, seed=1)
     assert [p.value for p in found.detection_probability(0.05, "chi2")] == [1.0]
@@ -209,7 +209,7 @@ def test_wider_wings_than_the_grid_are_counted(engine: Engine) -> None:
 
 @pytest.mark.long
 def test_own_weights_define_a_statistic(engine: Engine) -> None:
-    """The matched filter given as weights is the matched filter; any other follows its normal."""
+    """Give the matched filter as weights, and compare other weights with their normal distribution."""
     quiet, *flares = star(amplitudes=AMPLITUDES)
     used = np.ones(quiet.wavelength_nm.size, bool)
     twin = Linear("twin", Matched().weights_per_dn(Setting(quiet, used), flares[1]))
@@ -233,7 +233,7 @@ def test_own_weights_define_a_statistic(engine: Engine) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("number", range(5))
 def test_random_scenes_agree_with_theory(engine: Engine, number: int) -> None:
-    """Detection probabilities of random scenes at 1e6, within 4 standard errors: 30 values, 2e-3 by chance.
+    """Compare 30 probabilities of random scenes at 1e6 within 4 standard errors; fails in 2e-3 of seeds.
 
     A star, magnitude, exposure, temperature and sky at random, and a flare near the edge of detection.
     """

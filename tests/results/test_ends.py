@@ -1,4 +1,4 @@
-"""No distribution has an end: every number of an answer against sorting the values of the same realisations.
+"""Every number of an answer, compared with sorting the values of the same realisations.
 
 Studies at random, most with something that carries statistics far from where Gaussian noise alone would leave them:
 priors, cosmic rays, noisy references, estimated variances, own weights, near-saturated stars. Nothing here is left to
@@ -157,7 +157,7 @@ def check_answers(found: Detection, statistic: str, k: int, null: Sorted, flare:
 @pytest.mark.long
 @pytest.mark.parametrize(("width", "number"), [(16, 0), (16, 1), (16, 2), (16, 5), (1, 0), (1, 1)])
 def test_snr_equals_that_of_sorting(width: int, number: int) -> None:
-    """Means, spreads and quantiles per pixel and element, against the S/N of the raw spectra themselves."""
+    """Compare means, spreads and quantiles of pixels and elements with the S/N of the raw spectra."""
     (quiet, *_), how = study(number)
     n = 1000
     processes = how["processes"]
@@ -199,7 +199,7 @@ PRIOR = Processes(detector_temperature=Uniform(15.0, 24.0))
 
 
 def test_nan_values_are_refused(engine: Engine) -> None:
-    """Weights so large that float32 overflows in the flare: the null is answered, what reads the flare is not."""
+    """Use weights for which float32 overflows in the flare: the null is answered, numbers of the flare are refused."""
     quiet, flare = star(magnitude=5.0, amplitudes=(2.0,), payload=instrument(part=True))
     delta = (flare.signal_dn - quiet.signal_dn).sum()
     own = Linear("own", np.full(quiet.wavelength_nm.size, 1e38 / delta * 5))
@@ -218,7 +218,7 @@ def test_nan_values_are_refused(engine: Engine) -> None:
 
 
 def test_all_statistics_are_tested() -> None:
-    """Every statistic, reference, kind of variance, prior and cosmic rays are among the studies."""
+    """Check that the studies include every statistic, reference, variance, prior and cosmic rays."""
     hows = [study(number)[1] for number in range(STUDIES)]
     assert {name for how in hows for name in how["statistics"] if isinstance(name, str)} == set(STATISTICS)
     assert {how["comparison"].exposures for how in hows} == {0, 1, 3}

@@ -1,4 +1,4 @@
-"""Hundreds of flares: what each keeps in memory is bounded, and dividing them changes nothing."""
+"""Hundreds of flares: bounded memory for each, and equal results however they are divided."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_batches_of_flares_equal_all_at_once(engine: Engine) -> None:
 
 @pytest.mark.long
 def test_memory_per_flare_is_bounded(engine: Engine) -> None:
-    """From bright flares, whose bins are many, to faint ones; a histogram of all bins would keep 2 MB."""
+    """Include bright flares, which fill many bins, and faint ones; a full histogram would take 2 MB."""
     sizes = {}
     seen(engine, np.array([0.1])).table(0.01)
     for number in (6, 22):
@@ -58,7 +58,7 @@ def test_memory_per_flare_is_bounded(engine: Engine) -> None:
 
 
 def test_sparse_shards_are_restored(engine: Engine) -> None:
-    """Counts pass through shards, in any order and twice over, to the same distributions."""
+    """Add shards in any order and repeatedly; distributions are the same."""
     quiet, *flares = star("G2V", 7.4, amplitudes=(0.01, 1.0), exposure=50.0, payload=PAYLOAD)
     request = DetectRequest(quiet, flares, 20_000, 4)
     sums = DetectionSums(request)

@@ -105,7 +105,7 @@ def test_forecasts_of_balmer_jumps_and_of_wrong_blackbodies(row: tuple[float, ..
 
 @pytest.mark.parametrize("name", ["280", "Ca II K", "Ca II H", "H beta", "H alpha"])
 def test_line_snr_equals_its_closed_form(name: str) -> None:
-    """1e-12 erg s-1 cm-2 in 50 s at M3V of V = 9: .050, .071, .071, .075 and .066 (specification, three decimals)."""
+    """Compare 1e-12 erg s-1 cm-2 in 50 s at M3V of V = 9 with .050, .071, .071, .075 and .066 (specification)."""
     wanted = {"280": 0.050, "Ca II K": 0.071, "Ca II H": 0.071, "H beta": 0.075, "H alpha": 0.066}[name]
     m, x = model(lines=(name,)), quiet()
     line = 1e-12 * m.fixed[0]
@@ -127,7 +127,7 @@ def test_line_snr_equals_its_closed_form(name: str) -> None:
 def test_forecasts_agree_with_brute_force(
     library: str, v: float, kelvin: float, jump: float, line: float, unknown: bool
 ) -> None:
-    """Whole spectra through `expect`, derivatives by differences, unknowns as parameters of the information."""
+    """Compare with whole spectra by `expect`, numerical derivatives, and unknowns as parameters."""
     x, s = quiet(library, v), star(library, v)
     m = FlareModel.of(s, MAUVE, x, jump=True, lines=("Ca II",))
     amplitudes = m.amplitudes(kelvin, 0.3, jump=jump, lines=(line,))
@@ -179,7 +179,7 @@ def bounds(n: int, low: float = 0.94, high: float = 0.96, false: float = 1e-6) -
 @pytest.mark.parametrize("unknown", [False, True], ids=["known", "free"])
 @pytest.mark.parametrize("jump", [False, True], ids=["blackbody", "jump"])
 def test_intervals_of_95_percent_cover(jump: bool, unknown: bool) -> None:
-    """24 cells of 600 fits; false failures: 2e-6 x 4 or 5 quantities x 24 cells and as much for all cells together.
+    """Fit 24 cells of 600 draws; 4 or 5 quantities of each fail in 2e-6 of seeds, and all cells together in as many.
 
     S/N is what is left when the unknowns are marginalised over.
     """
@@ -211,7 +211,7 @@ def test_intervals_of_95_percent_cover(jump: bool, unknown: bool) -> None:
 
 
 def test_hot_flare_has_a_lower_limit_of_temperature() -> None:
-    """False failures: the coverage of the one-sided limit is 97.5 % or more of 400; fewer than 370 have p < 1e-6."""
+    """Check a one-sided coverage of 97.5 % in 400 fits; fewer than 370 have p < 1e-6."""
     x, m = quiet(), model()
     amplitude = 0.01
     raw = drawn(x, m.counts(60_000.0, [amplitude]), 400, 31)
@@ -222,7 +222,7 @@ def test_hot_flare_has_a_lower_limit_of_temperature() -> None:
 
 
 def test_amplitude_without_a_flare_is_at_its_boundary() -> None:
-    """False failures: half of 400 pull to no light at one temperature; over temperatures fewer, not below 50 (1e-6)."""
+    """Check that half of 400 amplitudes are 0 at one temperature, and fewer over temperatures, at least 50 (1e-6)."""
     x, m = quiet(), model()
     found = fit(drawn(x, np.zeros(x.wavelength_nm.size), 400, 32), x, m, levels=(0.95,))
     amplitude = found.column("amplitude")
@@ -234,7 +234,7 @@ def test_amplitude_without_a_flare_is_at_its_boundary() -> None:
 
 
 def test_bounded_intervals_agree_with_brute_force() -> None:
-    """Jump and lines near their bounds: non-negative least squares of SciPy on grids of temperature and jump."""
+    """Compare jump and lines near their bounds with SciPy's non-negative least squares on grids."""
     x, m = quiet(), model(jump=True, lines=("Mg II",))
     raw = drawn(x, m.counts(9000.0, m.amplitudes(9000.0, 0.05, jump=1.05, lines=(2e-12,))), 4, 51)
     found, allowed = fit(raw, x, m, levels=(0.95,)), float(scipy.stats.chi2.isf(0.05, 1))
@@ -277,7 +277,7 @@ def test_bounded_intervals_agree_with_brute_force() -> None:
 def test_great_flare_of_ad_leo(
     file: str, misfits: tuple[float, float], jumps: tuple[float, float], optical_k: tuple[float, float]
 ) -> None:
-    """The mean exposure: no blackbody, a Balmer jump, and the 9500 K of the optical within its interval."""
+    """Fit the mean exposure: no blackbody, a Balmer jump, and an interval that contains the optical 9500 K."""
     data, units = Path(__file__).parents[1] / "data", {"wavelength_unit": "Angstrom"}
     ad_leo = Source.read(data / "flares" / "adleo_quiescent2.dat", extend="M3V", **units)  # type: ignore[arg-type]
     flare = ObservedFlare.read(data / file, data / "flares" / "adleo_quiescent2.dat", continue_at_k=9500.0, **units)  # type: ignore[arg-type]
@@ -300,7 +300,7 @@ def test_great_flare_of_ad_leo(
 
 
 def test_limits_at_a_bound_have_nominal_coverage() -> None:
-    """A flare without a jump, fitted with one: half of the fits are at the bound, and limits cover 97.5 %.
+    """Fit a jump to a flare without one: half of the fits are at the bound, and limits cover 97.5 %.
 
     At a bound the statistic is 0 or that of Wilks, each in half of the cases (Chernoff 1954). False failures: 1e-6.
     """
@@ -316,7 +316,7 @@ def test_limits_at_a_bound_have_nominal_coverage() -> None:
 
 
 def test_sums_of_the_device_give_the_fit_of_pixels(engine: Engine) -> None:
-    """The same 300 realisations as frames, and as sums that the device makes of their pixels."""
+    """Compare 300 realisations as frames with the device's sums of their pixels."""
     x = quiet()
     for jump in (1.0, 2.0):
         m = model(jump=jump > 1)
@@ -334,7 +334,7 @@ def test_sums_of_the_device_give_the_fit_of_pixels(engine: Engine) -> None:
 
 
 def test_sums_keep_the_information() -> None:
-    """At most 1 % of the information may be lost: here 1e-4 of an error, in and between the nodes."""
+    """Check that errors grow by 1e-4 at most, where 1 % would be allowed, at the nodes and between them."""
     x = quiet()
     for kelvin in (3100.0, 9500.0, 41_234.0):
         m = model(jump=True, lines=("Mg II", "H beta"))
@@ -374,7 +374,7 @@ def test_fit_does_not_depend_on_other_frames() -> None:
 
 @pytest.mark.long
 def test_intervals_agree_with_minos_and_emcee() -> None:
-    """One spectrum of a flare with a Balmer jump, dark and star unknown: the full likelihood, unknowns as parameters.
+    """Compare the full likelihood of a flare with a Balmer jump, with unknown dark and star as parameters.
 
     Our variance is that of the fitted flare; MINOS moves it along. False failures: emcee's own noise, some 3 % of an
     error against 15 %.

@@ -46,7 +46,7 @@ def atom(values: np.ndarray, fap: float) -> tuple[float, float]:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_threshold_exists_unless_a_value_is_too_probable(engine: Engine, seed: int) -> None:
-    """Over stars near saturation: refused exactly where an independent count of raw values finds such a value.
+    """Compare stars near saturation with an independent count of raw values.
 
     Values of one pixel are whole DN, many to a bin of the histogram at most: compared where they are clearly apart.
     """
@@ -82,7 +82,7 @@ def test_threshold_exists_unless_a_value_is_too_probable(engine: Engine, seed: i
 
 
 def test_scenes_include_stars_without_threshold(engine: Engine) -> None:
-    """The test above meets both kinds."""
+    """Check that the test above meets stars with and without a threshold."""
     kinds = set()
     for seed in range(20):
         quiet, _ = nearly_saturated(seed)
@@ -92,7 +92,7 @@ def test_scenes_include_stars_without_threshold(engine: Engine) -> None:
 
 
 def test_sampled_threshold_raises_as_well(engine: Engine) -> None:
-    """One frame is drawn as a stack: importance sampling meets the same value."""
+    """Sample a single frame, drawn as a stack, whose most probable value is the same."""
     quiet, flare = nearly_saturated(3)
     quiet, flare = (replace(x, n_frames=1) for x in (quiet, flare))
     light = quiet.source_electrons.copy()

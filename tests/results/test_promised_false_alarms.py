@@ -1,4 +1,4 @@
-"""What a sceptic would run: in random scenes, false alarms come as often as the threshold says."""
+"""False alarms in random scenes are as frequent as the threshold promises."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def scene(number: int) -> tuple:
 
 @pytest.mark.long
 def test_false_alarms_are_as_requested(engine: Engine) -> None:
-    """Eighteen sums over 80 scenes, and their scatter; both together fail by chance once in 1e6 runs.
+    """Check eighteen sums over 80 scenes, and their scatter; both together fail once in 1e6 runs.
 
     Each sum notices false alarms that are wrong by 16 % at 1e-4, 5 % at 1e-3 and 1.6 % at 1e-2 in all scenes.
 

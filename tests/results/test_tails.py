@@ -1,4 +1,4 @@
-"""Rare false alarms by importance sampling: against brute force, the closed form, and themselves."""
+"""Rare false alarms by importance sampling, compared with brute force and closed forms."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def found(engine: Engine) -> Detection:
 @pytest.mark.parametrize("statistic", STATISTICS)
 @pytest.mark.parametrize("fap", [1e-2, 1e-4, 3e-6])
 def test_sampled_tail_agrees_with_brute_force(found: Detection, statistic: str, fap: float) -> None:
-    """Realisations beyond the sampled threshold: |z| < 4.5 with both errors, 18 values, 1e-4 by chance."""
+    """Count realisations beyond sampled thresholds: 18 values with |z| < 4.5 fail in 1e-4 of seeds."""
     sampled = tail(found, fap, statistic, seed=3)
     null = found.distribution(statistic)
     beyond, expected = null.above(sampled.threshold.value), fap * N
@@ -54,7 +54,7 @@ def plain(engine: Engine) -> Detection:
 @pytest.mark.parametrize("statistic", STATISTICS)
 @pytest.mark.parametrize("fap", [1e-3, 1e-6, 1e-9])
 def test_sampled_tail_agrees_with_the_exact_closed_form(plain: Detection, statistic: str, fap: float) -> None:
-    """Within 4 standard errors."""
+    """Compare within 4 standard errors."""
     sampled = tail(plain, fap, statistic, seed=5)
     exact = plain.closed_form(statistic).sf(sampled.threshold.value)
     assert abs(exact / fap - 1) < 4 * sampled.relative_error
@@ -77,7 +77,7 @@ UNKNOWNS = {
 @pytest.mark.long
 @pytest.mark.parametrize("case", UNKNOWNS)
 def test_sampled_tail_with_unknowns_agrees_with_brute_force(engine: Engine, case: str) -> None:
-    """Up to three statistics at two probabilities, each case: |z| < 4.5 with both errors, 16 values, 1e-4 by chance."""
+    """Count up to three statistics at two probabilities: 16 values with |z| < 4.5 fail in 1e-4 of seeds."""
     nuisances, processes = UNKNOWNS[case]
     n = 500_000
     quiet, flare = star(amplitudes=(0.1,), payload=instrument(**PART))
@@ -95,7 +95,7 @@ def test_sampled_tail_with_unknowns_agrees_with_brute_force(engine: Engine, case
 
 @pytest.mark.parametrize("statistic", ["chi2", "matched"])
 def test_bins_do_not_move_a_sampled_threshold(engine: Engine, statistic: str) -> None:
-    """What a detection reports is what was sampled, and flares are counted there, not at the next edge of a bin."""
+    """Check that a detection reports and uses the sampled threshold instead of the next edge of a bin."""
     quiet, *flares = star(amplitudes=(0.05, 0.1), payload=instrument(**PART))
     found = engine.detect(quiet, flares, realisations=20_000, seed=2, statistics=("chi2", "matched"), tails="sampled")
     for fap in (1e-4, 1e-7):
@@ -116,7 +116,7 @@ def test_bins_do_not_move_a_sampled_threshold(engine: Engine, statistic: str) ->
 
 @pytest.mark.long
 def test_tail_intervals_have_nominal_coverage(engine: Engine) -> None:
-    """Of 60 intervals of 95 %, at least 50 hold the closed form: fewer once in 2000 runs of new seeds."""
+    """Check that 50 of 60 intervals of 95 % contain the closed form; fails once in 2000 new seeds."""
     payload = instrument(dark_scale_dn_per_s=0.0, read_noise_dn=60.0, output_min_nm=350.0, output_max_nm=360.0)
     quiet, flare = star(amplitudes=(0.1,), payload=payload)
     plain = engine.detect(quiet, [flare], realisations=100, seed=1, statistics=("chi2", "matched"), tails="sampled")
@@ -163,14 +163,14 @@ def compared(request: pytest.FixtureRequest, engine: Engine) -> Detection:
 @pytest.mark.long
 @pytest.mark.parametrize("statistic", STATISTICS)
 def test_sampled_tail_agrees_for_every_comparison(compared: Detection, statistic: str) -> None:
-    """At 1e-4 of 1e6 realisations: |z| < 4.5 with both errors, 12 values, 1e-4 by chance."""
+    """Compare 12 values at 1e-4 of 1e6 realisations: |z| < 4.5 fails in 1e-4 of seeds."""
     sampled, expected = tail(compared, ONE_IN, statistic, seed=4), ONE_IN * FEWER
     beyond = compared.false_alarm_probability(sampled.threshold.value, statistic).value * FEWER
     assert abs(beyond - expected) < 4.5 * np.hypot(np.sqrt(expected), sampled.relative_error * expected)
 
 
 def test_sum_in_dn_is_tilted_in_its_unit(engine: Engine) -> None:
-    """Weights of one DN each: |z| < 4.5 with both errors, 1e-5 by chance."""
+    """Use weights of one DN each: |z| < 4.5 fails in 1e-5 of seeds."""
     quiet, _ = star(amplitudes=(0.1,), payload=instrument(**PART))
     own = Linear("own", np.ones(quiet.wavelength_nm.size))
     n, fap = 400_000, 1e-3

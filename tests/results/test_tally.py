@@ -39,14 +39,14 @@ BIN = np.sqrt(2 * 1643) * 2**layout.FINE_BITS / layout.STEPS_PER_SIGMA
 
 
 def test_moments_equal_those_of_the_values(values: np.ndarray, found: Distribution) -> None:
-    """A fine step is 1/2048 of a standard deviation; its rounding averages out."""
+    """Compare moments on fine steps of 1/2048 of a standard deviation, whose rounding averages out."""
     assert found.mean == pytest.approx(values.mean(), abs=BIN / 200)
     assert found.std == pytest.approx(values.std(), rel=1e-5)
 
 
 @pytest.mark.parametrize("p", [0.001, 0.5, 0.97])
 def test_quantile_intervals_have_nominal_coverage(p: float) -> None:
-    """300 samples of 2000: at least 268 hold the true quantile, fewer once in 5000 runs of new seeds."""
+    """Check that 268 of 300 intervals contain the true quantile; fails once in 5000 new seeds."""
     rng, grid = np.random.default_rng(9), Grid(0, 0.0, 1.0)
     found = [distribution(rng.normal(size=2000), grid).quantile_interval(p) for _ in range(300)]
     assert sum(q.low <= stats.norm.ppf(p) <= q.high for q in found) >= 268
@@ -107,7 +107,7 @@ def bin_of(value: float, grid: Grid) -> float:
 @pytest.mark.parametrize("grid", GRIDS.values(), ids=list(GRIDS))
 @pytest.mark.parametrize("values", FAR.values(), ids=list(FAR))
 def test_numbers_agree_with_sorting_for_any_float(values: np.ndarray, grid: Grid) -> None:
-    """Moments, counts, thresholds and quantiles of any float32 on any grid, against sorting and exact sums."""
+    """Compare moments, counts, thresholds and quantiles of any float32 on any grid with sorting and exact sums."""
     values = values.astype(np.float32)
     found, ordered = distribution(values, grid), np.sort(values.astype(float))
     n = values.size
@@ -143,7 +143,7 @@ def test_numbers_agree_with_sorting_for_any_float(values: np.ndarray, grid: Grid
 
 
 def test_nan_is_refused() -> None:
-    """Counted, and never left out in silence."""
+    """Count NaN, and refuse numbers that depend on them."""
     found = distribution(np.array([0.0, np.nan, np.inf, -np.inf, 1.0, 1e9]), Grid(0, 0.0, 1.0))
     assert (found.far.undefined, found.far.n, found.counts.sum()) == (3, 1, 2)
     for read in (
@@ -161,7 +161,7 @@ def test_nan_is_refused() -> None:
 
 
 def test_order_and_splitting_change_nothing() -> None:
-    """The same values backwards, in uneven pieces: every count and both exact sums."""
+    """Add the same values backwards and in uneven pieces; all counts and both exact sums agree."""
     values, grid = FAR["every float"].astype(np.float32), GRIDS["unit"]
     whole, parts = Tally([grid]), Tally([grid])
     whole.add_far(0, values)
@@ -184,7 +184,7 @@ def test_picture_bins_contain_every_realisation(values: np.ndarray, found: Distr
 
 
 def test_moments_of_long_runs_stay_exact() -> None:
-    """Sums grow past 64 bits without wrapping."""
+    """Let sums grow past 64 bits without overflow."""
     tally = Tally([Grid(0, 0.0, 1.0)])
     sums = np.array([[2**40, 2**62]])
     for _ in range(8):

@@ -34,7 +34,7 @@ def model(**how: bool) -> FlareModel:
 
 
 def test_two_temperatures_are_recovered_without_noise() -> None:
-    """Second temperatures are tried 0.6 % apart, which is far below their error."""
+    """Compare to 0.6 %, the step between second temperatures, which is far below their error."""
     quiet, two, _ = expectations()
     found = fit_two(two.recorded_dn, quiet, model())
     best = dict(zip(found.names, found.estimates[0], strict=True))
@@ -53,7 +53,7 @@ def test_two_temperatures_are_recovered_without_noise() -> None:
 
 @pytest.mark.long
 def test_intervals_of_two_temperatures_have_nominal_coverage(engine: Engine) -> None:
-    """400 drawn exposures. False failures: a coverage of 93 to 97 %, 1e-6 on each side of four quantities."""
+    """Fit 400 draws: a coverage of 93 to 97 % fails in 1e-6 of seeds on each side of four quantities."""
     quiet, two, _ = expectations()
     found = fit_two(engine.realise(two, count=400, seed=3), quiet, model(), levels=(0.95,))
     exact = fit_two(two.recorded_dn, quiet, model())
@@ -72,7 +72,7 @@ def test_intervals_of_two_temperatures_have_nominal_coverage(engine: Engine) -> 
 
 @pytest.mark.long
 def test_second_temperature_of_a_single_blackbody_is_unconstrained(engine: Engine) -> None:
-    """A blackbody of 9000 K: no limit on the second temperature, and the first is that of the plain fit."""
+    """Fit a blackbody of 9000 K: the second temperature has no limit, the first is that of the plain fit."""
     quiet, _, one = expectations()
     found = fit_two(engine.realise(one, count=20, seed=5), quiet, model(), levels=(0.95,))
     area, second = found.column("second area"), found.column("second temperature")

@@ -1,4 +1,4 @@
-"""Dask workers in processes of their own: the same bits, whoever dies."""
+"""Dask workers in separate processes give the same bits, whichever of them end."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_two_processes_give_the_stares_of_one(workers: DaskWorkers, engine: Engi
 
 
 def test_killed_worker_is_replaced(workers: DaskWorkers, engine: Engine, scene: list[Expectation]) -> None:
-    """SIGKILL to a process that is counting: its shard is counted by another, and the answer keeps its bits."""
+    """Kill a counting process: another one counts its shard, and the answer has the same bits."""
     quiet, *flares = scene
     n, pids = 150_000, list(workers._client.run(os.getpid).values())
     pool = Pool(workers)
@@ -94,7 +94,7 @@ def greeted(port: int, context: ssl.SSLContext | None) -> bool:
 
 
 def test_strangers_cannot_connect(workers: DaskWorkers) -> None:
-    """Another user of this machine sees the ports; without this run's certificate none of them answers."""
+    """Check that no port answers without this run's certificate, since other users of the machine see them."""
     import psutil
     from distributed import Security
 
@@ -130,7 +130,7 @@ def test_two_processes_measure_the_flares_of_one(workers: DaskWorkers, engine: E
 
 
 def test_error_on_a_worker_raises(workers: DaskWorkers) -> None:
-    """An error that another try would not mend is not tried again."""
+    """Check that errors which another try would not mend are raised at once."""
     before = workers.retries
 
     (bright,) = star(magnitude=-0.7, payload=instrument(part=True))
@@ -143,7 +143,7 @@ def test_error_on_a_worker_raises(workers: DaskWorkers) -> None:
 
 
 class Silent:
-    """A Dask client that answers nothing and takes nothing back; its own futures as well."""
+    """Dask client that never answers and keeps its futures."""
 
     cluster, status = None, "running"
 
@@ -161,7 +161,7 @@ class Silent:
 
 
 def test_waiting_threads_are_woken_at_the_end(scene: list[Expectation], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever Dask does: threads that wait for shards, for spectra, and for each other end at once."""
+    """Check that threads which wait for shards, spectra or each other end at once, whatever Dask does."""
     monkeypatch.setattr("mauvecl.runs.cluster._client", lambda where, distributed: nullcontext(Silent()))
     monkeypatch.setattr(Silent, "run", lambda *given, **how: {}, raising=False)
     monkeypatch.setattr(Silent, "wait_for_workers", lambda *given, **how: None, raising=False)
@@ -195,7 +195,7 @@ def test_waiting_threads_are_woken_at_the_end(scene: list[Expectation], monkeypa
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_cluster_ends_its_workers(stop: signal.Signals, tmp_path: Path) -> None:
-    """Two seconds where this was written; five are promised.
+    """Check the promised five seconds.
 
     Ctrl-C in a terminal reaches the whole process group: workers are not of it, or what they build is cut off aloud.
     """
@@ -303,7 +303,7 @@ def test_example_for_batch_systems_runs(system: str, line: str) -> None:
 def test_existing_cluster_is_used(
     cluster: tuple[str, Path], by: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By address and by scheduler file, from the command line; the tables are those of one machine."""
+    """Name it by address and by scheduler file on the command line; tables equal those of one machine."""
     monkeypatch.chdir(tmp_path)
     Path("study.toml").write_text(small().toml())
     flags = ["detect", "study.toml", "--no-pictures", "--quiet"]

@@ -1,4 +1,4 @@
-"""Shards of a request: whoever counts them, in whatever order, however often, they add up to the engine's answer."""
+"""Shards of a request add up to the engine's answer, whoever counts them, in any order."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ pytestmark = pytest.mark.usefixtures("small_shards")
 
 
 class Shuffled(LocalWorkers):
-    """Answers shards late, in another order, and through the form they travel in."""
+    """Workers that answer shards late, in another order, and in the form in which they travel."""
 
     def __init__(self, engine: Engine, seed: int) -> None:
         super().__init__([None], make=lambda device, progress: engine)
@@ -89,7 +89,7 @@ def test_order_of_shards_does_not_affect_the_answer(engine: Engine, scene: list[
 
 @pytest.mark.long
 def test_shards_of_every_kind_of_request_join(engine: Engine) -> None:
-    """Several launches to a request, and everything that a request can carry."""
+    """Include requests with several launches and all arguments."""
     quiet, *flares = star(amplitudes=tuple(np.linspace(0.01, 0.3, 17)), payload=instrument(part=True))
     how: dict[str, Any] = {
         "realisations": 9000,
@@ -104,7 +104,7 @@ def test_shards_of_every_kind_of_request_join(engine: Engine) -> None:
 
 
 def test_devices_of_different_form_give_one_answer(scene: list[Expectation], engine: Engine) -> None:
-    """Two engines, one with 16 realisations to a work-item and one with 1, share the work and the answer's bits."""
+    """Share the work between engines with 16 realisations and with 1 per work-item."""
     quiet, *flares = scene
     widths = iter((16, 1))
 
@@ -192,7 +192,7 @@ def test_pool_gives_the_table_of_the_engine(
 
 
 def test_fingerprints_distinguish_requests(scene: list[Expectation]) -> None:
-    """Everything that changes an answer changes the name of its shards, and nothing else does."""
+    """Check that the name of a shard changes with everything that changes an answer, and with nothing else."""
     quiet, *flares = scene
     base = DetectRequest(quiet, tuple(flares), N, 5, ("chi2", "matched"))
     brighter = replace(flares[1], source_electrons=np.nextafter(flares[1].source_electrons, np.inf))
@@ -216,7 +216,7 @@ def test_fingerprints_distinguish_requests(scene: list[Expectation]) -> None:
 
 
 def test_shards_do_not_depend_on_the_number_of_realisations(scene: list[Expectation]) -> None:
-    """All but the last: so a longer run finds the shards of a shorter one."""
+    """Check all shards but the last, so that a longer run finds those of a shorter one."""
     quiet, *flares = scene
     short, long = (shards.shards(DetectRequest(quiet, tuple(flares), n, 5, ("chi2",))) for n in (N, 10 * N))
     assert short[:-1] == long[: len(short) - 1]
@@ -225,7 +225,7 @@ def test_shards_do_not_depend_on_the_number_of_realisations(scene: list[Expectat
 
 
 def test_large_requests_have_larger_shards(scene: list[Expectation], monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that there are never more than one process can add up."""
+    """Limit the number of shards to what one process can add up."""
     monkeypatch.setattr(shards, "SHARD_WORK", 2**34)
     for n in (10**6, 10**9, 10**12, 10**15):
         found = shards.shards(DetectRequest(scene[0], tuple(scene[1:]), n, 5, ("chi2",)))
@@ -276,7 +276,7 @@ def test_unfinished_run_is_not_overwritten(tmp_path: Path, engine: Engine) -> No
 
 
 def test_counts_of_another_form_raise(tmp_path: Path, engine: Engine) -> None:
-    """As an older version left them; also where the manifest is lost, none of its shards is added."""
+    """Refuse shards of an older version, also if their manifest is lost."""
     with pytest.raises(KeyboardInterrupt):
         at_work(tmp_path, engine, interrupting(10_000))
     path = tmp_path / "checkpoint" / "manifest.json"
@@ -352,7 +352,7 @@ def test_short_runs_leave_no_files(tmp_path: Path, engine: Engine) -> None:
 
 
 def test_jumps_of_the_clock_have_no_effect(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wall time runs backwards and leaps; neither shards nor progress care."""
+    """Let the wall time jump and run backwards; shards and progress are unaffected."""
     from mauvecl.cli.console import Meter
 
     leaps = iter(np.resize([1e9, -1e9, 0.0, 5e9], 100_000))

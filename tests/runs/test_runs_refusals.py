@@ -25,7 +25,7 @@ def test_invalid_cluster_raises(where: str) -> None:
 
 @pytest.mark.parametrize("package", ["distributed", "cryptography"])
 def test_missing_package_raises(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No cluster rather than one without encryption."""
+    """Refuse to start a cluster without encryption."""
     monkeypatch.setitem(sys.modules, package, None)
     with refused({"distributed": "dask"}.get(package, package), "'mauvecl[cluster]'"):
         DaskWorkers("local:2")

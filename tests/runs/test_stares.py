@@ -1,4 +1,4 @@
-"""A run of stares in shards: whoever draws them, whatever is kept of them, they join to the same bits."""
+"""Shards of stares join to the same bits, whoever draws them and whatever is kept."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("small_shards")
 
 @dataclass(frozen=True)
 class Largest:
-    """The largest value of each stare."""
+    """Reduction to the largest value of each stare."""
 
     adds: ClassVar[bool] = False
 
@@ -38,7 +38,7 @@ class Largest:
 
 @dataclass(frozen=True)
 class Above:
-    """How many frames lie above a level."""
+    """Reduction to the number of frames above a level."""
 
     level: float
     adds: ClassVar[bool] = True
@@ -51,7 +51,7 @@ class Above:
 @pytest.mark.parametrize("method", ["pixels", "cumulants"])
 @pytest.mark.parametrize("reduction", [None, Largest(), Above(500.0)])
 def test_shards_of_stares_join_to_the_same_bits(engine: Engine, method: Any, reduction: Any) -> None:
-    """Two engines of different form, in the form that requests travel in, against one call."""
+    """Compare two engines of different form, with requests in the form in which they travel, with one call."""
     asked = request(method, reduction=reduction)
     widths = iter((16, 1))
 

@@ -1,4 +1,4 @@
-"""Plans and stares that are stopped and resumed: the same tables, and nothing that is finished is computed again."""
+"""Plans and stares that are resumed give the same tables and compute nothing twice."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MEASURE = ("measure", "--star", "M3V", "-m", "9", "--sweep", "amplitude=0.1,0.3,
 
 
 class StoppedError(Exception):
-    """What ends a run in these tests."""
+    """Error that ends a run in these tests."""
 
 
 def unfinished(folder: Path, verb: str, study: Study, question: Any, compute: Any, **how: Any) -> Any:
@@ -96,7 +96,7 @@ def test_plan_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 @pytest.mark.long
 def test_stare_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The frames that were drawn and the thresholds that were sampled are kept."""
+    """Check that drawn frames and sampled thresholds are kept."""
     settings = ["star=[{library = 'M3V', magnitude = 9}, {library = 'K5V', magnitude = 8}]", "stare.duration_s=2000"]
     study = Study().with_settings([*settings, "search.half_widths_s=[30, 120]"])
     drawn: list[int] = []
@@ -133,7 +133,7 @@ def test_stare_is_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 
 @pytest.mark.long
 def test_measurement_is_resumed(tmp_path: Path) -> None:
-    """Fits that are finished are read, and the answer is that of one engine alone, bit for bit."""
+    """Read finished fits; the answer has the bits of one engine alone."""
     settings = [
         "star=[{library='M3V', magnitude=9}]",
         "flare.amplitudes=[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]",
@@ -174,7 +174,7 @@ def test_measurement_is_resumed(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_killed_run_is_resumed_to_the_same_bits(tmp_path: Path) -> None:
-    """A killed run is resumed, and writes the tables of one that was never stopped."""
+    """Kill and resume a run; its tables equal those of a run that was never stopped."""
     again = [sys.executable, "-m", "mauvecl", *MEASURE, "--output", "out", "--resume", "--keep-after", "0"]
     folder = tmp_path / "out" / "checkpoint"
 

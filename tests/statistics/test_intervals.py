@@ -1,4 +1,4 @@
-"""The interval of a detection probability covers the true one as often as it says, by plain normals: no device."""
+"""Intervals of detection probabilities have their coverage, by plain normals without a device."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def counted(kind: str, fap: float, probability: float, n: int, seeds: int) -> tu
     [(0.1, 1000, 2000, (0.3, 0.7, 0.97)), (0.01, 10_000, 1000, (0.05, 0.3, 0.97)), (1e-3, 100_000, 100, (0.3,))],
 )
 def test_interval_has_nominal_coverage(kind: str, fap: float, n: int, seeds: int, probabilities: tuple) -> None:
-    """94-97 %, within 5 standard errors of the seeds: one of the 21 fails by chance in 8e4 runs.
+    """Check 94-97 % within 5 standard errors of the seeds; one of the 21 fails in 8e4 runs.
 
     The interval that it takes the place of is wider in all of them, and up to twice as wide.
     """
@@ -70,7 +70,7 @@ def test_interval_has_nominal_coverage(kind: str, fap: float, n: int, seeds: int
 
 @pytest.mark.parametrize("probability", [0.15, 0.5, 0.99, 0.998, 0.9995])
 def test_interval_covers_near_the_ends(probability: float) -> None:
-    """Few flares missed of 1000, or hardly more than false alarms; 5 standard errors below 94 %: 3e-7 by chance."""
+    """Include few missed flares of 1000, and hardly more detections than false alarms; fails in 3e-7 of seeds."""
     for kind in ("matched", "chi2"):
         above, shared = counted(kind, 0.1, probability, 1000, 1000)
         found = [
@@ -81,7 +81,7 @@ def test_interval_covers_near_the_ends(probability: float) -> None:
 
 
 def test_ends_of_the_counts() -> None:
-    """None, or all, found: Clopper and Pearson's interval where the threshold is sure, a wider one where it is not."""
+    """Compare no and all detections with Clopper and Pearson's interval, which an uncertain threshold widens."""
     sure = detection_interval((1000, 1000, 1000), 1000, 1e-3)
     assert (sure.value, sure.high) == (1.0, 1.0)
     assert 0.99 < sure.low < clopper_pearson(1000, 1000).low + 1e-9
@@ -97,7 +97,7 @@ def test_ends_of_the_counts() -> None:
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 0.96, 0.9999, 1.0])
 def test_orthant_probability_of_two_normals(correlation: float) -> None:
-    """Against scipy's bivariate normal."""
+    """Compare with scipy's bivariate normal."""
     for h, k in ((2.33, -0.5), (3.09, 1.88), (1.28, 1.0)):
         exact = stats.multivariate_normal.cdf(
             [-h, -k], cov=[[1, correlation], [correlation, 1]], allow_singular=True, abseps=1e-10

@@ -46,7 +46,7 @@ def setting(quiet: Expectation, sd: dict[str, float]) -> Setting:
 def test_costs_of_unknowns_equal_those_computed_elsewhere(
     star: Any, known: float, dark: tuple[float, float], light: tuple[float, float], both: float
 ) -> None:
-    """Numbers computed apart from this project, Vega at V = 0; to 1 %, or half a unit of the last digit of 0.23."""
+    """Compare with numbers of another program (Vega at V = 0) to 1 %, or half a digit of 0.23."""
     quiet, flare = pair(*star)
     matched, plain = Matched(), Setting(quiet, ~quiet.saturated)
     weights, delta = matched.plain_weights(plain, flare), flare.signal_dn - quiet.signal_dn
@@ -89,7 +89,7 @@ def test_distributions_agree_with_drawn_nuisances(name: str, sd: dict[str, float
 
 @pytest.mark.parametrize("name", ["chi2", "chi2_element"])
 def test_subtracted_rows_give_the_inverse_covariance(name: str) -> None:
-    """x^T C^-1 x with C written out in full."""
+    """Compare with x^T C^-1 x for the full matrix C."""
     quiet, _ = pair()
     s, one = setting(quiet, {"dark": 0.1, "light": 0.02, "tilt": 0.05}), STATISTICS[name]
     assert s.nuisances is not None
@@ -127,7 +127,7 @@ def test_degrees_of_freedom() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("amplitude", [0.24, 3.0])
 def test_closed_form_in_a_span_equals_the_full_one(amplitude: float) -> None:
-    """Every fourth pixel, against the eigenvalues of the whole covariance."""
+    """Compare with the eigenvalues of the whole covariance, for every fourth pixel."""
     quiet, flare = pair(amplitude=amplitude)
     used = np.arange(quiet.wavelength_nm.size) % 4 == 0
     s = Setting(quiet, used, nuisances=Nuisances.of(quiet, {"dark": 0.5, "light": FREE, "sky": 0.1}))

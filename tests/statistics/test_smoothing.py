@@ -28,7 +28,7 @@ def whole(quiet: Expectation, flare: Expectation) -> tuple[np.ndarray, np.ndarra
 
 @pytest.mark.long
 def test_few_centres_represent_all_pixels() -> None:
-    """Draw by draw to 1e-3, thresholds to 1e-4, false alarms to 1e-3 at 1e-2 and to 5e-3 at 1e-10."""
+    """Compare draws to 1e-3, thresholds to 1e-4, false alarms to 1e-3 at 1e-2 and to 5e-3 at 1e-10."""
     quiet, flare = star(amplitudes=(0.081,))
     rows, factor, modes = whole(quiet, flare)
     smoothing = Smoothing.of(quiet, np.ones(len(rows), bool), (flare,))
@@ -46,7 +46,7 @@ def test_few_centres_represent_all_pixels() -> None:
 
 
 def test_every_pixel_is_a_centre_if_few_do_not_suffice() -> None:
-    """A star without any light below 400 nm, nor any sky: one over the smoothed flux jumps."""
+    """Use a star without light or sky below 400 nm, where the inverse of the smoothed flux jumps."""
     nm = np.arange(170.0, 1150.0, 0.5)
     dark = Source.from_arrays(nm, np.where(nm > 400.0, 1e-11, 0.0)).at_magnitude(7.4)
     quiet = expect(dark, Instrument.load("mauve"), exposure=50.0, sky=Sky.none())
@@ -60,7 +60,7 @@ def test_every_pixel_is_a_centre_if_few_do_not_suffice() -> None:
 @pytest.mark.parametrize("chunk", [4, 32])
 @pytest.mark.parametrize("changes", [{}, {"output_min_nm": 300.0, "output_max_nm": 330.0}])
 def test_bands_hold_the_rows(chunk: int, changes: dict) -> None:
-    """Followed as the kernel follows them, chunk by chunk, with some pixels left out."""
+    """Follow the bands in chunks as the kernel does, with some pixels left out."""
     (quiet,) = star(payload=instrument(**changes))
     n = quiet.wavelength_nm.size
     used = np.random.default_rng(2).random(n) > 0.1
@@ -80,7 +80,7 @@ def test_bands_hold_the_rows(chunk: int, changes: dict) -> None:
 
 
 def test_sum_is_a_generalised_chi_squared() -> None:
-    """Against NumPy's normals: Kolmogorov-Smirnov p > 1e-6 with and without a flare."""
+    """Compare with NumPy's normals: Kolmogorov-Smirnov p > 1e-6 with and without a flare."""
     quiet, flare = star(amplitudes=(0.03,), payload=instrument(part=True))
     smoothing = Smoothing.of(quiet, np.ones(quiet.wavelength_nm.size, bool))
     scale = smoothing.scale(flare)

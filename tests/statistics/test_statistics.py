@@ -16,7 +16,7 @@ from mauvecl.statistics.intervals import clopper_pearson
 @pytest.mark.parametrize("n", [10, 48, 1643])
 @pytest.mark.parametrize("scale", [1.0, 2.5])
 def test_equal_weights_are_a_scaled_non_central_chi_squared(n: int, scale: float) -> None:
-    """scipy's ncx2 is another method (Boost); weights of 1 + 1e-12 keep ours from handing over to it."""
+    """Compare with scipy's ncx2 (Boost); weights of 1 + 1e-12 keep ours from using it."""
     shift = np.linspace(-0.5, 0.7, n)
     form = QuadraticForm(np.full(n, scale * (1 + 1e-12)), shift)
     exact = stats.ncx2(n, np.sum(shift**2), scale=scale)
@@ -33,7 +33,7 @@ def test_unit_weights_use_scipy() -> None:
 
 
 def test_two_weights_with_a_closed_form() -> None:
-    """Pairs of equal weights make exponentials: a hypoexponential tail, exact."""
+    """Compare pairs of equal weights with the exact hypoexponential tail."""
     a, b = 1.0, 3.0
     form = QuadraticForm(np.array([a, a, b, b]), np.zeros(4))
     for x in (0.5, 5.0, 20.0, 60.0):
@@ -62,7 +62,7 @@ def of_two(form: QuadraticForm, x: float, *, upper: bool) -> float:
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore::scipy.integrate.IntegrationWarning")
 def test_two_terms_of_any_kind_against_quadrature() -> None:
-    """Weights up to 1e4 apart, shifts up to 8: every tail to 1e-10, its quantile in half a second."""
+    """Compare weights up to 1e4 apart and shifts up to 8: every tail to 1e-10, quantiles in half a second."""
     generator = np.random.default_rng(8)
     for _ in range(3):
         form = QuadraticForm(10 ** generator.uniform(-4, 0, 2), generator.normal(0, 1, 2) * generator.choice([0, 1, 4]))
@@ -78,7 +78,7 @@ def test_two_terms_of_any_kind_against_quadrature() -> None:
 @pytest.mark.parametrize("n", [1, 2, 5, 29, 400])
 @pytest.mark.parametrize("push", [0.0, 0.5, 1e4])
 def test_few_terms_and_far_tails_agree_with_scipy(n: int, push: float) -> None:
-    """Equal weights, whatever their number: 1e-100 too; below 1e-10 scipy's own digits end."""
+    """Compare equal weights down to 1e-100, with the accuracy that scipy has below 1e-10."""
     form = QuadraticForm(np.full(n, 2.5), np.sqrt(np.append(push, np.zeros(n - 1))))
     exact = stats.ncx2(n, push, scale=2.5) if push else stats.chi2(n, scale=2.5)
     for p in (1e-10, 1e-5, 0.2):
@@ -89,7 +89,7 @@ def test_few_terms_and_far_tails_agree_with_scipy(n: int, push: float) -> None:
 
 
 def test_several_weights_with_a_closed_form() -> None:
-    """Pairs of equal weights make exponentials; five different ones, from 1 to 1e-3, in a tail of 1e-12 too."""
+    """Compare five pairs of equal weights from 1 to 1e-3 with sums of exponentials, also at 1e-12."""
     weight = np.array([1.0, 0.4, 0.05, 0.01, 1e-3])
     form = QuadraticForm(np.repeat(weight, 2), np.zeros(10))
     share = np.array([np.prod(w / (w - np.delete(weight, k))) for k, w in enumerate(weight)])
@@ -100,7 +100,7 @@ def test_several_weights_with_a_closed_form() -> None:
 
 @pytest.mark.parametrize("spread", [0.01, 0.5, 3.0])
 def test_both_integrals_agree(spread: float) -> None:
-    """Of many terms: the characteristic function's, and the one along the bent path."""
+    """Compare the integral of the characteristic function with that along the bent path, for many terms."""
     generator = np.random.default_rng(9)
     form = QuadraticForm(10 ** generator.uniform(-spread, 0, 300), generator.normal(0, 0.3, 300))
     assert form.effective_terms > MANY
@@ -116,7 +116,7 @@ def test_number_of_effective_terms() -> None:
 
 
 def test_unequal_weights_against_simulation() -> None:
-    """A fixed seed; 5 standard errors at 4e5, so one chance failure in 3e5 seeds for the five values."""
+    """Compare five values within 5 standard errors of 4e5 draws; one fails in 3e5 seeds."""
     generator = np.random.default_rng(77)
     weight, shift = generator.uniform(0.8, 1.4, 60), generator.normal(0, 0.5, 60)
     form = QuadraticForm(weight, shift)

@@ -1,4 +1,4 @@
-"""Stores of raw spectra: what is in them, what is found wrong with them, and what they survive."""
+"""Stores of raw spectra: content, verification, and recovery."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def test_damage_is_found_and_repaired_to_the_bit(
 
 
 def test_redrawing_finds_damage_with_valid_digests(tmp_path: Path, path: Path, engine: Engine) -> None:
-    """Chunk and digest of another seed's store are consistent, and not this study's."""
+    """Insert chunk and digest of another seed's store, which are consistent with each other."""
     other = tmp_path / "other.zarr"
     bulk.realise(study(run={"seed": 12}), other, engine)
     for name in (CHUNK, "star-1/quiescent/digests.txt"):
@@ -207,7 +207,7 @@ def test_second_writer_raises(path: Path, engine: Engine) -> None:
 
 @pytest.mark.long
 def test_random_kills_lose_nothing(tmp_path: Path, painted: dict[str, bytes]) -> None:
-    """Killed at any moment and resumed: the same files, to the bit."""
+    """Kill a run at random moments and resume it; all files have the same bits."""
     path, kills, stores = tmp_path / "frames.zarr", 0, 0
     moments = random.Random(5)
     while kills < 50:
@@ -228,7 +228,7 @@ def test_random_kills_lose_nothing(tmp_path: Path, painted: dict[str, bytes]) ->
 
 @pytest.mark.long
 def test_kill_at_every_step_of_writing_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before each fsync, each rename and each line of digests, one by one."""
+    """Kill before each fsync, rename and line of digests."""
     described, seen, step = Store(tmp_path, study(200)).description(), stored_scenes.scenes(cases(study(200))), 0
     monkeypatch.setattr(Store, "description", lambda self: described)
     monkeypatch.setattr(layout, "scenes", lambda asked: seen)

@@ -26,7 +26,7 @@ from mauvecl.store.layout import Store
 
 
 class Seeded(Painter):
-    """Rows that tell their seed too."""
+    """Painter of rows that also contain their seed."""
 
     def realise(
         self, x: Any, *, start: int, count: int, seed: int, out: NDArray[Any] | None = None, **how: Any
@@ -61,7 +61,7 @@ COPIES = ["zarr.json", "star-1/quiescent/zarr.json", "star-1/flare-1/zarr.json"]
 
 @pytest.mark.parametrize("copy", COPIES)
 def test_changed_byte_of_a_study_is_found(made: Path, copy: str) -> None:
-    """Wherever it is changed: the store keeps its study, and repair mends the one file."""
+    """Change any byte: the store keeps its study, and repair restores the file."""
     before, right = tree(made), Store.open(made).study
     text = study().toml()
     # A sample of the bytes, and the seed's.
@@ -77,7 +77,7 @@ def test_changed_byte_of_a_study_is_found(made: Path, copy: str) -> None:
 
 @pytest.mark.parametrize("copy", COPIES)
 def test_contradicting_studies_raise(made: Path, copy: str) -> None:
-    """Each with its digest: nobody here can know which one was drawn, so nothing is read and nothing written."""
+    """Give two studies with valid digests; nothing is read or written, since either could be the drawn one."""
     other = study().toml().replace("seed = 11", "seed = 31")
     relabelled(made / copy, lambda text: other, **signed(other))
     before = tree(made)
@@ -104,7 +104,7 @@ def test_store_without_intact_study_raises(made: Path) -> None:
 
 
 def test_repair_does_not_mix_two_studies(made: Path) -> None:
-    """Every copy replaced alike: the digests of what was written still tell."""
+    """Replace every copy of the study; the digests of the written data still show it."""
     other = study().toml().replace("seed = 11", "seed = 31")
     for copy in COPIES:
         relabelled(made / copy, lambda text: other, **signed(other))
@@ -164,7 +164,7 @@ def test_restart_draws_the_new_study(made: Path, tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_kill_during_removal_is_recovered(made: Path, tmp_path: Path) -> None:
-    """At any file: what is left is a store, and a second restart ends as the first would have."""
+    """Kill at any file; the rest is a store, and a second restart completes."""
     other = study(run={"seed": 3})
     bulk.realise(other, tmp_path / "fresh.zarr", PAINTER)
     for step in (0, 3, 9, 14):
@@ -189,7 +189,7 @@ def test_kill_during_removal_is_recovered(made: Path, tmp_path: Path) -> None:
 
 
 def test_store_larger_than_any_disk_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """6e15 rows and one chunk of them: each question is answered by what is there, in a second or so."""
+    """Claim 6e15 rows with one chunk; each question is answered in about a second."""
     path, asked = tmp_path / "vast.zarr", study(6 * 10**15)
     with refused("run.realisations"):
         bulk.realise(asked, path, PAINTER)

@@ -1,4 +1,4 @@
-"""Cases: what they compute, when, and how often they load."""
+"""Cases: their values, and when and how often inputs are loaded."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ def test_card_shows_both_numbers_whichever_is_chosen(unknown: str, tmp_path: Pat
     "more", ["", "&statistic=chi2_element", "&own_unknown=200+1,+450+3", "&instrument=mauve-electrons"]
 )
 def test_each_number_is_the_answer_to_its_own_question(more: str, tmp_path: Path) -> None:
-    """Also that of the pictures, whichever number they belong to."""
+    """Check the numbers of the card and of the pictures."""
     for chosen in UNKNOWN:
         found = chances(forms_of(f"{M_DWARF}{more}&unknown={chosen}", tmp_path), {})
         for one in found:
@@ -63,7 +63,7 @@ def test_statistic_that_unknowns_exclude_has_one_number(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("chosen", UNKNOWN)
 def test_one_simulation_gives_both_numbers(chosen: str, tmp_path: Path) -> None:
-    """To the bit those of `detect` with and without the usual unknowns."""
+    """Compare all bits with `detect` with and without the usual unknowns."""
     closed = forms_of(f"{M_DWARF}&realisations=10000&fap=0.05&unknown={chosen}", tmp_path)
     pool = Pool(LocalWorkers([None]))
     answers = SIMULATIONS["detection"](closed.study, pool)
@@ -77,7 +77,7 @@ def test_one_simulation_gives_both_numbers(chosen: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("of", ["amplitude", "magnitude", "exposure"])
 def test_sentence_holds_the_limits_of_the_verb(of: str, tmp_path: Path) -> None:
-    """The limits in closed form of `mauvecl limit`, to the digits shown."""
+    """Compare with the closed forms of `mauvecl limit`, to the digits shown."""
     closed = forms_of(f"{M_DWARF}&of={of}&power=0.8", tmp_path)
     told = solved(closed)
     assert told.startswith("80 % of flares")

@@ -35,7 +35,7 @@ PATIENCE = 90_000
 
 
 class Server:
-    """A server that can be ended and started anew at the same address."""
+    """Server that can be ended and started again at the same address."""
 
     def __init__(self, log: Path) -> None:
         self.log = log
@@ -171,7 +171,7 @@ def run(folder: Path, *words: str) -> None:
 
 
 def test_one_edit_answers_without_scrolling(browser: Browser, server: Server) -> None:
-    """Would Mauve see a 2 % flare on a G2V star of V = 7.4 in 50 s?"""
+    """Ask about a 2 % flare on a G2V star of V = 7.4 in 50 s."""
     page = fresh(browser, server.address, viewport={"width": 1280, "height": 800})
     enter(page, "Magnitude", "7.4")
     told = shown(page)
@@ -248,7 +248,7 @@ def settled_ranges(page: Page, picture: str) -> list[float]:
 
 
 def test_pictures_zoom_and_reset(page: Page) -> None:
-    """By box, by wheel, by keys; the reset resets both axes. Without Ctrl or focus the wheel scrolls the page."""
+    """Zoom by box, wheel and keys, and reset both axes; without Ctrl or focus the wheel scrolls the page."""
     page.locator("#figure-excess .legend li:visible", has_text="drawn exposure").wait_for()
     before = settled_ranges(page, "excess")
     plot = page.locator("#plot-excess")

@@ -125,7 +125,7 @@ def test_own_star_is_in_the_study_that_the_command_names(tmp_path: Path, monkeyp
 @pytest.mark.long
 @pytest.mark.parametrize("tab", TABS)
 def test_printed_commands_give_the_numbers_of_the_page(tab: str, tmp_path: Path) -> None:
-    """Of a random question for each tab; `tools/check_commands.py` asks twenty."""
+    """Run the command of a random question for each tab; `tools/check_commands.py` runs twenty."""
     _, closed = check_commands.possible_question(np.random.default_rng([3, len(tab)]), tmp_path)
     assert check_commands.differences(TABS[tab], closed, tmp_path) == []
 

@@ -328,7 +328,7 @@ def test_every_picture_has_its_data(closed: ClosedForms, tab: str) -> None:
 
 @pytest.mark.parametrize("statistic", ["matched", "chi2", "uv_excess"])
 def test_card_shows_the_closed_form(statistic: str, tmp_path: Path) -> None:
-    """What an answer on the command line is compared with, known without a scene that could be drawn."""
+    """Compare with an answer of the command line, without a scene that is drawn."""
     state = State()
     state.enter({"statistic": statistic, "magnitude": "6", "unknown": "the usual"})
     closed = ClosedForms.of(state.question(), tmp_path)
@@ -343,7 +343,7 @@ def test_card_shows_the_closed_form(statistic: str, tmp_path: Path) -> None:
 
 
 def test_changed_light_changes_the_question(closed: ClosedForms) -> None:
-    """Scaled light gives what a question at that magnitude and amplitude gives."""
+    """Compare scaled light with a question at that magnitude and amplitude."""
     at = limit.odds(closed, 10.0, np.array([1.0, 3.0]))
     assert limit.odds(closed, 8.5, np.ones(1))[0].probability == pytest.approx(closed.chance, abs=1e-12)
     state = State()
@@ -354,7 +354,7 @@ def test_changed_light_changes_the_question(closed: ClosedForms) -> None:
 
 @pytest.mark.parametrize("statistic", STATISTICS)
 def test_curve_and_map_show_the_closed_form(statistic: str, tmp_path: Path) -> None:
-    """Between the points that are computed, too: the curve to 1 %, the map to 0.05 mag and its rows."""
+    """Compare also between computed points: the curve to 1 %, the map to 0.05 mag and its rows."""
     state = State()
     state.enter({"statistic": statistic, "amplitude_percent": "5"})
     closed = ClosedForms.of(state.question(), tmp_path)
@@ -370,7 +370,7 @@ def test_curve_and_map_show_the_closed_form(statistic: str, tmp_path: Path) -> N
 
 
 def test_excess_equals_that_of_the_matched_statistic(closed: ClosedForms) -> None:
-    """Squares of the excess per pixel add up to the matched S/N, squared."""
+    """Check that squares of the excess per pixel add up to the square of the matched S/N."""
     pixel, _ = closed.excess
     assert np.sqrt(np.sum(pixel**2)) == pytest.approx(closed.odds.flaring.mean, rel=1e-9)
 
@@ -440,7 +440,7 @@ def test_uploaded_spectrum_answers_as_on_the_command_line() -> None:
 
 
 class Talk:
-    """One visitor's connection, as the page's own code speaks."""
+    """Connection of a visitor that sends what the page's script would."""
 
     def __init__(self, connection: Any) -> None:
         self._connection, self._n = connection, 0
@@ -588,7 +588,7 @@ def test_last_of_several_questions_is_answered(served: Any) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("kind", SIMULATIONS)
 def test_cancel_ends_every_computation(served: Any, kind: str) -> None:
-    """Each is ended once it has begun, and the next one is computed."""
+    """Cancel each computation once it has started, and compute the next one."""
     link = "?realisations=4000000&targets=eps+Eri"
 
     async def work(host: str) -> tuple[float, float]:
@@ -911,7 +911,7 @@ def test_messages_without_fields_are_answered_or_refused(served: Any, caplog: py
 
 
 def test_half_open_connections_are_dropped(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those that never end their headers, or their body, and those beyond the bound; a page stays."""
+    """Drop connections that never end their headers or body, and those beyond the limit; a page stays."""
     monkeypatch.setattr(server, "REQUEST_S", 1.0)
 
     async def work(host: str) -> None:
