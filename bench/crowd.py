@@ -65,15 +65,15 @@ class Visitor:
         n = await self._ask("answer", link=link, tab="detection")
         answered = 0.0
         while True:
-            told = await self._message()
-            if told.get("n") != n:
+            reported = await self._message()
+            if reported.get("n") != n:
                 continue
-            if "answer" in told:
+            if "answer" in reported:
                 answered = time.perf_counter() - start
-            elif "pictures" in told:
+            elif "pictures" in reported:
                 return answered
-            elif "refused" in told or told.get("faults"):
-                raise RuntimeError(str(told))
+            elif "refused" in reported or reported.get("faults"):
+                raise RuntimeError(str(reported))
 
     async def draw(self, magnitude: float) -> None:
         """Draw one exposure, half a second after the last change."""

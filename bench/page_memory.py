@@ -46,12 +46,12 @@ async def session(host: str, number: int) -> None:
             got = await asyncio.wait_for(socket_.read_message(), PATIENCE)
             if got is None:
                 raise ConnectionError("the server has closed the connection")
-            told = json.loads(got) if isinstance(got, str) else {}
-            if told.get("n") != n:
+            reported = json.loads(got) if isinstance(got, str) else {}
+            if reported.get("n") != n:
                 continue
-            if told.get("refused") or told.get("faults"):
-                raise RuntimeError(str(told))
-            if done in told:
+            if reported.get("refused") or reported.get("faults"):
+                raise RuntimeError(str(reported))
+            if done in reported:
                 return
 
     target = TARGETS[number % len(TARGETS)]

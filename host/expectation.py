@@ -503,9 +503,9 @@ def expect(
     n_pixel = instrument.wavelength_nm.size
     element, element_wavelength = _elements(instrument)
     electrons = per_frame(source)
-    beside = np.zeros(n_pixel)
+    near = np.zeros(n_pixel)
     if neighbours is not None:
-        beside = _faint_enough(instrument.frame_s * neighbours.electrons_per_second(instrument, order), "a neighbour")
+        near = _faint_enough(instrument.frame_s * neighbours.electrons_per_second(instrument, order), "a neighbour")
     plain = Expectation(
         wavelength_nm=instrument.wavelength_nm,
         source_electrons=_faint_enough(np.maximum(electrons, 0.0), source.name),
@@ -523,7 +523,7 @@ def expect(
         signal=signal,
         adc_max_dn=instrument.adc_max_dn,
         saturation_dn=instrument.saturation_dn,
-        neighbour_electrons=beside,
+        neighbour_electrons=near,
         conditions={
             name: getattr(instrument, name)
             for name in ("temperature_c", "dark_slope_per_c", "light_loss", "pointing_loss")

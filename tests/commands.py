@@ -22,19 +22,19 @@ class Done:
 
 def run(*words: str | Path, folder: Path, code: int = 0) -> Done:
     """Run a command in this process, which is faster than `started`."""
-    found, out, told = ended(*words, folder=folder)
-    assert found == code, out + told
-    return Done(out, told)
+    found, out, reported = ended(*words, folder=folder)
+    assert found == code, out + reported
+    return Done(out, reported)
 
 
 def ended(*words: str | Path, folder: Path) -> tuple[int, str, str]:
     """Run a command in this process; return exit code, standard output and standard error."""
-    out, told = io.StringIO(), io.StringIO()
+    out, reported = io.StringIO(), io.StringIO()
     code = 0
     with (
         contextlib.chdir(folder),
         contextlib.redirect_stdout(out),
-        contextlib.redirect_stderr(told),
+        contextlib.redirect_stderr(reported),
         mock.patch.object(sys, "argv", ["mauvecl", *map(str, words)]),
         mock.patch.dict(os.environ, {"COLUMNS": "200"}),
     ):
@@ -42,7 +42,7 @@ def ended(*words: str | Path, folder: Path) -> tuple[int, str, str]:
             main()
         except SystemExit as end:
             code = end.code or 0
-    return code, out.getvalue(), told.getvalue()
+    return code, out.getvalue(), reported.getvalue()
 
 
 def started(*words: str | Path, folder: Path, code: int = 0, **environment: str) -> Done:

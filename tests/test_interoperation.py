@@ -129,8 +129,8 @@ def test_fits_tables_are_valid(tmp_path: Path) -> None:
     table = QTable.read(file)
     assert table["raw"].unit == u.adu
     if shutil.which("fitsverify"):
-        told = subprocess.run(["fitsverify", file], capture_output=True, text=True, check=True).stdout
-        assert "0 warning(s) and 0 error(s)" in told, told
+        reported = subprocess.run(["fitsverify", file], capture_output=True, text=True, check=True).stdout
+        assert "0 warning(s) and 0 error(s)" in reported, reported
 
 
 def test_html_representations_contain_values() -> None:

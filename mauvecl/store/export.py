@@ -120,11 +120,11 @@ def export(selection: Selection, path: str | Path, *, replace: bool = False) -> 
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=path.parent) as folder:
-            beside = Path(folder) / path.name
-            _fits(selection).writeto(beside, checksum=True)
-            with beside.open("rb") as file:
+            temporary = Path(folder) / path.name
+            _fits(selection).writeto(temporary, checksum=True)
+            with temporary.open("rb") as file:
                 os.fsync(file.fileno())
-            beside.replace(path)
+            temporary.replace(path)
     except OSError as error:
         raise InputError(
             f"export {str(path)!r} cannot be written ({error.strerror or error})",

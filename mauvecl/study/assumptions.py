@@ -40,10 +40,10 @@ def assumption_line(study: Study, uses: Collection[Use], varied: Collection[str]
         "templates": lambda: f"flares of the shape {study.search.shape}; noise as measured",
         "seed": lambda: f"seed {study.run.seed}",
     }
-    told = {*uses, *(("unknowns",) if {*UNKNOWN_USES} & {*uses} else ())}
+    stated = {*uses, *(("unknowns",) if {*UNKNOWN_USES} & {*uses} else ())}
     unused = unused_unknowns(study, uses)
     ignored = [f"not used: {', '.join(unused)}"] if unused else []
-    return f"Assumed: {'; '.join([*(words[use]() for use in words if use in told), *ignored])}."
+    return f"Assumed: {'; '.join([*(words[use]() for use in words if use in stated), *ignored])}."
 
 
 def _instrument(study: Study, swept: set[str]) -> str:

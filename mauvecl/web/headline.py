@@ -109,17 +109,17 @@ def solved(closed: ClosedForms) -> str:
     """Return a sentence on the limit of the quantity that the question solves for, with and without unknowns."""
     q, asked = closed.question, closed.study.limit
     words = LIMITS[asked.of]
-    told, near = [], None
+    clauses, near = [], None
     for unknown in UNKNOWN:
         try:
             assumed = closed.assuming(unknown)
             near = None if assumed.slow else _limit(assumed, near)
-            told.append(words.slow if near is None else f"{words.before} {words.value(near)}")
+            clauses.append(words.slow if near is None else f"{words.before} {words.value(near)}")
         except InputError:
-            told.append(words.none)
+            clauses.append(words.none)
     flares = "flares" if asked.of == "amplitude" else f"flares of {q.amplitude_percent:g} %"
     at = "" if asked.of == "magnitude" else f" at {q.band} = {q.magnitude:g}"
-    first, second = told
+    first, second = clauses
     # The size belongs to the flares, what is exposed to their detection.
     where = f" {first}{at} are detected" if asked.of == "amplitude" else f"{at} are detected {first}"
     return f"{100 * asked.power:g} % of {flares}{where} with everything known, and {second} with the usual unknowns."
@@ -139,7 +139,7 @@ def _limit(assumed: ClosedForms, known: float | None) -> float:
 
 def other_payloads(closed: ClosedForms) -> str:
     """Return a sentence on the chances with other payloads than the question's."""
-    told, payloads = [], FIELDS["instrument"].read
+    clauses, payloads = [], FIELDS["instrument"].read
     assert isinstance(payloads, Choice)
     for name in payloads.options:
         if name != closed.question.instrument:
@@ -149,5 +149,5 @@ def other_payloads(closed: ClosedForms) -> str:
                     shown.append(percent(closed.assuming(unknown, instrument=name).chance))
                 except InputError:
                     shown.append("no number")
-            told.append(f"With the payload {name}: {' and '.join(shown)}.")
-    return " ".join(told)
+            clauses.append(f"With the payload {name}: {' and '.join(shown)}.")
+    return " ".join(clauses)

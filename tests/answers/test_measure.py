@@ -220,9 +220,9 @@ def test_measure_command_writes_its_files(tmp_path: Path) -> None:
     assert {path.name for path in (tmp_path / "out").iterdir()} >= {
         "measure.ecsv", "fits.ecsv", "fit.png", "contours.png", "pulls.png", "errors.png", "study.toml", "run.json"
     }  # fmt: skip
-    code, _, told = ended("measure", *words, "--model", "spots", folder=tmp_path)
+    code, _, reported = ended("measure", *words, "--model", "spots", folder=tmp_path)
     assert code == 2
-    assert "spots" in told
+    assert "spots" in reported
 
 
 def test_expected_regions_close(jump: MeasureAnswer) -> None:

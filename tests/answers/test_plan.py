@@ -144,9 +144,9 @@ def test_report_numbers_are_in_the_named_tables(answer: PlanAnswer, tmp_path: Pa
 
 
 def test_missing_values_are_reported(answer: PlanAnswer) -> None:
-    told = " ".join(answer.messages)
-    assert "Flare rates of Denebola, of the type 'A3V', are unknown except for an exponent of 1.3" in told
-    assert "EK Dra is never seen" in told
+    reported = " ".join(answer.messages)
+    assert "Flare rates of Denebola, of the type 'A3V', are unknown except for an exponent of 1.3" in reported
+    assert "EK Dra is never seen" in reported
     table = answer.table
     assert np.isnan(table["expected"][2])
     assert np.isfinite(table["E50"][2].value)

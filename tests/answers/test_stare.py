@@ -181,8 +181,8 @@ def test_stare_command_writes_its_files(tmp_path):
         "--distance",
         "14",
     ]
-    told = run(*words, "--energy", "1e33", "--half-width", "30", "--no-search", "-o", "out", folder=tmp_path).stdout
-    assert "1e+33" in told
+    reported = run(*words, "--energy", "1e33", "--half-width", "30", "--no-search", "-o", "out", folder=tmp_path).stdout
+    assert "1e+33" in reported
     made = {path.name for path in (tmp_path / "out").iterdir()}
     assert made == {
         "stare.ecsv", "events.ecsv", "light-curve-1.ecsv", "light-curve-1.fits", "light-curve-1.png",
@@ -219,9 +219,9 @@ def test_saturated_flare_is_reported(stares):
 
 
 def test_unused_settings_are_reported(stares):
-    told = stare(SHORT.with_settings(["observation.exposure_s=20", "events=[{peak_s=310}, {peak_s=200}]"]), stares)
-    assert len(of_kind(told.messages, "not used")) == 1
-    (line,) = (message for message in told.messages if "outside the frames" in message)
+    reported = stare(SHORT.with_settings(["observation.exposure_s=20", "events=[{peak_s=310}, {peak_s=200}]"]), stares)
+    assert len(of_kind(reported.messages, "not used")) == 1
+    (line,) = (message for message in reported.messages if "outside the frames" in message)
     assert line.startswith("Flare 1 peaks at 310 s")
     plain = stare(SHORT.with_settings(["observation.exposure_s=5"]), stares)
     assert not any("not used" in message or "outside" in message for message in plain.messages)

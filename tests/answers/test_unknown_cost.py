@@ -161,9 +161,9 @@ def test_invalid_nuisances_raise(text: str, key: str) -> None:
 @pytest.mark.parametrize("flag", ["dark", "dark=-1", "missing.txt=free"])
 def test_invalid_nuisance_flags_name_the_flag(flag: str, tmp_path: Path) -> None:
     star = ("--star", "G2V", "-m", "7.4", "-n", "20000", "--fap", "0.01")
-    code, _, told = ended("detect", *star, "--nuisance", flag, folder=tmp_path)
-    assert (code, told.count("\n")) == (2, 1)
-    assert "expected" in told
+    code, _, reported = ended("detect", *star, "--nuisance", flag, folder=tmp_path)
+    assert (code, reported.count("\n")) == (2, 1)
+    assert "expected" in reported
 
 
 def test_usual_unknowns_follow_the_observation() -> None:

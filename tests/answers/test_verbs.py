@@ -45,7 +45,7 @@ def test_progress_ends_at_its_total(name: str, engine: Engine) -> None:
     """Pass all arguments by position, since all verbs have the same."""
     seen: list[tuple[int, int]] = []
     drawing = None if name == "plan" else engine
-    answer = VERBS[name].ask(Study().with_settings(FEW + QUICK[name]), drawing, lambda *told: seen.append(told))
+    answer = VERBS[name].ask(Study().with_settings(FEW + QUICK[name]), drawing, lambda *reported: seen.append(reported))
     assert isinstance(answer, Answer)
     done, total = zip(*seen, strict=True)
     assert list(done) == sorted(done)

@@ -37,9 +37,9 @@ def test_unexpected_error_writes_a_traceback_file(tmp_path: Path) -> None:
         raise KeyError("what nobody foresaw")
 
     with mock.patch("mauvecl.answers.files.write_record", fail):
-        code, _, told = ended(*OBSERVE, "-o", "there", folder=tmp_path)
+        code, _, reported = ended(*OBSERVE, "-o", "there", folder=tmp_path)
     assert code == 70
-    (line,) = told.splitlines()
+    (line,) = reported.splitlines()
     file = Path(re.search(r"its traceback is in '(.*?)'", line)[1])
     assert file.resolve().parent == tmp_path / "there", "in the output folder"
     text = (tmp_path / file).read_text()
@@ -48,9 +48,9 @@ def test_unexpected_error_writes_a_traceback_file(tmp_path: Path) -> None:
     # What was written before is kept.
     assert (tmp_path / "there" / "observation-1.ecsv").exists()
     with mock.patch("mauvecl.host.stars.catalogue.library_table", fail):
-        code, _, told = ended("library", folder=tmp_path)
+        code, _, reported = ended("library", folder=tmp_path)
     assert code == 70
-    file = Path(re.search(r"its traceback is in '(.*?)'", told)[1])
+    file = Path(re.search(r"its traceback is in '(.*?)'", reported)[1])
     assert "Traceback" in file.read_text()
     file.unlink()
 
@@ -136,9 +136,9 @@ NAMES = [LONG, NOT_TEXT, CONTROL]
 
 def refused(*words: str, folder: Path) -> str:
     """Run the command, check that it fails with one sentence, and return the sentence."""
-    code, _, told = ended(*words, folder=folder)
-    assert code == 2, told
-    (line,) = told.splitlines()
+    code, _, reported = ended(*words, folder=folder)
+    assert code == 2, reported
+    (line,) = reported.splitlines()
     assert line.startswith("mauvecl: ")
     assert len(line) < 1100
     return line
@@ -343,9 +343,9 @@ def test_two_flags_for_one_key_are_refused(tmp_path: Path) -> None:
     ids=lambda words: words[0],
 )
 def test_runs_above_one_year_need_insist(words: tuple[str, ...], tmp_path: Path) -> None:
-    told = refused(*words, folder=tmp_path)
-    assert "years" in told
-    assert "--insist" in told
+    reported = refused(*words, folder=tmp_path)
+    assert "years" in reported
+    assert "--insist" in reported
     assert not list(tmp_path.iterdir()), "nothing has begun"
 
 
@@ -373,9 +373,9 @@ def test_stores_larger_than_the_disk_need_insist(tmp_path: Path) -> None:
     words = ("realise", "--star", "G2V", "-m", "7", "-a", "0.1", "-t", "5")
     usage = mock.Mock(free=10 << 20)
     with mock.patch.object(foresight.shutil, "disk_usage", return_value=usage):
-        told = refused(*words, "-n", "100000", "-o", "s.zarr", folder=tmp_path)
-        most = int(re.search(r"expected at most (\d+) of them", told)[1])
-        assert "10 MiB" in told
+        reported = refused(*words, "-n", "100000", "-o", "s.zarr", folder=tmp_path)
+        most = int(re.search(r"expected at most (\d+) of them", reported)[1])
+        assert "10 MiB" in reported
         assert not (tmp_path / "s.zarr").exists()
         from mauvecl.store.layout import Store
 

@@ -63,16 +63,16 @@ def test_defaults_in_help_equal_those_of_the_study(name: str, monkeypatch: pytes
         return
     CliRunner().invoke(app, [name])
     for flag, text in flags.items():
-        told = re.search(r"\[([^][]*)\]\.$", text or "")
+        reported = re.search(r"\[([^][]*)\]\.$", text or "")
         keys = [key for key in KEYS.get(flag, ()) if key[0] != "star"]
-        if told is None or not keys:
+        if reported is None or not keys:
             continue
         values = [_at(asked[0], key) for key in keys]
-        number = re.match(r"-?[\d.]+", told[1])
+        number = re.match(r"-?[\d.]+", reported[1])
         if number and all(isinstance(value, int | float) for value in values):
             assert float(number[0]) in values, flag
         elif all(isinstance(value, str) for value in values):
-            assert any(value in told[1] for value in values), flag
+            assert any(value in reported[1] for value in values), flag
 
 
 def _at(study: Study, path: tuple[str, ...]) -> Any:
@@ -191,7 +191,9 @@ def test_mistakes_load_no_heavy_package(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", code, json.dumps(asked)], capture_output=True, text=True, cwd=tmp_path, check=True
     )
-    told = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")]
+    reported = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")]
     # Nor is all of it looked through for circles at the end, or often before.
     assert done.stdout.splitlines()[-1] == "frozen True True"
-    assert list(zip(asked, told, strict=True)) == [(words, [0 if words == ["--version"] else 2, []]) for words in asked]
+    assert list(zip(asked, reported, strict=True)) == [
+        (words, [0 if words == ["--version"] else 2, []]) for words in asked
+    ]

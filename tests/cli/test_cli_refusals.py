@@ -66,7 +66,7 @@ ROWS: list[tuple[tuple[str, ...], *tuple[str, ...]]] = [
     (("detect", "--target", "290 11"), "only one of target and time"),
     (("detect", "-m", "1", "-m", "2", "-m", "3"), "3 magnitudes for 2 stars"),
     (("detect", "--star", "G2V", "--fap", "1e-6", "-n", "1000"), "ask for 100000000 realisations"),
-    (("stare", "--energy", "1e33", "--amplitude", "0.1"), "--energy is given beside --amplitude"),
+    (("stare", "--energy", "1e33", "--amplitude", "0.1"), "--energy is given together with --amplitude"),
     (("limit", "--known", "light_loss,luck"), "unknowns.known names 'luck', expected some of "),
     (("exposure", *STAR), "no wanted S/N, expected --snr and --at"),
     (("exposure", *STAR, "--snr", "10", "--at", "900"), "wavelength = 900.0 nm"),
@@ -79,20 +79,22 @@ ROWS: list[tuple[tuple[str, ...], *tuple[str, ...]]] = [
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: " ".join(row[0])[:60])
 def test_bad_input_exits_with_code_2(row: tuple[tuple[str, ...], *tuple[str, ...]], tmp_path: Path) -> None:
     words, *facts = row
-    code, out, told = ended(*words, folder=tmp_path)
-    assert (code, out, told.count("\n")) == (2, "", 1), told
-    assert told.startswith("mauvecl: ")
-    assert "`" not in told
-    assert all(fact in told for fact in facts), told
-    assert re.search(r"expected|Missing|No such|does not|cannot|is unknown|only one|\d magnitudes for", told), told
+    code, out, reported = ended(*words, folder=tmp_path)
+    assert (code, out, reported.count("\n")) == (2, "", 1), reported
+    assert reported.startswith("mauvecl: ")
+    assert "`" not in reported
+    assert all(fact in reported for fact in facts), reported
+    assert re.search(r"expected|Missing|No such|does not|cannot|is unknown|only one|\d magnitudes for", reported), (
+        reported
+    )
 
 
 def test_study_file_keeps_its_keys(tmp_path: Path) -> None:
     """A value of a file is named by its key, not by a flag."""
     (tmp_path / "s.toml").write_text("[run]\nfap = 2\n")
-    code, _, told = ended("detect", "s.toml", "--seed", "3", folder=tmp_path)
-    assert (code, told) == (2, "mauvecl: s.toml: run.fap = 2, expected a number above 0 and below 1\n")
+    code, _, reported = ended("detect", "s.toml", "--seed", "3", folder=tmp_path)
+    assert (code, reported) == (2, "mauvecl: s.toml: run.fap = 2, expected a number above 0 and below 1\n")
     (tmp_path / "s.toml").write_text("[run]\nsead = 3")
-    code, _, told = ended("detect", "s.toml", folder=tmp_path)
-    assert (code, told.count("\n")) == (2, 1)
-    assert "'run.sead', did you mean 'seed'?" in told
+    code, _, reported = ended("detect", "s.toml", folder=tmp_path)
+    assert (code, reported.count("\n")) == (2, 1)
+    assert "'run.sead', did you mean 'seed'?" in reported

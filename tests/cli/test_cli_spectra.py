@@ -23,8 +23,10 @@ def simulated(folder: Path, *flags: str) -> str:
 
 
 def test_assumptions_about_a_spectrum_come_first(tmp_path: Path) -> None:
-    told = simulated(tmp_path, "--star", str(FILES / "10lac_stis_001.txt"), "--wavelength-unit", "Angstrom", "-m", "8")
-    assert told.index("ASSUMED: flux in erg") < told.index("10lac_stis_001 V = 8")
+    reported = simulated(
+        tmp_path, "--star", str(FILES / "10lac_stis_001.txt"), "--wavelength-unit", "Angstrom", "-m", "8"
+    )
+    assert reported.index("ASSUMED: flux in erg") < reported.index("10lac_stis_001 V = 8")
     record = json.loads(next((tmp_path / "out").glob("*.json")).read_text())
     assert "ASSUMED: flux in erg" in json.dumps(record)
     # The study that was written reads the same star again.
@@ -34,11 +36,11 @@ def test_assumptions_about_a_spectrum_come_first(tmp_path: Path) -> None:
 
 def test_star_is_extended_and_binned(tmp_path: Path) -> None:
     flags = ("--star", str(FILES / "vb8_stiswfcnic_004.fits"), "--extend", "M3V", "--bin-nm", "2", "-m", "9")
-    told = simulated(tmp_path, *flags)
-    assert "continued by M3V" in told
-    assert "113 of its 1349 points" in told
-    told = simulated(tmp_path, "--star", f"{FILES / 'ckp00_5750.fits'}[g45]", "-m", "8")
-    assert "ckp00_5750" in told
+    reported = simulated(tmp_path, *flags)
+    assert "continued by M3V" in reported
+    assert "113 of its 1349 points" in reported
+    reported = simulated(tmp_path, "--star", f"{FILES / 'ckp00_5750.fits'}[g45]", "-m", "8")
+    assert "ckp00_5750" in reported
 
 
 def test_keys_of_files_need_stars_from_files(tmp_path: Path) -> None:

@@ -31,10 +31,10 @@ def test_time_left_is_unknown_after_few_realisations(clock: Clock, capsys: pytes
             meter(done, 10**12)
             clock.now += 11.0
         meter(2, 10**12)
-    told = capsys.readouterr().err
-    assert "2 of 1000000000000 realisations" in told
-    assert "time left unknown" in told
-    assert not re.search(r"\d s left", told)
+    reported = capsys.readouterr().err
+    assert "2 of 1000000000000 realisations" in reported
+    assert "time left unknown" in reported
+    assert not re.search(r"\d s left", reported)
 
 
 @pytest.mark.parametrize(
@@ -73,9 +73,9 @@ def test_meter_restarts_for_the_next_star(clock: Clock, capsys: pytest.CaptureFi
 
 def test_empty_columns_are_omitted(capsys: pytest.CaptureFixture[str]) -> None:
     show_table("title", ("a", "empty", "b"), [("1", "", "x"), ("2", "", "")])
-    told = capsys.readouterr().out
-    assert "empty" not in told
-    rows = [line.split() for line in told.splitlines() if line.strip(" ─")]
+    reported = capsys.readouterr().out
+    assert "empty" not in reported
+    rows = [line.split() for line in reported.splitlines() if line.strip(" ─")]
     assert rows == [["title"], ["a", "b"], ["1", "x"], ["2"]]
 
 
@@ -88,12 +88,12 @@ def test_narrow_terminal_truncates_nothing(
     columns = ("star", "flare", "threshold", INTERVAL, "closed form", "why")
     cells = [(f"star {n}", f"{n} %", f"{n}12.345", f"[{n}, 77]", f"0.{n}", "a reason of many words") for n in range(3)]
     show_table("title", columns, cells)
-    told = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
-    assert "…" not in told
+    reported = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+    assert "…" not in reported
     for row in cells:
-        assert all(cell in told for cell in row)
+        assert all(cell in reported for cell in row)
     # What a row is begins each of its parts, and a value keeps its interval.
-    assert all(line.split()[0] in ("star", "title") for line in told.splitlines() if line.strip(" ─"))
-    assert all("[0, 77]" in line for line in told.splitlines() if "012.345" in line)
+    assert all(line.split()[0] in ("star", "title") for line in reported.splitlines() if line.strip(" ─"))
+    assert all("[0, 77]" in line for line in reported.splitlines() if "012.345" in line)
     if width >= 80:
-        assert max(map(len, told.splitlines())) <= width
+        assert max(map(len, reported.splitlines())) <= width

@@ -58,13 +58,13 @@ def check(folder: Path, *words: str, **environment: str) -> None:
     """Run the command and check its exit code, message, duration and memory."""
     started, before = time.monotonic(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with mock.patch.dict(os.environ, {"MAUVECL_DATA_DIR": str(folder / "data")} | environment):
-        code, out, told = ended(*words, folder=folder)
+        code, out, reported = ended(*words, folder=folder)
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
-    sentences = [line for line in told.splitlines() if not line.startswith("mauvecl: note: ")]
-    assert code in (0, 2), (words, code, told)
-    assert "Traceback" not in out + told
+    sentences = [line for line in reported.splitlines() if not line.startswith("mauvecl: note: ")]
+    assert code in (0, 2), (words, code, reported)
+    assert "Traceback" not in out + reported
     if code == 2:
-        assert len(sentences) == 1, told
+        assert len(sentences) == 1, reported
         assert sentences[0].startswith("mauvecl: ")
         assert len(sentences[0]) < 1200
         assert "memory" not in sentences[0]

@@ -28,12 +28,12 @@ def test_help_fits_80_columns(words: tuple[str, ...], tmp_path: Path, monkeypatc
 
     monkeypatch.setattr(typer.rich_utils, "MAX_WIDTH", 80, raising=False)
     monkeypatch.setenv("TERMINAL_WIDTH", "80")
-    code, told, _ = ended(*words, "--help", folder=tmp_path)
+    code, reported, _ = ended(*words, "--help", folder=tmp_path)
     assert code == 0
-    text = told.replace("\\\n", " ")
+    text = reported.replace("\\\n", " ")
     examples = re.findall(rf"^ +(mauvecl {' '.join(words)}.*)$", text, re.MULTILINE)
     assert examples
-    lines = told.splitlines()
+    lines = reported.splitlines()
     begun = [i for i, line in enumerate(lines) if line.strip().startswith("mauvecl ")]
     for i in begun:
         while lines[i].endswith("\\"):
@@ -55,8 +55,8 @@ def test_parts_of_a_table_repeat_only_the_labels(
     names = [f"label {n}" for n in range(labels)]
     rows = [tuple(f"{r >> n & 1}abc" for n in reversed(range(labels))) for r in range(2**labels)]
     show_table("title", (*names, *months), [(*row, *("300" for _ in months)) for row in rows])
-    told = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
-    assert all(told.count(month) == 1 for month in months)
-    assert told.count(names[0]) > 1
-    assert all(told.count(name) == told.count(names[0]) for name in names)
-    assert max(map(len, told.splitlines())) <= 80
+    reported = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+    assert all(reported.count(month) == 1 for month in months)
+    assert reported.count(names[0]) > 1
+    assert all(reported.count(name) == reported.count(names[0]) for name in names)
+    assert max(map(len, reported.splitlines())) <= 80

@@ -33,10 +33,10 @@ def spectrum(folder: Path, name: str) -> str:
 def test_star_is_accepted_in_place_of_the_study(verb: str, tmp_path: Path) -> None:
     """Give every verb a star with a wrong magnitude, which its message names."""
     for star in ("G2V,M3V", spectrum(tmp_path, "noname")):
-        code, _, told = ended(verb, star, "-m", "99", folder=tmp_path)
-        assert (code, told) == (2, "mauvecl: --magnitude 99.0, expected -30 to 40 mag\n"), star
-    code, _, told = ended(verb, "G2V", "--star", "M3V", "-m", "7", folder=tmp_path)
-    assert (code, told) == (2, "mauvecl: 'G2V' and --star are both stars, expected one of them\n")
+        code, _, reported = ended(verb, star, "-m", "99", folder=tmp_path)
+        assert (code, reported) == (2, "mauvecl: --magnitude 99.0, expected -30 to 40 mag\n"), star
+    code, _, reported = ended(verb, "G2V", "--star", "M3V", "-m", "7", folder=tmp_path)
+    assert (code, reported) == (2, "mauvecl: 'G2V' and --star are both stars, expected one of them\n")
 
 
 def test_given_star_becomes_the_star_of_the_study(tmp_path: Path) -> None:
@@ -47,14 +47,14 @@ def test_given_star_becomes_the_star_of_the_study(tmp_path: Path) -> None:
         assert (star.library or (star.file and star.file.name), star.magnitude) == (given, 8.0)
     # A study is still one, whatever it is called.
     (tmp_path / "mauvecl-exposure" / "study.toml").rename(tmp_path / "study")
-    told = run("exposure", "study", "--no-pictures", folder=tmp_path).stdout
-    assert "star V = 8" in told
+    reported = run("exposure", "study", "--no-pictures", folder=tmp_path).stdout
+    assert "star V = 8" in reported
 
 
 def test_missing_study_is_reported(tmp_path: Path) -> None:
     for name in ("no.toml", "nothing", "G3V"):
-        code, _, told = ended("detect", name, folder=tmp_path)
-        assert (code, f"study file {name!r} does not exist" in told) == (2, True), told
+        code, _, reported = ended("detect", name, folder=tmp_path)
+        assert (code, f"study file {name!r} does not exist" in reported) == (2, True), reported
 
 
 @pytest.mark.parametrize("name", ["AD Leo", "ad leo", "Proxima", "Proxima Cen", "EV Lac", "YZ CMi", "AU Mic", "GJ 388",
@@ -70,10 +70,10 @@ def test_well_known_stars_name_a_spectrum_and_a_magnitude(name: str) -> None:
 
 def test_flags_are_proposed_for_a_well_known_star(tmp_path: Path) -> None:
     for words in (("--star", "AD Leo"), ("ad leo",)):
-        code, _, told = ended("simulate", *words, folder=tmp_path)
+        code, _, reported = ended("simulate", *words, folder=tmp_path)
         assert code == 2
-        found = re.search(r"(--star \S+) with (--magnitude \S+) ", told)
-        assert found, told
+        found = re.search(r"(--star \S+) with (--magnitude \S+) ", reported)
+        assert found, reported
     run("simulate", *shlex.split(f"{found[1]} {found[2]}"), "--no-pictures", folder=tmp_path)
 
 
@@ -86,7 +86,7 @@ def test_every_listed_star_is_proposed() -> None:
 
 
 def test_sun_needs_another_magnitude(tmp_path: Path) -> None:
-    code, _, told = ended("detect", "--star", "Sun", folder=tmp_path)
+    code, _, reported = ended("detect", "--star", "Sun", folder=tmp_path)
     assert code == 2
-    assert "V = -26.76" in told
-    assert "--magnitude 7.4" in told
+    assert "V = -26.76" in reported
+    assert "--magnitude 7.4" in reported

@@ -51,7 +51,7 @@ def test_every_numeric_flag_refuses_text(tmp_path: Path) -> None:
     flags = numeric()
     assert len(flags) > 60
     for flag, verb in sorted({flag: verb for verb, flag in flags}.items()):
-        code, out, told = ended(verb, flag, "many", folder=tmp_path)
+        code, out, reported = ended(verb, flag, "many", folder=tmp_path)
         assert (code, out) == (2, ""), (verb, flag)
-        assert told.startswith(f"mauvecl: {flag} 'many', expected a "), told
-        assert told.count("\n") == 1
+        assert reported.startswith(f"mauvecl: {flag} 'many', expected a "), reported
+        assert reported.count("\n") == 1

@@ -49,8 +49,8 @@ def test_every_changed_or_missing_file_is_noticed(verb: str, tmp_path: Path, mon
         for changed in (content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :], content + b"\n", b""):
             path.write_bytes(changed)
             assert [one.file for one in verify_answer(out)] == [path.name], path
-        told = json.loads(run("verify", out, "--json", folder=tmp_path, code=1).stdout)
-        assert told[0]["file"] == path.name
+        reported = json.loads(run("verify", out, "--json", folder=tmp_path, code=1).stdout)
+        assert reported[0]["file"] == path.name
         path.unlink()
         assert [(one.file, one.state) for one in verify_answer(out)] == [(path.name, "missing")]
         path.write_bytes(content)

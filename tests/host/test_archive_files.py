@@ -131,15 +131,15 @@ def test_short_spectra_suffice_for_a_narrower_range() -> None:
 
 
 def test_messages_of_archive_files() -> None:
-    told = {name: Source.read(HERE / name, **options).messages for name, options, *_ in RIGHT}
-    assert told["18sco_stis_004.fits"] == ("its own points cover 171.042-31891.2 nm",)
-    assert told["sun_reference_stis_002.fits"] == ("its own points cover 119.5-2695.74 nm",)
-    assert "its own points cover 290.033-2497.72 nm, 82% of 200-700 nm" in told["vb8_stiswfcnic_004.fits"]
-    assert any("ASSUMED: flux in erg" in text for text in told["10lac_stis_001.txt"])
-    assert any("merged; 11 of them differ" in text for text in told["10lac_stis_001.txt"])
-    assert any("130 of its 2242 points" in text for text in told["h_stis_ngsl_hd095735_v2.txtA"])
-    assert any("113 of its 1349 points" in text for text in told["vb8_stiswfcnic_004.fits"])
-    assert any("below 290.033 nm it is continued by M3V" in text for text in told["vb8_stiswfcnic_004.fits"])
+    reported = {name: Source.read(HERE / name, **options).messages for name, options, *_ in RIGHT}
+    assert reported["18sco_stis_004.fits"] == ("its own points cover 171.042-31891.2 nm",)
+    assert reported["sun_reference_stis_002.fits"] == ("its own points cover 119.5-2695.74 nm",)
+    assert "its own points cover 290.033-2497.72 nm, 82% of 200-700 nm" in reported["vb8_stiswfcnic_004.fits"]
+    assert any("ASSUMED: flux in erg" in text for text in reported["10lac_stis_001.txt"])
+    assert any("merged; 11 of them differ" in text for text in reported["10lac_stis_001.txt"])
+    assert any("130 of its 2242 points" in text for text in reported["h_stis_ngsl_hd095735_v2.txtA"])
+    assert any("113 of its 1349 points" in text for text in reported["vb8_stiswfcnic_004.fits"])
+    assert any("below 290.033 nm it is continued by M3V" in text for text in reported["vb8_stiswfcnic_004.fits"])
 
 
 def test_start_and_step_in_one_row() -> None:

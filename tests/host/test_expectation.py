@@ -102,8 +102,8 @@ def test_sky_alone_has_no_net_signal(sunlike: Source, mauve: Instrument) -> None
 
 def test_paper_signal_is_reported(sunlike: Source, mauve: Instrument) -> None:
     sky = Sky.of_brightness(22.1)
-    told = expect(sunlike, mauve, exposure=50, sky=sky, signal="paper").messages
-    assert of_kind(told, "paper signal")
+    reported = expect(sunlike, mauve, exposure=50, sky=sky, signal="paper").messages
+    assert of_kind(reported, "paper signal")
     assert not of_kind(expect(sunlike, mauve, exposure=50, sky=sky).messages, "paper signal")
 
 
@@ -141,7 +141,7 @@ def test_dark_in_electrons_is_less_noisy(sunlike: Source, quiet: Expectation) ->
 
 
 @pytest.mark.parametrize(
-    ("exposure", "frames", "told"),
+    ("exposure", "frames", "reported"),
     [
         (50, 10, False),
         (47.0, 10, True),
@@ -153,11 +153,13 @@ def test_dark_in_electrons_is_less_noisy(sunlike: Source, quiet: Expectation) ->
         (np.float32(10), 2, False),
     ],
 )
-def test_exposures_are_whole_frames(sunlike: Source, mauve: Instrument, exposure: Any, frames: int, told: bool) -> None:
+def test_exposures_are_whole_frames(
+    sunlike: Source, mauve: Instrument, exposure: Any, frames: int, reported: bool
+) -> None:
     x = expect(sunlike, mauve, exposure=exposure)
     assert x.n_frames == frames
     assert x.exposure_s == 5 * frames
-    assert bool(of_kind(x.messages, "rounded up")) is told
+    assert bool(of_kind(x.messages, "rounded up")) is reported
 
 
 def test_float_sum_of_frames_is_not_rounded_up(sunlike: Source, mauve: Instrument) -> None:

@@ -39,8 +39,8 @@ def test_noise_dominated_ultraviolet_is_reported() -> None:
     """Report the ultraviolet of M5V and M6V, which is brighter than M4V's because of noise."""
     limits = {"M0V": 0.0, "M1V": 240.0, "M3V": 0.0, "M4V": 240.0, "M5V": 300.0, "M6V": 300.0}
     for name, limit in limits.items():
-        told = Source.from_library(name).messages
-        assert told == (
+        reported = Source.from_library(name).messages
+        assert reported == (
             (f"noise rules its ultraviolet below {limit:g} nm, where its flux is an upper limit",) * (limit > 0)
         )
         assert (near_ultraviolet(name) > 2 * near_ultraviolet("M4V")) <= (limit >= 300 or name in ("M0V", "M1V"))
@@ -146,9 +146,9 @@ def test_every_spectrum_and_band_names_its_source_file() -> None:
     files = {row["entry"]: row for row in table}
     index = Table.read(library / "index.ecsv", format="ascii.ecsv")
     for row in index:
-        told = files.pop(f"spectrum {row['name']}")
-        assert told["file"].endswith("/" + row["source_file"])
-        assert told["package"] in row["origin"]
+        reported = files.pop(f"spectrum {row['name']}")
+        assert reported["file"].endswith("/" + row["source_file"])
+        assert reported["package"] in row["origin"]
     for file in (library / "bands").glob("*.ecsv"):
         meta = Table.read(file, format="ascii.ecsv").meta
         assert f"package {files.pop('band ' + meta['name'])['package']} " in meta["origin"]

@@ -141,9 +141,9 @@ def test_mean_orbit_follows_sgp4_for_a_fortnight(orbit: Orbit) -> None:
 
 def test_messages_about_the_epoch(orbit: Orbit) -> None:
     assert orbit.messages(TimeGrid("2026-09-20", 5.0)) == []
-    told = orbit.messages(TimeGrid("2026-10-10", 5.0))
-    assert len(told) == 1
-    assert "along its track" in told[0]
+    reported = orbit.messages(TimeGrid("2026-10-10", 5.0))
+    assert len(reported) == 1
+    assert "along its track" in reported[0]
     assert orbit.along_track_km(30) == pytest.approx(1 + 60 + 0.5 * 5.125e-5 * 900 * 2 * np.pi * 6879.04, rel=1e-4)
     assert orbit.farthest_d(TimeGrid("2026-10-10", 5.0)) < MEAN_FROM_D
 

@@ -313,5 +313,5 @@ def test_documentation_and_help_list_all_collections() -> None:
     page = (Path(__file__).parents[2] / "docs/my-star.md").read_text(encoding="utf-8")
     named = {*re.findall(r'fetch "(\w+):', page), *re.findall(r"\b(\w+):\.\.\.", page)}
     assert named == {one.name for one in hst_collections.COLLECTIONS}
-    told = CliRunner().invoke(app, ["library", "fetch", "--help"]).output
-    assert all(name in told for name in named)
+    reported = CliRunner().invoke(app, ["library", "fetch", "--help"]).output
+    assert all(name in reported for name in named)

@@ -123,8 +123,8 @@ def test_solar_avoidance_message_states_the_separation() -> None:
     _, _, separation = almanac(100.0, 10.0, "2026-06-21")
     with refused("target") as caught:
         Sky.at("100.0 10.0", "2026-06-21")
-    told = float(str(caught.value).removeprefix("the Sun is ").split(" deg")[0])
-    assert told == pytest.approx(separation, abs=0.1)
+    reported = float(str(caught.value).removeprefix("the Sun is ").split(" deg")[0])
+    assert reported == pytest.approx(separation, abs=0.1)
 
 
 @pytest.mark.filterwarnings("error")

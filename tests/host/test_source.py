@@ -410,9 +410,11 @@ def test_measured_noise_is_kept_and_reported_once() -> None:
     star = Source.from_arrays(nm, flux, name="cool")
     np.testing.assert_array_equal(star.flux_flam, flux)
     found = expect(star, Instrument.load("mauve"), exposure=50.0)
-    told = [message for message in found.messages if "negative flux" in message]
-    assert len(told) == 1
-    assert f"{int((flux[(nm >= 180) & (nm <= 750)] < 0).sum())} of its 5700 points" in told[0].replace("5701", "5700")
+    reported = [message for message in found.messages if "negative flux" in message]
+    assert len(reported) == 1
+    assert f"{int((flux[(nm >= 180) & (nm <= 750)] < 0).sum())} of its 5700 points" in reported[0].replace(
+        "5701", "5700"
+    )
     assert (found.source_electrons >= 0).all()
     # Magnitudes take the noise as it is, above and below zero.
     assert star.magnitude("GALEX NUV") != Source.from_arrays(nm, np.maximum(flux, 0), name="x").magnitude("GALEX NUV")
@@ -441,10 +443,10 @@ def test_standard_error_equals_the_scatter_of_means() -> None:
     rng = np.random.default_rng(5)
     draws = [1e-12 + 1e-13 * rng.standard_normal(nm.size) for _ in range(200)]
     means = np.array([electrons_per_second(mauve, nm, flux) for flux in draws])
-    told = np.mean(
+    reported = np.mean(
         [standard_error_per_second(Source.from_arrays(nm, flux), mauve, "paper") for flux in draws[:20]], axis=0
     )
-    ratio = (told / means.std(axis=0))[100:1600:150]
+    ratio = (reported / means.std(axis=0))[100:1600:150]
     assert (np.abs(ratio - 1) < 0.25).all(), ratio
 
 

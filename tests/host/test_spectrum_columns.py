@@ -190,7 +190,7 @@ def test_columns_are_recognised(tmp_path: Path, case: str) -> None:
     ],
 )
 def test_conversions_are_reported(tmp_path: Path, case: str, message: str) -> None:
-    assert any(message in told for told in read(tmp_path, RIGHT[case]).messages)
+    assert any(message in reported for reported in read(tmp_path, RIGHT[case]).messages)
 
 
 ONE, TWO = FLUX, 2 * FLUX

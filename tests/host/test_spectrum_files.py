@@ -26,11 +26,11 @@ NM = np.arange(170.0, 1000.0, 2.0)
 FLUX = 1e-13 * (1.1 + np.sin(NM / 37.0)) * np.exp(-(((NM - 560.0) / 300.0) ** 2))
 
 
-def alike(path: Path | str, rtol: float = 1e-9, told: str | None = None, **options: Any) -> Source:
+def alike(path: Path | str, rtol: float = 1e-9, reported: str | None = None, **options: Any) -> Source:
     star = Source.read(path, **options)
     np.testing.assert_allclose(star.wavelength_nm, NM, rtol=rtol)
     np.testing.assert_allclose(star.flux_flam, FLUX, rtol=rtol)
-    assert told is None or any(told in text for text in star.messages), star.messages
+    assert reported is None or any(reported in text for text in star.messages), star.messages
     return star
 
 
@@ -230,7 +230,7 @@ def test_assumed_units_are_reported(tmp_path: Path) -> None:
     assert star.messages == ("its own points cover 170-998 nm",)
     alike(tmp_path / "b.txt", wavelength_unit=u.AA, flux_unit=u.W / u.m**2 / u.nm)
     (tmp_path / "c.fits").write_bytes(table(units=(None, None)))
-    alike(tmp_path / "c.fits", told="ASSUMED: wavelength in Angstrom")
+    alike(tmp_path / "c.fits", reported="ASSUMED: wavelength in Angstrom")
 
 
 def test_angstrom_that_spans_the_range_as_numbers_is_not_nm(tmp_path: Path) -> None:

@@ -90,11 +90,11 @@ def test_auto_mode_stacks_only_where_moments_agree() -> None:
             "gain": float(generator.choice([0.05, 0.6, 1.0])),
         }
         x = quiet(float(10 ** generator.uniform(-1.0, 1.2)), int(generator.integers(2, 60)), **kind)
-        told = [exact.draws_to_tell(*both(x, p)[:2]) for p in range(8)]
+        reported = [exact.draws_to_tell(*both(x, p)[:2]) for p in range(8)]
         frames = prepare([x]).frames
         stacked += not frames
-        wrong += min(told) < 1e12
-        assert frames or min(told) > SOONEST
+        wrong += min(reported) < 1e12
+        assert frames or min(reported) > SOONEST
         if frames:
             with refused("mode", "'stacked'"):
                 prepare([x], mode="stacked")

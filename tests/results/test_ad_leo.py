@@ -88,9 +88,9 @@ def test_command_line_measures_the_flare(tmp_path: Path) -> None:
 
 def test_flare_as_observed_has_no_other_amplitude(tmp_path: Path) -> None:
     """Refuse a sweep over amplitudes, and a flare without a file."""
-    code, _, told = ended(*ad_leo_words(912), "--sweep", "amplitude=0.1,0.2", folder=tmp_path)
+    code, _, reported = ended(*ad_leo_words(912), "--sweep", "amplitude=0.1,0.2", folder=tmp_path)
     assert code == 2
-    assert "amplitude" in told
+    assert "amplitude" in reported
     with refused("flare.spectrum.as_observed"):
         Study().with_settings(["flare.spectrum.as_observed=true"])
 

@@ -161,8 +161,8 @@ def test_forecasts_agree_with_brute_force(
     if unknown:
         information[6, 6] += 1 / 0.1**2
     errors = np.sqrt(np.diag(np.linalg.inv(information / np.outer(scale, scale)))) / scale
-    told = forecast(x, m, kelvin, amplitudes, free(x, sky=0.1) if unknown else None)
-    got = [told.errors[told.names.index(name)] for name in ("amplitude", "temperature", "jump", "line Ca II")]
+    reported = forecast(x, m, kelvin, amplitudes, free(x, sky=0.1) if unknown else None)
+    got = [reported.errors[reported.names.index(name)] for name in ("amplitude", "temperature", "jump", "line Ca II")]
     np.testing.assert_allclose(got, errors[:4], rtol=2e-3)
     np.testing.assert_allclose(m.counts(kelvin, amplitudes), counts(*at), rtol=1e-4, atol=1e-3)
 
@@ -339,15 +339,15 @@ def test_sums_keep_the_information() -> None:
     for kelvin in (3100.0, 9500.0, 41_234.0):
         m = model(jump=True, lines=("Mg II", "H beta"))
         amplitudes = m.amplitudes(kelvin, 0.3, jump=1.7, lines=(1e-12, 0.0))
-        told = forecast(x, m, kelvin, amplitudes)
+        reported = forecast(x, m, kelvin, amplitudes)
         slope = amplitudes[0] * m.hot_spline(np.log(kelvin), 1)
         rows = np.vstack([m.hot_spline(np.log(kelvin)), m.fixed, slope])
         variance = x.variance_dn2 + x.gain_dn_per_electron * m.counts(kelvin, amplitudes)
         scale = np.linalg.norm(rows / np.sqrt(variance), axis=1)
         white = rows / np.sqrt(variance) / scale[:, None]
         inverse = np.linalg.inv(white @ white.T)
-        assert told.errors[0] / kelvin == pytest.approx(np.sqrt(inverse[-1, -1]) / scale[-1], rel=1e-4)
-        assert told.errors[1] == pytest.approx(np.sqrt(inverse[0, 0]) / scale[0], rel=1e-4)
+        assert reported.errors[0] / kelvin == pytest.approx(np.sqrt(inverse[-1, -1]) / scale[-1], rel=1e-4)
+        assert reported.errors[1] == pytest.approx(np.sqrt(inverse[0, 0]) / scale[0], rel=1e-4)
 
 
 def test_saturated_pixels_do_not_count() -> None:

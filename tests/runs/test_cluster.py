@@ -293,10 +293,10 @@ def test_example_for_batch_systems_runs(system: str, line: str) -> None:
     pytest.importorskip("dask_jobqueue")
     example = Path(__file__).parents[2] / "docs" / "examples" / "batch_cluster.py"
     command = [sys.executable, example, system, "--queue", "astro", "--cores", "4", "--show"]
-    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert line in told
-    assert "--nthreads 1" in told
-    assert "--nworkers 4" in told
+    reported = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert line in reported
+    assert "--nthreads 1" in reported
+    assert "--nworkers 4" in reported
 
 
 @pytest.mark.parametrize("by", ["address", "file"])

@@ -210,8 +210,8 @@ def test_fingerprints_distinguish_requests(scene: list[Expectation]) -> None:
     ]
     names = [fingerprint(one) for one in (base, *others)]
     assert len(set(names)) == len(names)
-    told = replace(quiet, provenance={"from": "elsewhere"}, messages=())
-    for same_one in (replace(base, realisations=7), replace(base, quiet=told), pickle.loads(pickle.dumps(base))):
+    reported = replace(quiet, provenance={"from": "elsewhere"}, messages=())
+    for same_one in (replace(base, realisations=7), replace(base, quiet=reported), pickle.loads(pickle.dumps(base))):
         assert fingerprint(same_one) == names[0]
 
 
@@ -396,11 +396,11 @@ def test_background_work_begins_once_after_the_devices() -> None:
 def test_progress_includes_resumed_shards(tmp_path: Path, engine: Engine) -> None:
     with pytest.raises(KeyboardInterrupt):
         at_work(tmp_path, engine, interrupting(20_000))
-    told: list[tuple[int, int]] = []
-    _, pool, _ = at_work(tmp_path, engine, lambda done, total: told.append((done, total)), resume=True)
-    assert told[0] == (0, N)
-    assert told[-1] == (N, N)
-    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    reported: list[tuple[int, int]] = []
+    _, pool, _ = at_work(tmp_path, engine, lambda done, total: reported.append((done, total)), resume=True)
+    assert reported[0] == (0, N)
+    assert reported[-1] == (N, N)
+    assert [done for done, _ in reported] == sorted(done for done, _ in reported)
     s = pool.standing
     assert (s.shards, s.of, s.retries) == (8, 8, 0)
 

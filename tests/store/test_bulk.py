@@ -326,8 +326,8 @@ def test_fits_export_contains_the_rows(tmp_path: Path, engine: Engine) -> None:
         assert "table STUDY" in str(hdus[0].header["HISTORY"])
         assert Study.build(tomllib.loads("\n".join(hdus["STUDY"].data["LINE"])), "fits") == made.study
     if shutil.which("fitsverify"):
-        told = subprocess.run(["fitsverify", path], capture_output=True, text=True, check=True).stdout
-        assert "0 warning(s) and 0 error(s)" in told, told
+        reported = subprocess.run(["fitsverify", path], capture_output=True, text=True, check=True).stdout
+        assert "0 warning(s) and 0 error(s)" in reported, reported
 
 
 def test_fits_export_contains_any_study() -> None:

@@ -79,21 +79,22 @@ def test_one_simulation_gives_both_numbers(chosen: str, tmp_path: Path) -> None:
 def test_sentence_holds_the_limits_of_the_verb(of: str, tmp_path: Path) -> None:
     """Compare with the closed forms of `mauvecl limit`, to the digits shown."""
     closed = forms_of(f"{M_DWARF}&of={of}&power=0.8", tmp_path)
-    told = solved(closed)
-    assert told.startswith("80 % of flares")
+    reported = solved(closed)
+    assert reported.startswith("80 % of flares")
     for words, unknown in (("everything known", UNKNOWN[0]), ("the usual unknowns", UNKNOWN[1])):
         limit = LimitSearch(closed.assuming(unknown).case, "matched").root()
         wanted = {"amplitude": f"{100 * limit:.3g} %", "magnitude": f"{limit:.2f}", "exposure": f"{limit:.3g} s"}[of]
         (clause,) = re.findall(
-            rf"(?:of at least|to a magnitude of|in) ([\d.]+(?: %| s)?)(?: at V = 9 are detected)? with {words}", told
+            rf"(?:of at least|to a magnitude of|in) ([\d.]+(?: %| s)?)(?: at V = 9 are detected)? with {words}",
+            reported,
         )
-        assert clause == wanted, told
+        assert clause == wanted, reported
 
 
 def test_flare_at_the_limit_is_detected_with_the_wanted_probability(tmp_path: Path) -> None:
     """By inversion, within the rounding of the sentence: 1 % of the amplitude moves the chance by less than 1.5 %."""
-    told = solved(forms_of(M_DWARF, tmp_path))
-    for amplitude, unknown in zip(re.findall(r"of at least ([\d.]+) %", told), UNKNOWN, strict=True):
+    reported = solved(forms_of(M_DWARF, tmp_path))
+    for amplitude, unknown in zip(re.findall(r"of at least ([\d.]+) %", reported), UNKNOWN, strict=True):
         closed = forms_of(f"{M_DWARF}&amplitude_percent={amplitude}&unknown={unknown}", tmp_path)
         assert closed.chance == pytest.approx(0.9, abs=0.015)
 
@@ -108,8 +109,8 @@ def test_limit_that_does_not_exist_is_told(tmp_path: Path) -> None:
 
 def test_other_payload_is_that_of_its_own_question(tmp_path: Path) -> None:
     other = chances(forms_of(f"{M_DWARF}&instrument=mauve-electrons", tmp_path), {})
-    told = " and ".join(percent(one.value) for one in other)
-    assert other_payloads(forms_of(M_DWARF, tmp_path)) == f"With the payload mauve-electrons: {told}."
+    reported = " and ".join(percent(one.value) for one in other)
+    assert other_payloads(forms_of(M_DWARF, tmp_path)) == f"With the payload mauve-electrons: {reported}."
 
 
 @pytest.mark.parametrize("of", ["amplitude", "magnitude"])

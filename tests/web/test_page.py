@@ -65,9 +65,9 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     yield found
     found.kill()
     # A visitor who leaves in mid-sentence is no fault.
-    told = found.log.read_text()
-    assert "mauvecl.web" not in told, told
-    assert "Traceback" not in told, told
+    reported = found.log.read_text()
+    assert "mauvecl.web" not in reported, reported
+    assert "Traceback" not in reported, reported
 
 
 @pytest.fixture(scope="module")
@@ -174,9 +174,9 @@ def test_one_edit_answers_without_scrolling(browser: Browser, server: Server) ->
     """Ask about a 2 % flare on a G2V star of V = 7.4 in 50 s."""
     page = fresh(browser, server.address, viewport={"width": 1280, "height": 800})
     enter(page, "Magnitude", "7.4")
-    told = shown(page)
-    assert told.startswith("> 99.99 %")
-    assert "a 2 % flare (10000 K) on a G2V star of V = 7.4, in 50 s (10 frames)" in told
+    reported = shown(page)
+    assert reported.startswith("> 99.99 %")
+    assert "a 2 % flare (10000 K) on a G2V star of V = 7.4, in 50 s (10 frames)" in reported
     for found in ("#f-star", "#f-magnitude", "#f-amplitude_percent", "#f-exposure_s", "#chance", "#facts", "#simulate",
                   "#plot-excess", "#plot-distributions"):  # fmt: skip
         box = page.locator(found).bounding_box()
@@ -194,14 +194,14 @@ def test_page_and_command_line_give_the_same_bits(page: Page, tmp_path: Path) ->
     assert page.get_by_text("not a flight calibration").count() == 1, "told once"
     enter(page, "Flare amplitude", "1.9")
     place = page.locator("#plot-excess").bounding_box()
-    told = simulate(page)
+    reported = simulate(page)
     assert page.locator("#plot-excess").bounding_box() == place, "nothing jumps"
-    assert "of 100,000 simulated" in told
+    assert "of 100,000 simulated" in reported
     table, roc = download(page, "detection (ecsv)"), download(page, "roc (fits)")
     assert roc.startswith(b"SIMPLE")
     rows = QTable.read(io.BytesIO(table), format="ascii.ecsv")
     (row,) = (row for row in rows if row["statistic"] == "matched")
-    assert told.startswith(f"{100 * row['probability']:.1f} %")
+    assert reported.startswith(f"{100 * row['probability']:.1f} %")
     tab(page, "S/N")
     assert b"q97.5" in download(page, "snr (ecsv)")
     (tmp_path / "study.toml").write_bytes(taken(page))
@@ -418,7 +418,7 @@ def test_invalid_field_removes_the_answer(page: Page) -> None:
     before = shown(page)
     place = "document.querySelector('#plot-excess').getBoundingClientRect().y + scrollY"
     top = page.evaluate(place)
-    for label, wrong, right, told in (
+    for label, wrong, right, reported in (
         ("Magnitude", "99", "8.5", "'99' is out of range, expected -30 to 40 mag"),
         ("Magnitude", "7,4", "8.5", "'7,4' is not a number"),
         ("Seed", "", "1", "nothing is entered, expected a whole number"),
@@ -432,10 +432,10 @@ def test_invalid_field_removes_the_answer(page: Page) -> None:
         field = page.get_by_label(label, exact=True)
         assert field.input_value() == wrong, "what was entered stays there"
         assert field.get_attribute("aria-invalid") == "true"
-        assert told in page.locator(f"#{field.get_attribute('aria-describedby')}").inner_text(), "at its field"
+        assert reported in page.locator(f"#{field.get_attribute('aria-describedby')}").inner_text(), "at its field"
         enter(page, label, right)
         assert shown(page) == before
-        assert page.get_by_text(told).count() == 0
+        assert page.get_by_text(reported).count() == 0
 
 
 def test_typing_and_sliders_update_the_answer(page: Page) -> None:
@@ -504,10 +504,10 @@ def test_copied_link_restores_the_page(browser: Browser, page: Page) -> None:
     enter(page, "False-alarm probability", "0.05")
     enter(page, "Realisations", "10000")
     enter(page, "Flare amplitude", "1.5")
-    told = simulate(page)
+    reported = simulate(page)
     until(page, lambda: "simulated=detection" in page.url)
     second = fresh(browser, page.url)
-    until(second, lambda: shown(second) == told)
+    until(second, lambda: shown(second) == reported)
     assert second.url == page.url
     assert second.get_by_label("Realisations", exact=True).input_value() == "10000"
     second.context.close()
@@ -776,9 +776,9 @@ def test_page_without_scripts_says_so(browser: Browser, server: Server) -> None:
     context = browser.new_context(java_script_enabled=False)
     page = context.new_page()
     page.goto(server.address)
-    told = page.locator(".noscript")
-    assert told.is_visible()
-    assert "needs JavaScript" in told.inner_text()
+    reported = page.locator(".noscript")
+    assert reported.is_visible()
+    assert "needs JavaScript" in reported.inner_text()
     context.close()
 
 

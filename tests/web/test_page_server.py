@@ -144,7 +144,7 @@ def test_targets_are_names_coordinates_or_a_table(text: str, names: list[str]) -
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reported"),
     [
         ("AU Mik", "AU Mic"),
         ("no such star", "expected a name such as"),
@@ -159,11 +159,11 @@ def test_targets_are_names_coordinates_or_a_table(text: str, names: list[str]) -
         ("x" * 4000, "too long"),
     ],
 )
-def test_invalid_targets_are_a_fault(text: str, told: str) -> None:
+def test_invalid_targets_are_a_fault(text: str, reported: str) -> None:
     state = State()
     state.enter({"targets": text})
     assert state.faults.keys() == {"targets"}
-    assert told in state.faults["targets"]
+    assert reported in state.faults["targets"]
 
 
 @pytest.mark.parametrize(
@@ -290,7 +290,7 @@ def star_file(path: Path) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("value", "told"),
+    ("value", "reported"),
     [
         (1.0, "> 99.99 %"),
         (0.99995, "> 99.99 %"),
@@ -300,8 +300,8 @@ def star_file(path: Path) -> bytes:
         (0.0, "< 0.01 %"),
     ],
 )
-def test_probabilities_are_never_shown_as_certain(value: float, told: str) -> None:
-    assert percent(value) == told
+def test_probabilities_are_never_shown_as_certain(value: float, reported: str) -> None:
+    assert percent(value) == reported
 
 
 @pytest.fixture(scope="module")
@@ -461,34 +461,34 @@ class Talk:
         self._n += 1
         await self._connection.write_message(json.dumps({"ask": what, "n": self._n} | more))
         while True:
-            told = await self.next()
-            if told.get("n") == self._n and until in told:
-                return told
+            reported = await self.next()
+            if reported.get("n") == self._n and until in reported:
+                return reported
 
     async def answer(self, link: str = "", tab: str = "detection") -> dict[str, Any]:
-        told = await self.ask("answer", "faults", link=link, tab=tab)
-        if "answer" in told:
+        reported = await self.ask("answer", "faults", link=link, tab=tab)
+        if "answer" in reported:
             await self.pictures(tab)
-        return told
+        return reported
 
     async def pictures(self, tab: str) -> dict[str, Any]:
-        while "pictures" not in (told := await self.next()):
+        while "pictures" not in (reported := await self.next()):
             pass
-        assert told["tab"] == tab
-        return told
+        assert reported["tab"] == tab
+        return reported
 
     async def upload(self, content: bytes, field: str = "star", name: str = "star.txt") -> dict[str, Any]:
         self._n += 1
         await self._connection.write_message(json.dumps({"ask": "upload", "n": self._n, "field": field, "name": name}))
         await self._connection.write_message(content, binary=True)
-        while (told := await self.next()).get("n") != self._n:
+        while (reported := await self.next()).get("n") != self._n:
             pass
-        return told
+        return reported
 
     async def file(self, **which: str) -> tuple[str, bytes]:
-        told = await self.ask("file", "file", **which)
-        assert told["file"], told
-        return told["file"], await asyncio.wait_for(self._connection.read_message(), 60)
+        reported = await self.ask("file", "file", **which)
+        assert reported["file"], reported
+        return reported["file"], await asyncio.wait_for(self._connection.read_message(), 60)
 
     async def simulate(self, kind: str, link: str) -> dict[str, Any]:
         return await self.ask("simulate", "ended", kind=kind, link=link)
@@ -515,9 +515,9 @@ def test_failed_upload_leaves_no_answer(served: Any, monkeypatch: pytest.MonkeyP
             with monkeypatch.context() as patch:
                 patch.setitem(visitor.UPLOADS, "star", (fail, "uploaded star"))
                 assert (await talk.upload(good, name="my ![star](http://x/y.png).txt"))["lacks"]
-            told = await talk.answer(uploaded)
-            assert "answer" not in told, "no star, whatever was there before"
-            assert "its file again" in told["faults"]["star"]
+            reported = await talk.answer(uploaded)
+            assert "answer" not in reported, "no star, whatever was there before"
+            assert "its file again" in reported["faults"]["star"]
             assert (
                 "expected"
                 in (await talk.ask("file", "refused", link=uploaded, tab="spectrum", name="observation"))["refused"]
@@ -557,9 +557,9 @@ def test_internal_error_leaves_no_answer(served: Any, monkeypatch: pytest.Monkey
         talk = await Talk.begin(host)
         with monkeypatch.context() as patch:
             patch.setattr(closed_forms, "STATISTICS", {})
-            told = await talk.answer("?magnitude=8")
-            assert "answer" not in told
-            assert told["refused"] == visitor.OWN_FAULT
+            reported = await talk.answer("?magnitude=8")
+            assert "answer" not in reported
+            assert reported["refused"] == visitor.OWN_FAULT
         assert "answer" in await talk.answer("?magnitude=8")
         talk.end()
 
@@ -576,9 +576,9 @@ def test_last_of_several_questions_is_answered(served: Any) -> None:
             )
         answered = 0
         while True:
-            told = await talk.next()
-            answered += "answer" in told
-            if told["n"] == last and "pictures" in told:
+            reported = await talk.next()
+            answered += "answer" in reported
+            if reported["n"] == last and "pictures" in reported:
                 talk.end()
                 return answered
 
@@ -595,13 +595,13 @@ def test_cancel_ends_every_computation(served: Any, kind: str) -> None:
         talk = await Talk.begin(host)
         await talk.answer(link)
         await talk._connection.write_message(json.dumps({"ask": "simulate", "n": 99, "kind": kind, "link": link}))
-        while "waiting" in (told := await talk.next()).get("message", "waiting"):
-            assert "ended" not in told, told
+        while "waiting" in (reported := await talk.next()).get("message", "waiting"):
+            assert "ended" not in reported, reported
         used = resource.getrusage(resource.RUSAGE_SELF).ru_utime
         await talk._connection.write_message(json.dumps({"ask": "cancel", "n": 100}))
-        while "ended" not in (told := await talk.next()):
+        while "ended" not in (reported := await talk.next()):
             pass
-        assert told["ended"] == "Cancelled."
+        assert reported["ended"] == "Cancelled."
         spent = resource.getrusage(resource.RUSAGE_SELF).ru_utime - used
         await asyncio.sleep(0.3)
         idle = resource.getrusage(resource.RUSAGE_SELF).ru_utime - used - spent
@@ -788,8 +788,11 @@ def test_number_of_visitors_is_limited(served: Any, monkeypatch: pytest.MonkeyPa
 
     async def work(host: str) -> None:
         here = [await Talk.begin(host) for _ in range(2)]
-        code, told = await got(f"http://{host}/")
-        assert (code, told) == (503, "Too many visitors are here at the moment; please come again in some minutes.\n")
+        code, reported = await got(f"http://{host}/")
+        assert (code, reported) == (
+            503,
+            "Too many visitors are here at the moment; please come again in some minutes.\n",
+        )
         with pytest.raises(HTTPClientError, match="503"):
             await opened(host, Origin=f"http://{host}")
         assert (await got(f"http://{host}/favicon.svg"))[0] == 200
@@ -847,7 +850,7 @@ POINTLESS = [
 
 @pytest.mark.long
 def test_invalid_messages_give_no_traceback_and_no_path(served: Any, caplog: pytest.LogCaptureFixture) -> None:
-    told: list[str] = []
+    reported: list[str] = []
 
     async def work(host: str) -> None:
         for message in NONSENSE:
@@ -855,29 +858,29 @@ def test_invalid_messages_give_no_traceback_and_no_path(served: Any, caplog: pyt
             await connection.read_message()
             await connection.write_message(message, binary=isinstance(message, bytes))
             assert await asyncio.wait_for(connection.read_message(), 10) is None, "the end of it"
-            told.append(str(connection.close_reason))
+            reported.append(str(connection.close_reason))
         for pointless in POINTLESS:
             talk = await Talk.begin(host)
             await talk._connection.write_message(json.dumps({"n": 1, "link": ""} | pointless))
             with contextlib.suppress(TimeoutError):
-                told.append(str(await asyncio.wait_for(talk._connection.read_message(), 1.0)))
+                reported.append(str(await asyncio.wait_for(talk._connection.read_message(), 1.0)))
             talk.end()
         outside = "/..%2f..%2fetc/passwd", "/assets/%00", "/assets/../page.py", "/assets/server.py", "/nothing", "/live"
         for path in (*outside, "/figures/light/nothing.json", "/figures/light/excess.json?log=xyz"):
             code, text = await got(f"http://{host}{path}")
             assert 400 <= code < 500, path
-            told.append(text)
+            reported.append(text)
         assert (await got(f"http://{host}/?star=%ff%fe"))[0] == 200
         reader, writer = await asyncio.open_connection(*host.rsplit(":", 1))
         writer.write(b"GET / HTTP/9.9\r\nHost: \xff\xfe\r\nContent-Length: -1\r\n\r\n")
-        told.append((await reader.read(1000)).decode())
+        reported.append((await reader.read(1000)).decode())
 
     with caplog.at_level(logging.WARNING):
         served(work)
     form = Plain()
     lines = [form.format(record) for record in caplog.records]
     assert any("no question" in one for one in lines), "there is something to see"
-    for text in (*told, *lines):
+    for text in (*reported, *lines):
         assert "Traceback" not in text
         assert "site-packages" not in text
         assert str(Path(__file__).parents[2]) not in text
@@ -897,12 +900,12 @@ def test_messages_without_fields_are_answered_or_refused(served: Any, caplog: py
             await connection.write_message(json.dumps({"ask": ask}))
             # Whoever is still there answers the next message.
             await connection.write_message(json.dumps({"ask": "export", "n": 7, "link": "?star=M3V&magnitude=9"}))
-            told: Any = {}
-            while told.get("n") != 7:
+            reported: Any = {}
+            while reported.get("n") != 7:
                 message = await asyncio.wait_for(connection.read_message(), 60)
                 assert message is not None, ask
                 # A requested file arrives as bytes.
-                told = json.loads(message) if isinstance(message, str) else {}
+                reported = json.loads(message) if isinstance(message, str) else {}
             connection.close()
 
     with caplog.at_level(logging.ERROR):

@@ -122,14 +122,7 @@ ENERGY_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class PlanAnswer(Answer):
-    """Answer of `plan`.
-
-    Attributes
-    ----------
-    study : Study
-    seen : VisibleAnswer
-    planned : tuple of Planned
-    """
+    """Answer of `plan`."""
 
     USES: ClassVar[tuple[Use, ...]] = ("instrument", "flare", "orbit", "processes", "stare", "seed")
 

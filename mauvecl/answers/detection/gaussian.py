@@ -163,14 +163,7 @@ def _promises(result: SnrResult) -> QTable:
 
 @dataclass(eq=False)
 class GaussianAnswer(Answer):
-    """Answer of `gaussian_report`.
-
-    Attributes
-    ----------
-    study : Study
-    signal : SnrAnswer
-    detection : DetectAnswer
-    """
+    """Answer of `gaussian_report`."""
 
     USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "processes", "nuisances", "seed")
 

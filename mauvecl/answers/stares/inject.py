@@ -195,14 +195,7 @@ class StarCompleteness(InCell):
 
 @dataclass(eq=False)
 class InjectAnswer(Answer):
-    """The answer of `mauvecl inject`.
-
-    Attributes
-    ----------
-    study : Study
-    stars : list of StarCompleteness
-    messages : list of str
-    """
+    """The answer of `mauvecl inject`."""
 
     USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "processes", "stare", "seed")
 

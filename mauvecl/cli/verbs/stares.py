@@ -23,7 +23,7 @@ def stare(
     from mauvecl.schema.errors import InputError
 
     if given["energy"] and (given["amplitude"] or given["flares"]):
-        raise InputError("--energy is given beside --amplitude or --flares", "one of them", key="energy")
+        raise InputError("--energy is given together with --amplitude or --flares", "one of them", key="energy")
 
     stares = Stares(device)
     session.opened = stares.open_device
