@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from mauvecl.statistics.distributions import QuadraticForm
-from mauvecl.statistics.nuisances import Nuisances
 from mauvecl.statistics.statistic import Differences, Float, QuadraticStatistic, Setting, Tilt
 
 if TYPE_CHECKING:
@@ -43,20 +43,32 @@ class Chi2(QuadraticStatistic):
         if setting.nuisances:
             if scatter is not None:
                 scatter = self._grouped(setting, scatter * setting.used)[:, counts]
-            spectra = self._spectra(setting)[:, counts]
-            return self._marginal_form(setting.nuisances, spectra, delta, model, true, scatter)
+            return self._marginal_form(setting, counts, delta, model, true, scatter)
         return QuadraticForm(true / model, delta / np.sqrt(true))
 
-    @staticmethod
     def _marginal_form(
-        nuisances: Nuisances, spectra: Float, delta: Float, model: Float, true: Float, scatter: Float | None
+        self,
+        setting: Setting,
+        counts: NDArray[np.bool_],
+        delta: Float,
+        model: Float,
+        true: Float,
+        scatter: Float | None,
     ) -> QuadraticForm:
         """Return the distribution of x^T C^-1 x for normal x of mean `delta`, true variance and nuisance scatter."""
+        nuisances = setting.nuisances
+        assert nuisances is not None
         if scatter is None and not delta.any() and np.array_equal(model, true):
             size = delta.size - nuisances.free
             return QuadraticForm(np.ones(size), np.zeros(size))
         scale = np.sqrt(model)
-        rows = nuisances.rows(model, spectra) * scale
+
+        def projection() -> tuple[Float, Float]:
+            spectra = self._spectra(setting)[:, counts]
+            return spectra, nuisances.rows(model, spectra) * scale
+
+        # The nodes of an integral over drawn factors share the model's variances.
+        spectra, rows = setting.cached(f"projection of {self.name} on {np.packbits(counts).tobytes().hex()}", projection)
         drawn = (nuisances.finite(spectra) if scatter is None else scatter) / scale
         basis, rest = _span(np.vstack([spectra / scale, drawn, delta / scale]), true / model)
         # Covariance and quadratic form within the span.

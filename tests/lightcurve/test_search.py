@@ -42,11 +42,15 @@ def filtered(search, sums, curves):
 
 @pytest.mark.parametrize("level", [KNOWN, Baseline(window_s=600.0), Baseline(cycle=True, window_s=600.0)])
 def test_filters_are_least_squares_over_gaps(level):
-    """Compare correlations by FFT with a fit for each template, with gaps, unequal variances and a varying level."""
+    """Compare correlations by FFT with a fit for each template, with gaps, unequal variances and a varying level.
+
+    The last template is longer than the stare.
+    """
     stare = Stare.of(6000.0, gaps=[(1000, 1500), (3000, 3050)])
     rng = np.random.default_rng(1)
     curves = np.array([np.sin(stare.start_s / 600), np.cos(stare.start_s / 600)]) if level.cycle else np.zeros((0, 1))
-    bank = Bank((11.0, 54.0, 266.0), np.array([[1.0, 0.0], [0.8, 0.6]]), DAVENPORT, 5.0, level)
+    bank = Bank((11.0, 54.0, 266.0, 2000.0), np.array([[1.0, 0.0], [0.8, 0.6]]), DAVENPORT, 5.0, level)
+    assert bank.window(2000.0)[1] > stare.n_frames or level.offset
     variance = rng.uniform(0.5, 2.0, stare.n_frames)
     search = Search(bank, stare, curves if level.cycle else None, variance)
     sums = rng.standard_normal((2, stare.n_frames, 2)) + (30 + 1e-2 * stare.start_s[:, None] if level.offset else 0)

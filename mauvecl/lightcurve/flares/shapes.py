@@ -84,21 +84,16 @@ class Shape(ABC):
 
     def integral(self, first: ArrayLike, last: ArrayLike) -> Float:
         """Return the integral between two values of tau, elementwise, in half-widths."""
-        first, last = np.asarray(first, np.float64), np.asarray(last, np.float64)
+        first, last = np.broadcast_arrays(np.asarray(first, np.float64), np.asarray(last, np.float64))
+        values = np.empty(first.shape)
         # Differences of large integrals cancel, so each side of the peak uses the integral to its own end.
         late = first > 0
-        values = np.where(
-            late,
-            self.after(np.where(late, first, 0.0)) - self.after(np.maximum(last, 0.0)),
-            np.where(
-                last <= 0,
-                self.before(np.minimum(last, 0.0)) - self.before(np.minimum(first, 0.0)),
-                self.before(0.0)
-                - self.before(np.minimum(first, 0.0))
-                + self.after(0.0)
-                - self.after(np.maximum(last, 0.0)),
-            ),
-        )
+        early = ~late & (last <= 0)
+        across = ~(late | early)
+        values[late] = self.after(first[late]) - self.after(np.maximum(last[late], 0.0))
+        values[early] = self.before(last[early]) - self.before(first[early])
+        if across.any():
+            values[across] = self.before(0.0) - self.before(first[across]) + self.after(0.0) - self.after(last[across])
         # Shapes are not negative; differences of equal integrals may be, by rounding.
         return np.maximum(values, 0.0)
 
@@ -134,23 +129,27 @@ class Davenport2014(Shape):
     RISE: ClassVar = np.polynomial.Polynomial([1.0, 1.94053, -0.175084, -2.24588, -1.12498])
     #: Integral of the rise.
     RISEN: ClassVar = RISE.integ(lbnd=-1)
+    WHOLE_RISE: ClassVar = float(RISEN(0.0))
     DECAY: ClassVar = ((0.689008, 1.60053), (0.302963, 0.278318))
 
     def at(self, tau: ArrayLike) -> Float:
         t = np.asarray(tau, np.float64)
-        rise = np.where((t > -1) & (t <= 0), self.RISE(np.clip(t, -1, 0)), 0.0)
-        late = np.maximum(t, 0.0)
-        return np.asarray(np.where(t > 0, sum(a * np.exp(-b * late) for a, b in self.DECAY), rise))
+        values = np.zeros(t.shape)
+        rising, late = (t > -1) & (t <= 0), t > 0
+        values[rising] = self.RISE(t[rising])
+        values[late] = sum(a * np.exp(-b * t[late]) for a, b in self.DECAY)
+        return values
 
     def before(self, tau: ArrayLike) -> Float:
         t = np.asarray(tau, np.float64)
         late = np.maximum(t, 0.0)
-        return np.asarray(self._risen(t) + sum(-a / b * np.expm1(-b * late) for a, b in self.DECAY))
+        decayed = sum(-a / b * np.expm1(-b * late) for a, b in self.DECAY) if late.any() else 0.0
+        return np.asarray(self._risen(t) + decayed)
 
     def after(self, tau: ArrayLike) -> Float:
         t = np.asarray(tau, np.float64)
         late = np.maximum(t, 0.0)
-        rise = self.RISEN(0.0) - self._risen(t)
+        rise = self.WHOLE_RISE - self._risen(t) if (t < 0).any() else 0.0
         return np.asarray(rise + sum(a / b * np.exp(-b * late) for a, b in self.DECAY))
 
     def _risen(self, t: Float) -> Float:

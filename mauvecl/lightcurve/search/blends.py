@@ -241,9 +241,14 @@ class Block:
     basis: Float  # orthonormal columns of the whitened baseline, shape (n_used * n_sum, n_term)
     data: Float  # whitened sums less their projection on the baseline, shape (n_used * n_sum,)
 
+    @cached_property
+    def _frames(self) -> tuple[Float, Float]:
+        """Start and end of each frame, s, shape (n_used, 2), and its throughput, shape (n_used,)."""
+        return self.sums.edges[self.used], self.sums.survey.stare.light[self.used]
+
     def model(self, theta: Float) -> tuple[Float, Float]:
         """Return the whitened flux less its projection on the baseline, (n_row,), and derivatives, (n_row, n, 4)."""
-        edges, light = self.sums.edges[self.used], self.sums.survey.stare.light[self.used]
+        edges, light = self._frames
         shape, spline = self.sums.survey.bank.shape, self.sums.templates.mean_sums.spline
         derivatives = np.zeros((self.data.size, len(theta), 4))
         for k, one in enumerate(theta):
@@ -297,27 +302,26 @@ class Block:
                     every[j, AMPLITUDE] = value - every[j, WIDTH] - factor(every[j, KELVIN])[0]
             return every
 
-        held: dict[bytes, tuple[Float, Float]] = {}
+        held: dict[bytes, Float] = {}
 
-        def modelled(x: Float) -> tuple[Float, Float]:
+        def triangle(x: Float) -> Float:
+            """Return the triangular factor of derivatives and residuals as columns.
+
+            Its columns have the same scalar products, on which alone the fit depends. It has few rows.
+            """
             # Residuals and derivatives are evaluated at the same point, one after the other.
             if x.tobytes() not in held:
                 held.clear()
-                held[x.tobytes()] = self.model(whole(x))
+                every = whole(x)
+                model, derivatives = self.model(every)
+                if fixed is not None and fixed[3] is not None:
+                    j = fixed[0]
+                    tied = derivatives[:, j, AMPLITUDE].copy()
+                    derivatives[:, j, WIDTH] -= tied
+                    derivatives[:, j, KELVIN] -= fixed[3](every[j, KELVIN])[1] * tied
+                columns = np.column_stack([-derivatives[:, moved], self.data - model])
+                held[x.tobytes()] = np.linalg.qr(columns, mode="r")
             return held[x.tobytes()]
-
-        def residual(x: Float) -> Float:
-            return np.asarray(self.data - modelled(x)[0])
-
-        def jacobian(x: Float) -> Float:
-            every = whole(x)
-            derivatives = modelled(x)[1].copy()
-            if fixed is not None and fixed[3] is not None:
-                j = fixed[0]
-                tied = derivatives[:, j, AMPLITUDE].copy()
-                derivatives[:, j, WIDTH] -= tied
-                derivatives[:, j, KELVIN] -= fixed[3](every[j, KELVIN])[1] * tied
-            return -derivatives[:, moved]
 
         scale = np.ones(theta.shape)
         scale[:, PEAK] = np.exp(start[:, WIDTH])
@@ -325,8 +329,8 @@ class Block:
         if not moved.any():
             return BlendFit(whole(start[moved]), self.chi2(whole(start[moved])), dof, True)
         found = scipy.optimize.least_squares(
-            residual, start[moved], jacobian, bounds=(low[moved], high[moved]), x_scale=scale[moved],
-            ftol=CONVERGED, xtol=1e-9, gtol=None, max_nfev=MAX_EVALUATIONS,
+            lambda x: triangle(x)[:, -1], start[moved], lambda x: triangle(x)[:, :-1], bounds=(low[moved], high[moved]),
+            x_scale=scale[moved], ftol=CONVERGED, xtol=1e-9, gtol=None, max_nfev=MAX_EVALUATIONS,
         )  # fmt: skip
         return BlendFit(whole(found.x), 2 * float(found.cost), dof, bool(found.status > 0))
 

@@ -93,7 +93,8 @@ class Search:
         self._terms = [(power, 0) for power in bank.baseline.powers] + [(0, 1 + k) for k in range(len(series) - 1)]
         self._series = np.zeros((len(series), self.n_grid))
         self._series[:, self._at] = series
-        reach = max(t.shapes.shape[1] for t in bank.templates)
+        # Of templates longer than the stare, only the part within a stare's length of the onset meets data.
+        reach = min(max(t.shapes.shape[1] for t in bank.templates), self.n_grid)
         self._size = int(scipy.fft.next_fast_len(self.n_grid + reach, real=True))
 
     @cached_property
@@ -254,8 +255,9 @@ class Search:
         """Return sum_t data(t) kernel(t - first - onset) at every frame, in the precision of the spectrum."""
         real = np.float32 if spectrum.dtype == np.complex64 else np.float64
         held = np.zeros(self._size, real)
-        held[: kernel.size] = kernel
-        other = np.conj(scipy.fft.rfft(np.roll(held, first)))
+        met = slice(max(0, 1 - self.n_grid - first), max(0, self.n_grid - first))
+        held[: kernel[met].size] = kernel[met]
+        other = np.conj(scipy.fft.rfft(np.roll(held, first + met.start)))
         values: NDArray[Any] = scipy.fft.irfft(spectrum * other, self._size)
         return values[..., : self.n_grid]
 
