@@ -68,7 +68,8 @@ class Chi2(QuadraticStatistic):
             return spectra, nuisances.rows(model, spectra) * scale
 
         # The nodes of an integral over drawn factors share the model's variances.
-        spectra, rows = setting.cached(f"projection of {self.name} on {np.packbits(counts).tobytes().hex()}", projection)
+        pixels = np.packbits(counts).tobytes().hex()
+        spectra, rows = setting.cached(f"projection of {self.name} on {pixels}", projection)
         drawn = (nuisances.finite(spectra) if scatter is None else scatter) / scale
         basis, rest = _span(np.vstack([spectra / scale, drawn, delta / scale]), true / model)
         # Covariance and quadratic form within the span.
