@@ -51,7 +51,7 @@ def pearson(counts: np.ndarray, low: int, mean: float) -> float:
     return selftest.pearson(counts, stats.poisson.pmf(low + np.arange(counts.size), mean))
 
 
-#: Draws of each mean, and Philox counters whose words make them, so many at a time.
+#: Draws of each mean, and numbers of four words that are drawn at once.
 DRAWS, BLOCK = 100_000_000, 2_500_000
 EXPANDED = [SMALLEST_EXPANDED, 2225.0, 22250.0, 222500.0]
 
@@ -63,8 +63,9 @@ def drawn(probes_fast: Probes) -> dict[tuple[str, float], np.ndarray]:
     half = {mean: int(10 * np.sqrt(mean)) for mean in EXPANDED}
     counts = {("table", mean): np.zeros(2**table.bits, np.int64) for mean, table in tables.items()}
     counts |= {("expansion", mean): np.zeros(2 * half[mean], np.int64) for mean in EXPANDED}
-    for i in range(DRAWS // (4 * BLOCK)):
-        w = np.array(reference.words_at(np.arange(i * BLOCK, (i + 1) * BLOCK), 3, "dark", 7, 99))
+    rng = np.random.Generator(np.random.Philox(99))
+    for _ in range(DRAWS // (4 * BLOCK)):
+        w = rng.integers(0, 2**32, (4, BLOCK), np.uint32)
         for mean, table in tables.items():
             found = probes_fast.alias(w.ravel(), table.entries, table.bits)
             counts["table", mean] += np.bincount(found, minlength=2**table.bits)

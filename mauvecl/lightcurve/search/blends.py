@@ -320,17 +320,24 @@ class Block:
                     derivatives[:, j, WIDTH] -= tied
                     derivatives[:, j, KELVIN] -= fixed[3](every[j, KELVIN])[1] * tied
                 columns = np.column_stack([-derivatives[:, moved], self.data - model])
-                held[x.tobytes()] = np.linalg.qr(columns, mode="r")
+                held[x.tobytes()] = np.asarray(np.linalg.qr(columns, mode="r"))
             return held[x.tobytes()]
+
+        def residual(x: Float) -> Float:
+            return triangle(x)[:, -1]
+
+        def jacobian(x: Float) -> Float:
+            return triangle(x)[:, :-1]
 
         scale = np.ones(theta.shape)
         scale[:, PEAK] = np.exp(start[:, WIDTH])
         dof = self.data.size - self.basis.shape[1] - theta.shape[0] * len(self.sums.free)
         if not moved.any():
             return BlendFit(whole(start[moved]), self.chi2(whole(start[moved])), dof, True)
+
         found = scipy.optimize.least_squares(
-            lambda x: triangle(x)[:, -1], start[moved], lambda x: triangle(x)[:, :-1], bounds=(low[moved], high[moved]),
-            x_scale=scale[moved], ftol=CONVERGED, xtol=1e-9, gtol=None, max_nfev=MAX_EVALUATIONS,
+            residual, start[moved], jacobian, bounds=(low[moved], high[moved]), x_scale=scale[moved],
+            ftol=CONVERGED, xtol=1e-9, gtol=None, max_nfev=MAX_EVALUATIONS,
         )  # fmt: skip
         return BlendFit(whole(found.x), 2 * float(found.cost), dof, bool(found.status > 0))
 
