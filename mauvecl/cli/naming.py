@@ -47,7 +47,9 @@ def _flags(name: str, command: Any) -> list[str]:
     """Return the flags that set a parameter or a key of the study, the long one first."""
     from mauvecl.study.keys import keys_with_flags
 
-    wanted = {name} | {flag.parameter for key, _, flag in keys_with_flags() if f".{key}".endswith(f".{name}")}
+    # Of several flags of a key, the last takes its value as it is.
+    parameters = {key: flag.parameter for key, _, flag in keys_with_flags()}
+    wanted = {name} | {parameter for key, parameter in parameters.items() if f".{key}".endswith(f".{name}")}
     for parameter in command.params:
         if parameter.name in wanted:
             return sorted((one for one in parameter.opts if one.startswith("-")), key=len, reverse=True)
