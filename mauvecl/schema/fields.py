@@ -261,8 +261,10 @@ class Widget:
     most : float, optional
         Largest value that a server computes for a visitor; that of the key by default.
     kind : str
-        "day" for a calendar; by default a field of text, or a choice of words.
+        "day" for a calendar, "library" for a name of the library; by default a field of text, or a choice of words.
     slider : Slider, optional
+    suggestions : tuple of str
+        Texts that the page offers for a field of text.
     """
 
     label: str
@@ -277,6 +279,7 @@ class Widget:
     most: float | None = None
     kind: str = ""
     slider: Slider | None = None
+    suggestions: tuple[str, ...] = ()
 
 
 def found(kind: Any, of: type[Metadata]) -> list[Metadata]:

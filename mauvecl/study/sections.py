@@ -103,14 +103,34 @@ class Star(Section):
         str | None,
         Help("Unit of a spectrum file's wavelengths", "as in Angstrom, or 'nm air'"),
         Flag("--wavelength-unit"),
+        Widget(
+            label="Unit of wavelengths",
+            hint="That of the file's wavelengths, such as Angstrom or Angstrom air. Nothing: what the file says.",
+            group="Own spectrum",
+            suggestions=("nm", "Angstrom", "um", "nm air", "Angstrom air", "Hz", "eV"),
+        ),
     ] = None
     flux_unit: Annotated[
-        str | None, Help("Unit of a spectrum file's fluxes", "as in 'W m-2 nm-1'"), Flag("--flux-unit")
+        str | None,
+        Help("Unit of a spectrum file's fluxes", "as in 'W m-2 nm-1'"),
+        Flag("--flux-unit"),
+        Widget(
+            label="Unit of fluxes",
+            hint="That of the file's fluxes, such as W m-2 nm-1 or Jy. Nothing: what the file says.",
+            group="Own spectrum",
+            suggestions=("erg s-1 cm-2 Angstrom-1", "W m-2 nm-1", "W m-2 um-1", "Jy", "photon s-1 cm-2 Angstrom-1"),
+        ),
     ] = None
     extend: Annotated[
         str | None,
         Help("Library spectrum that continues a spectrum file beyond its ends, scaled to it"),
         Flag("--extend"),
+        Widget(
+            label="Continue with",
+            hint="Library spectrum that continues the file beyond its ends, scaled to it, such as G2V. Nothing: none.",
+            group="Own spectrum",
+            kind="library",
+        ),
     ] = None
     bin_nm: Annotated[BinWidth | None, Help("Width of bins over which the spectrum is averaged"), Flag("--bin-nm")] = (
         None

@@ -8,6 +8,7 @@ from mauvecl.answers.detection.chance_with_unknowns import BOTH_CHANCES
 from mauvecl.schema.messages import of_kind
 from mauvecl.web.closed_forms import ClosedForms, percent, short
 from mauvecl.web.headline import TITLES, chances
+from mauvecl.web.sentences import note
 from mauvecl.web.simulations import OTHER
 from mauvecl.web.tabs.tab import Answers, Tab
 
@@ -80,7 +81,7 @@ def _simulated(answers: Answers) -> list[str]:
 
 def _with_kinds(messages: list[str]) -> list[tuple[str, str]]:
     """Return messages with their kinds: severe ones begin in capitals."""
-    return [(m, "danger" if m.partition(":")[0].isupper() else "info") for m in messages]
+    return [(note(m), "danger" if m.partition(":")[0].isupper() else "info") for m in messages]
 
 
 def _messages(closed: ClosedForms, answers: Answers) -> list[str]:

@@ -243,7 +243,9 @@ class Field:
     most : int
         Largest number of characters.
     kind : str
-        Kind of the widget if not that of what is read: "day" or "targets".
+        Kind of the widget if not that of what is read: "day", "library" or "targets".
+    suggestions : tuple of str
+        Texts that the page offers.
     own_keys : tuple of str
         Keys and sections of the study that it sets without a path.
     """
@@ -260,6 +262,7 @@ class Field:
     scale: float = 1.0
     most: int = MOST_CHARACTERS
     kind: str = ""
+    suggestions: tuple[str, ...] = ()
     own_keys: tuple[str, ...] = ()
 
     @property
@@ -294,6 +297,7 @@ def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
         path,
         widget.scale,
         kind=widget.kind,
+        suggestions=widget.suggestions,
     )
 
 
@@ -303,6 +307,8 @@ def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> C
         return Choice(choices)
     if widget.kind == "day":
         return day
+    if widget.kind == "library":
+        return lambda text: spectrum_name(text, own=False) if text.strip() else None
     if field.annotation is bool:
         return Choice(("no", "yes"), lambda text: text == "yes")
     flag = first(field, Flag)
@@ -311,7 +317,7 @@ def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> C
         return lambda text: tuple(read([one for one in text.split(",") if one.strip()], widget.label))
     reach = first(field, Range)
     if reach is None:
-        return str
+        return (lambda text: text.strip() or None) if optional else str
     if widget.most is not None:
         reach = replace(reach, high=widget.most)
     if widget.scale != 1.0:
@@ -395,6 +401,8 @@ ADVANCED = {
 }
 #: Fields of the card.
 SOLVED = _group("Limit")
+#: Fields that say how the file of another field is read.
+READ_WITH = {"star": _group("Own spectrum")}
 #: Fields of the form above the tabs of targets.
 CAMPAIGN = _group("Campaign")
 #: Fields that ask for something under one sky only.

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
-from mauvecl.web.fields import FIELDS, UPLOADED, Draws, Field
+from mauvecl.web.fields import FIELDS, READ_WITH, UPLOADED, Draws, Field
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
 
-#: Fields whose values only apply together with those of others.
-CONDITIONAL = ("sky_brightness", "target", "time", "second_area", "hours")
+#: Fields whose values only apply together with those of others, and those that an upload was read with.
+CONDITIONAL = ("sky_brightness", "target", "time", "second_area", "hours", *itertools.chain(*READ_WITH.values()))
 Points = tuple[tuple[float, float], ...]
 #: Name of an uploaded star's file in the folder of its study.
 STAR_FILE = "star.ecsv"
@@ -23,10 +24,15 @@ STAR_FILE = "star.ecsv"
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """Valid values of all fields of `fields.FIELDS`, by name, and an uploaded star."""
+    """Valid values of all fields of `fields.FIELDS`, by name, and the contents of files that stand in them."""
 
     values: Mapping[str, Any]
-    uploaded: Source | None = None
+    uploads: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def uploaded(self) -> Source | None:
+        """The visitor's own star, if it is asked for."""
+        return self.uploads.get("star")
 
     def __getattr__(self, name: str) -> Any:
         """Return the value of a field, as in ``question.magnitude``."""
@@ -63,9 +69,9 @@ class Question:
         """
         values = self.values
         data: dict[str, Any] = {}
-        for name, field in FIELDS.items():
-            if field.path and name not in CONDITIONAL and values[name] is not None:
-                self._set(data, field, values[name])
+        for name, one in FIELDS.items():
+            if one.path and name not in CONDITIONAL and values[name] is not None:
+                self._set(data, one, values[name])
         data["star"] = [data["star"] | ({"file": file} if self.uploaded else {"library": values["star"]})]
         data["sky"] = {
             "brightness": {"surface_brightness": values["sky_brightness"]},
@@ -76,7 +82,8 @@ class Question:
             self._set(data, FIELDS["second_area"], values["second_area"])
         if values["lines"]:
             data["flare"].setdefault("spectrum", {})["lines"] = dict(values["lines"])
-        own = {"own": {"points": values["own_unknown"]}} if values["own_unknown"] else {}
+        points = self.uploads.get("own_unknown", values["own_unknown"])
+        own = {"own": {"points": points}} if points else {}
         data["nuisances"] = {"usual": values["unknown"] == "the usual", "own": own}
         draws: Draws = values["realisations"]
         data["run"] |= {
@@ -89,13 +96,13 @@ class Question:
         return data
 
     @staticmethod
-    def _set(data: dict[str, Any], field: Field, value: Any) -> None:
+    def _set(data: dict[str, Any], one: Field, value: Any) -> None:
         """Set the key of a field in the data of a study, in place."""
-        *sections, key = field.path
+        *sections, key = one.path
         for section in sections:
             data = data.setdefault(section, {})
-        if field.scale != 1.0:
-            value = value / field.scale
+        if one.scale != 1.0:
+            value = value / one.scale
         # A single flare.
         data[key] = [value] if key == "amplitudes" else value
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ WORDS = ("name", "origin", "notes", "messages", "measured_nm", "unscaled")
 _turns = threading.BoundedSemaphore(TOGETHER)
 
 
-def read_limited(content: bytes) -> Source:
+def read_limited(content: bytes, options: Mapping[str, str | None] | None = None) -> Source:
     """Read a spectrum from the bytes of a file, like `Source.read`, in a process with limited memory and time.
 
     Blocks for about a second, most of it for the start of Python: call it from a thread.
@@ -40,6 +41,8 @@ def read_limited(content: bytes) -> Source:
     ----------
     content : bytes
         What it is shows in itself: a name says nothing.
+    options : mapping, optional
+        Further arguments of `Source.read`.
 
     Raises
     ------
@@ -49,7 +52,7 @@ def read_limited(content: bytes) -> Source:
     if not _turns.acquire(timeout=SECONDS):
         raise InputError("too many uploads are read at the same time", "yours again in a minute", key="upload")
     try:
-        answer = _read_apart(content)
+        answer = _read_apart(content, dict(options or {}))
     finally:
         _turns.release()
     with np.load(io.BytesIO(answer), allow_pickle=False) as read:
@@ -67,7 +70,7 @@ def read_limited(content: bytes) -> Source:
         )
 
 
-def _read_apart(content: bytes) -> bytes:
+def _read_apart(content: bytes, options: dict[str, str | None]) -> bytes:
     """Run the reading process and return its output."""
     environment = os.environ | {
         # One thread of a numerical library needs no stacks of many.
@@ -77,7 +80,7 @@ def _read_apart(content: bytes) -> bytes:
         "PYTHONPATH": os.pathsep.join(filter(None, (_here(), os.environ.get("PYTHONPATH")))),
     }
     # A fresh interpreter, as spawn makes one: OpenCL does not survive a fork.
-    command = [sys.executable, "-m", "mauvecl.web.sandboxed_reader", str(MEMORY_MIB), str(SECONDS)]
+    command = [sys.executable, "-m", "mauvecl.web.sandboxed_reader", str(MEMORY_MIB), str(SECONDS), json.dumps(options)]
     with tempfile.TemporaryDirectory(prefix="mauvecl-upload-") as folder:
         try:
             done = subprocess.run(
@@ -132,12 +135,12 @@ def _limit(memory_mib: int, seconds: int) -> None:
 
 def _main() -> int:
     """Run the reading process: file on standard input, arrays on standard output, errors on standard error."""
-    memory_mib, seconds = sys.argv[1:]
+    memory_mib, seconds, options = sys.argv[1:]
     _limit(int(memory_mib), int(seconds))
     try:
         file = Path("upload")
         file.write_bytes(sys.stdin.buffer.read())
-        source = Source.read(file)
+        source = Source.read(file, **json.loads(options))
         out = io.BytesIO()
         np.savez(
             out,

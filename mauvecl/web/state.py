@@ -6,19 +6,17 @@ The state is independent of the page's appearance: the page enters text, and sho
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING
+from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
 from mauvecl.results.requests.fap_checks import check_fap
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
-from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_UNKNOWN, Choice, Field, several
-from mauvecl.web.question import Points, Question
+from mauvecl.web.fields import FIELDS, Choice, Field, several
+from mauvecl.web.question import Question
 from mauvecl.web.sentences import sentence
 from mauvecl.web.tabs import TABS
-
-if TYPE_CHECKING:
-    from mauvecl.host.stars.source import Source
+from mauvecl.web.upload import UPLOADS
 
 #: Largest number of characters of a link that are parsed.
 MOST_LINKED = 8192
@@ -35,19 +33,17 @@ class State:
         Text of each field of `FIELDS` and `SEEN` by name, valid or not.
     stray : str
         Message on entries of the last link that are not fields, or empty.
-    uploaded : Source or None
-        Spectrum of the star if "uploaded star" is entered.
-    unknown : tuple of pairs or None
-        Spectrum of the unknown if "uploaded spectrum" is entered.
+    uploads : mapping
+        Contents of the visitor's files by field.
     """
 
-    def __init__(self, uploaded: Source | None = None, unknown: Points | None = None) -> None:
+    def __init__(self, uploads: Mapping[str, Any] | None = None) -> None:
         self._fields = FIELDS | SEEN
         self.entered = {name: field.first for name, field in self._fields.items()}
         self._values = {name: field.read(field.first) for name, field in self._fields.items()}
         self._invalid: dict[str, str] = {}
         self.stray = ""
-        self.uploaded, self.unknown = uploaded, unknown
+        self.uploads = dict(uploads or {})
 
     def enter(self, given: Mapping[str, str]) -> None:
         """Enter text into fields."""
@@ -61,13 +57,16 @@ class State:
                         f"{shortened(text)} is too long", f"at most {field.most} characters", key=name, value=text
                     )
                 value = field.read(text)
-                if (text == UPLOADED and self.uploaded is None) or (text == UPLOADED_UNKNOWN and self.unknown is None):
+                if self._holds_file(name) and name not in self.uploads:
                     raise InputError(
                         f"the {text} is not here", "its file again: links do not hold it", key=name, value=text
                     )
                 self._values[name] = value
             except InputError as error:
                 self._invalid[name] = sentence(error)
+
+    def _holds_file(self, name: str) -> bool:
+        return name in UPLOADS and self.entered[name] == UPLOADS[name].entered
 
     @property
     def faults(self) -> dict[str, str]:
@@ -88,6 +87,13 @@ class State:
                 except InputError as error:
                     faults[name] = sentence(error)
         return faults
+
+    def values_of(self, names: Collection[str]) -> dict[str, Any]:
+        """Return the values of fields by name; raises InputError if one is invalid."""
+        for name in names:
+            if name in self._invalid:
+                raise InputError(f"{self._fields[name].label}: {self._invalid[name]}", key=name)
+        return {name: self._values[name] for name in names}
 
     def _check_fap(self) -> None:
         """Raise InputError if the realisations do not suffice for the false-alarm probability."""
@@ -134,9 +140,9 @@ class State:
             raise InputError(fault, expected or None, key=next(iter(faults)))
         first = State()
         values = {name: (self if name in names else first)._values[name] for name in FIELDS}
-        if values["own_unknown"] is None:
-            values["own_unknown"] = self.unknown
-        return Question(values, uploaded=self.uploaded if values["star"] == UPLOADED else None)
+        return Question(
+            values, {name: self.uploads[name] for name in UPLOADS if name in names and self._holds_file(name)}
+        )
 
     @property
     def simulated(self) -> tuple[str, ...]:

@@ -68,7 +68,7 @@ def front() -> bytes:
     """Return the page."""
     from mako.lookup import TemplateLookup
 
-    from mauvecl.host.stars import well_known
+    from mauvecl.host.stars import catalogue, well_known
     from mauvecl.host.stars.star_names import all_names
     from mauvecl.web import fields
     from mauvecl.web.figures import DASHES, INKS
@@ -76,7 +76,7 @@ def front() -> bytes:
     from mauvecl.web.simulations import SIMULATIONS
     from mauvecl.web.state import SEEN
     from mauvecl.web.tabs import TABS, reads_of
-    from mauvecl.web.upload import MOST_UPLOADED
+    from mauvecl.web.upload import MOST_UPLOADED, UPLOADS
     from mauvecl.web.visitor import UNUSED
 
     words = {
@@ -90,7 +90,7 @@ def front() -> bytes:
         "stars": all_names(),
         "example": "AU Mic\nYZ CMi\neps Eri",
         "asks": {name: sorted(reads_of(name)) for name in SIMULATIONS},
-        "uploads": {"star": fields.UPLOADED, "own_unknown": fields.UPLOADED_UNKNOWN},
+        "uploads": {name: {"entered": one.entered, "options": list(one.options)} for name, one in UPLOADS.items()},
         "under": fields.ASKED_UNDER,
         "presets": fields.PRESETS,
         "seen": {name: field.first for name, field in SEEN.items()},
@@ -113,7 +113,8 @@ def front() -> bytes:
     lookup = TemplateLookup([str(_FOLDER)], default_filters=["h"], strict_undefined=True)
     template = lookup.get_template("page.html.mako")
     text = template.render(
-        fields=fields, names=[star.name for star in well_known.stars()], tabs=TABS, version=VERSION,
+        fields=fields, uploads=UPLOADS, names=[star.name for star in well_known.stars()],
+        library=catalogue.names(), tabs=TABS, version=VERSION,
         bibtex=BIBTEX.format(version=VERSION), titles=TITLES, digest=_digest(),
         words=json.dumps(words).replace("<", "\\u003c"),
     )  # fmt: skip

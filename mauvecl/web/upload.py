@@ -1,8 +1,10 @@
-"""Uploads of spectra."""
+"""Files that visitors upload into fields of the page."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +12,7 @@ from mauvecl.host.files.columns import columns
 from mauvecl.host.stars.source import Source
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
-from mauvecl.web.fields import UPLOADED
+from mauvecl.web.fields import READ_WITH, UPLOADED, UPLOADED_UNKNOWN
 from mauvecl.web.question import Points
 from mauvecl.web.sandboxed_reader import read_limited
 
@@ -22,7 +24,7 @@ MOST_UPLOADED, MOST_POINTS = 4 * 2**20, 200_000
 MOST_PAIRS_BYTES, MOST_PAIRS = 2**18, 4000
 
 
-def read_upload(name: str, content: bytes) -> Source:
+def read_upload(name: str, content: bytes, **options: str | None) -> Source:
     """Read an untrusted spectrum from a visitor.
 
     Parameters
@@ -31,6 +33,8 @@ def read_upload(name: str, content: bytes) -> Source:
         Name on the visitor's computer; the format follows from the content.
     content : bytes
         Packed or not.
+    **options : str, optional
+        Those of `Source.read`.
 
     Raises
     ------
@@ -41,7 +45,7 @@ def read_upload(name: str, content: bytes) -> Source:
     if len(content) > MOST_UPLOADED:
         size, most = len(content) / 2**20, MOST_UPLOADED / 2**20
         raise InputError(f"upload of {size:.1f} MiB", f"at most {most:g} MiB", key="upload", value=len(content))
-    source = read_limited(content)
+    source = read_limited(content, options)
     if source.wavelength_nm.size > MOST_POINTS:
         raise InputError.of("points", source.wavelength_nm.size, f"at most {MOST_POINTS}")
     return replace(source, name=UPLOADED, origin="upload")
@@ -77,3 +81,29 @@ def read_pairs(name: str, content: bytes) -> Points:
     if not np.isfinite(pairs).all() or (np.diff(pairs[:, 0]) <= 0).any():
         raise InputError(f"{shortened(name)} does not ascend in nm", "rows that do", key="upload", value=name)
     return tuple((float(nm), float(dn)) for nm, dn in pairs)
+
+
+@dataclass(frozen=True)
+class Upload:
+    """Kind of file that a field takes.
+
+    Attributes
+    ----------
+    read : callable
+        Reads a file from its name and content, and from the values of `options` by name.
+    entered : str
+        Text of the field that stands for the file.
+    options : tuple of str
+        Fields that say how the file is read.
+    """
+
+    read: Callable[..., Any]
+    entered: str
+    options: tuple[str, ...] = ()
+
+
+#: Files by the field that takes them.
+UPLOADS: Mapping[str, Upload] = {
+    "star": Upload(read_upload, UPLOADED, READ_WITH["star"]),
+    "own_unknown": Upload(read_pairs, UPLOADED_UNKNOWN),
+}

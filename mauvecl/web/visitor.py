@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import hashlib
 import json
 import logging
 import tempfile
@@ -26,19 +27,16 @@ from mauvecl.schema.text import shortened
 from mauvecl.web.card import card, without_headline
 from mauvecl.web.closed_forms import ClosedForms
 from mauvecl.web.downloads import as_file, asked_study, taken_along
-from mauvecl.web.fields import UPLOADED, UPLOADED_UNKNOWN
 from mauvecl.web.headline import other_payloads, solved
 from mauvecl.web.known_stars import known
-from mauvecl.web.sentences import field_of, sentence
+from mauvecl.web.sentences import field_of, remedies, sentence
 from mauvecl.web.simulations import DRAWING, SIMULATIONS, verbs_of
 from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS, asking, reads_of
-from mauvecl.web.upload import read_pairs, read_upload
+from mauvecl.web.upload import UPLOADS
 from mauvecl.web.work import Cancelled, Job, reading
 
 if TYPE_CHECKING:
-    from mauvecl.host.stars.source import Source
-    from mauvecl.web.question import Points
     from mauvecl.web.tabs.tab import Answers, Tab
 
 log = logging.getLogger(__name__)
@@ -55,11 +53,6 @@ MOST_TASKS = 8
 OWN_FAULT = "the page has made a mistake of its own, and there is no answer: please report what was entered"
 #: Why a connection was ended, for the page.
 UNUSED = 4000
-#: Fields that take a file, with what reads it and what then stands in them.
-UPLOADS: dict[str, tuple[Callable[[str, bytes], Any], str]] = {
-    "star": (read_upload, UPLOADED),
-    "own_unknown": (read_pairs, UPLOADED_UNKNOWN),
-}
 
 
 class Visitor(WebSocketHandler):
@@ -79,9 +72,11 @@ class Visitor(WebSocketHandler):
         self._drawing: Job | None = None
         self._next: dict[str, Any] | None = None
         self._answering = False
+        self._solving = 0
         self._tasks: set[asyncio.Task[None]] = set()
-        self._coming: tuple[int, str, str] | None = None
+        self._coming: dict[str, Any] | None = None
         self._uploads: dict[str, Any] = {}
+        self._digests: dict[str, str] = {}
         self._closed: tuple[tuple[Any, ...], ClosedForms] | None = None
         self._answers: OrderedDict[tuple[str, tuple[Any, ...]], dict[str, Any]] = OrderedDict()
         self._files: OrderedDict[tuple[Any, ...], tuple[str, bytes]] = OrderedDict()
@@ -138,7 +133,7 @@ class Visitor(WebSocketHandler):
 
     def state(self, link: str) -> State:
         """Enter values."""
-        state = State(self._uploads.get("star"), self._uploads.get("own_unknown"))
+        state = State(self._uploads)
         state.follow(link)
         return state
 
@@ -193,9 +188,7 @@ class Visitor(WebSocketHandler):
 
     def _key(self, state: State, names: frozenset[str]) -> tuple[Any, ...]:
         """Return everything on which an answer to some fields depends."""
-        star: Source | None = self._uploads.get("star") if "star" in names else None
-        unknown: Points | None = self._uploads.get("own_unknown") if "own_unknown" in names else None
-        return state.asked(names), None if star is None else star.digest, hash(unknown)
+        return state.asked(names), *(self._digests.get(name) for name in UPLOADS if name in names)
 
     def _begin(self, work: Coroutine[Any, Any, None]) -> None:
         """Run a function without blocking other visitors."""
@@ -235,11 +228,15 @@ class Visitor(WebSocketHandler):
 
     def _ask_solve(self, asked: dict[str, Any]) -> None:
         """Send the limit of what the question solves for, and the chances with other payloads."""
-        n = asked["n"]
+        n = self._solving = asked["n"]
         self._give(self._solve(n, self.state(asked["link"])), n=n, solved="")
 
     async def _solve(self, n: int, state: State) -> None:
         closed = await self._in_thread(partial(self.closed, state, tab_of("")))
+        if n != self._solving:
+            # Of a bright star it takes long, and a later question waits.
+            self.send(n=n, solved="")
+            return
         self.send(n=n, payloads=await self._in_thread(partial(other_payloads, closed)))
         self.send(n=n, solved=await self._in_thread(partial(solved, closed)))
 
@@ -322,22 +319,26 @@ class Visitor(WebSocketHandler):
     def _ask_upload(self, asked: dict[str, Any]) -> None:
         """Expect a file in the next message."""
         if asked.get("field") in UPLOADS:
-            self._coming = asked["n"], asked["field"], str(asked.get("name"))
+            self._coming = asked
 
     def _content(self, content: bytes) -> None:
         """Read an uploaded file in a thread; its field is empty until then."""
         if self._coming is None:
             self.close(1003, "expected a question as the page asks it")
             return
-        (n, field, name), self._coming = self._coming, None
-        read, entered = UPLOADS[field]
+        asked, self._coming = self._coming, None
+        n, field, name = asked["n"], asked["field"], str(asked.get("name"))
+        upload = UPLOADS[field]
         self._uploads.pop(field, None)
+        state = self.state(asked["link"])
+        options = tuple(state.entered[name] for name in upload.options)
+        self._digests[field] = hashlib.sha256(content + repr(options).encode()).hexdigest()
 
         def came(future: Future[Any]) -> None:
             try:
                 self._uploads[field] = future.result()
             except InputError as error:
-                self.send(n=n, field=field, lacks=str(error))
+                self.send(n=n, field=field, lacks=sentence(error), remedies=remedies(error))
             except Exception as error:
                 log.exception("an upload failed")
                 self.send(
@@ -345,10 +346,10 @@ class Visitor(WebSocketHandler):
                     lacks=f"upload {shortened(name)} cannot be read ({type(error).__name__}), expected a spectrum",
                 )  # fmt: skip
             else:
-                self.send(n=n, field=field, entered=entered)
+                self.send(n=n, field=field, entered=upload.entered)
 
         loop = asyncio.get_running_loop()
-        future = reading(read, name, content)
+        future = reading(lambda: upload.read(name, content, **state.values_of(upload.options)))
         future.add_done_callback(lambda future: loop.call_soon_threadsafe(came, future))
 
     def _ask_file(self, asked: dict[str, Any]) -> None:

@@ -23,9 +23,9 @@ _own = threading.local()
 _reader = ThreadPoolExecutor(1, thread_name_prefix="mauvecl-upload")
 
 
-def reading(read: Callable[[str, bytes], Any], name: str, content: bytes) -> Future[Any]:
+def reading(read: Callable[[], Any]) -> Future[Any]:
     """Read an upload in the background."""
-    return _reader.submit(read, name, content)
+    return _reader.submit(read)
 
 
 class Cancelled(Exception):  # noqa: N818

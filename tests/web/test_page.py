@@ -549,8 +549,8 @@ def test_uploads_are_used_or_refused(page: Page, tmp_path: Path) -> None:
         choose.set_input_files(large)
         page.locator("#w-star", has_text=f"upload of {size:.1f} MiB, expected at most 4 MiB").wait_for()
         answerless(page)
-    enter(page, "Star", "Vega")
-    assert "Vega" in shown(page)
+    enter(page, "Star", "K5V")
+    assert "K5V" in shown(page)
     choose.set_input_files(good)
     until(page, lambda: "star=uploaded" in page.url and "your own star" in shown(page))
     (tmp_path / "stray.txt").write_text("200 1\n450 3\n700 1\n")
@@ -561,6 +561,36 @@ def test_uploads_are_used_or_refused(page: Page, tmp_path: Path) -> None:
         archive.extractall(tmp_path / "study")
     assert 'file = "star.ecsv"' in (tmp_path / "study" / "study.toml").read_text()
     assert "points" in (tmp_path / "study" / "study.toml").read_text()
+
+
+def test_units_are_chosen_where_they_are_advised_and_files_outlive_a_reload(browser: Browser, page: Page) -> None:
+    unit = page.get_by_label("Unit of wavelengths", exact=True)
+    assert not unit.is_visible()
+    short = "\n".join(f"{angstrom} 1e-12" for angstrom in range(3300, 7501, 10))
+    page.locator("[data-upload=star]").set_input_files(
+        {"name": "angstrom.txt", "mimeType": "text/plain", "buffer": short.encode()}
+    )
+    page.get_by_text("look like Angstrom").first.wait_for()
+    answerless(page)
+    # What the message advises is one click away, and the field that it names stands below the file.
+    assert unit.is_visible()
+    page.get_by_role("button", name="Unit of wavelengths: Angstrom", exact=True).click()
+    page.get_by_text("“Continue with” continues it by a library spectrum").first.wait_for()
+    assert unit.input_value() == "Angstrom"
+    enter(page, "Continue with", "M3V")
+    until(page, lambda: "your own star" in shown(page))
+    continued, address = shown(page), page.url
+    assert page.get_by_text("below 330 nm it is continued by M3V").count() == 1
+    page.reload()
+    until(page, lambda: "your own star" in shown(page))
+    assert shown(page) == continued
+    assert page.locator("[data-uploaded=star]").inner_text() == "angstrom.txt"
+    # Another visitor has not got the file, nor has another tab of this browser.
+    for context in (page.context, browser.new_context()):
+        other = context.new_page()
+        other.goto(address)
+        other.get_by_text("its file again: links do not hold it").first.wait_for()
+        other.close()
 
 
 def test_dropped_file_is_named_and_not_in_the_link(page: Page) -> None:

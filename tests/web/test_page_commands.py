@@ -106,7 +106,7 @@ def test_own_star_is_in_the_study_that_the_command_names(tmp_path: Path, monkeyp
     text = "\n".join(f"{nm} 1e-12" for nm in range(170, 1001))
     kept = tmp_path / "kept"
     kept.mkdir()
-    state = State(read_upload("star.txt", text.encode()))
+    state = State({"star": read_upload("star.txt", text.encode())})
     state.follow(f"?star={UPLOADED.replace(' ', '+')}")
     for tab in TABS.values():
         question = state.question(tab.reads)

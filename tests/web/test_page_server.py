@@ -55,7 +55,7 @@ from mauvecl.web.simulations import SIMULATIONS, asked, campaign_plan
 from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS, limit
 from mauvecl.web.tabs.tab import FIXED
-from mauvecl.web.upload import MOST_UPLOADED, read_pairs, read_upload
+from mauvecl.web.upload import MOST_UPLOADED, Upload, read_pairs, read_upload
 
 NUMBERS = [name for name, field in FIELDS.items() if isinstance(field.read, Number)]
 HOSTILE = "![x](http://127.0.0.1:1/x.png) <img src=http://127.0.0.1:1/y.png>"
@@ -428,7 +428,7 @@ def test_decompression_bombs_are_refused_early(bomb: Callable[[], bytes]) -> Non
 def test_uploaded_spectrum_answers_as_on_the_command_line() -> None:
     found = read_pairs("stray.txt", b"# nm DN\n200 1\n450 3.5\n700 1\n")
     assert found == ((200.0, 1.0), (450.0, 3.5), (700.0, 1.0))
-    state = State(unknown=found)
+    state = State({"own_unknown": found})
     state.enter({"own_unknown": UPLOADED_UNKNOWN})
     assert state.question().study().nuisances.own["own"].points == found
     state = State()
@@ -477,9 +477,13 @@ class Talk:
         assert reported["tab"] == tab
         return reported
 
-    async def upload(self, content: bytes, field: str = "star", name: str = "star.txt") -> dict[str, Any]:
+    async def upload(
+        self, content: bytes, field: str = "star", name: str = "star.txt", link: str = ""
+    ) -> dict[str, Any]:
         self._n += 1
-        await self._connection.write_message(json.dumps({"ask": "upload", "n": self._n, "field": field, "name": name}))
+        await self._connection.write_message(
+            json.dumps({"ask": "upload", "n": self._n, "field": field, "name": name, "link": link})
+        )
         await self._connection.write_message(content, binary=True)
         while (reported := await self.next()).get("n") != self._n:
             pass
@@ -513,7 +517,7 @@ def test_failed_upload_leaves_no_answer(served: Any, monkeypatch: pytest.MonkeyP
                 raise fault
 
             with monkeypatch.context() as patch:
-                patch.setitem(visitor.UPLOADS, "star", (fail, "uploaded star"))
+                patch.setitem(visitor.UPLOADS, "star", Upload(fail, "uploaded star"))
                 assert (await talk.upload(good, name="my ![star](http://x/y.png).txt"))["lacks"]
             reported = await talk.answer(uploaded)
             assert "answer" not in reported, "no star, whatever was there before"
@@ -537,7 +541,7 @@ def test_answers_continue_while_an_upload_is_read(served: Any, monkeypatch: pyte
         assert wait.wait(60.0)
         raise InputError("no spectrum")
 
-    monkeypatch.setitem(visitor.UPLOADS, "star", (slow, "uploaded star"))
+    monkeypatch.setitem(visitor.UPLOADS, "star", Upload(slow, "uploaded star"))
 
     async def work(host: str) -> None:
         first, other = await Talk.begin(host), await Talk.begin(host)

@@ -51,6 +51,9 @@ export class Fields {
     /** Fields on which the tab in front depends.
      * @type {Set<string>} */
     this.reads = new Set(Object.keys(words.fields))
+    /** Fields that hold a file.
+     * @type {Set<string>} */
+    this.filed = new Set()
     // The number of realisations that was chosen, and a larger one that the false-alarm probability needs.
     this.wish = this.raised = words.fields.realisations
     // The star whose values are filled in once the server knows them.
@@ -157,6 +160,8 @@ export class Fields {
       this.aside(name)
     }
     this.settled = this.entered.star
+    // Nothing is known of a file that is being read.
+    if (!this.entered.star) byId("k-star").textContent = ""
     if (this.entered.realisations !== this.raised) this.wish = this.entered.realisations
   }
 
@@ -184,12 +189,14 @@ export class Fields {
     this.hide()
   }
 
-  // Hide fields on which the tab does not depend, and those that apply to another choice of sky.
+  // Hide fields on which the tab does not depend, those that apply to another choice of sky, and those of absent files.
   hide() {
+    const options = Object.entries(this.words.uploads).flatMap(([field, one]) => this.filed.has(field) ? [] : one.options)
+    const fileless = new Set(options)
     for (const name of Object.keys(this.words.fields)) {
       const sky = this.words.under[name]
       const [box] = every(`[data-field="${name}"]`)
-      if (box) box.hidden = !this.reads.has(name) || (sky !== undefined && this.entered.sky !== sky)
+      if (box) box.hidden = !this.reads.has(name) || fileless.has(name) || (sky !== undefined && this.entered.sky !== sky)
     }
     for (const group of every("#advanced fieldset")) group.hidden = !every("[data-field]:not([hidden])", group).length
     byId("advanced").hidden = !every("#advanced fieldset:not([hidden])").length

@@ -21,6 +21,18 @@
 <%def name="meaning(name, about, message)">
 <div class="meaning" id="help-${name}" popover><strong>${about}</strong> ${message}</div>
 </%def>
+<%def name="upload(name, title, about, kinds)">
+<div class="file"><button type="button" class="plain" data-choose="${name}">${title}</button>
+<input type="file" data-upload="${name}" aria-label="${about}" tabindex="-1" hidden><span class="hint">${kinds}</span>
+<span data-uploaded="${name}"></span> <span data-remedies="${name}"></span></div>
+% if uploads[name].options:
+<div class="options">
+% for option in uploads[name].options:
+${control(option)}
+% endfor
+</div>
+% endif
+</%def>
 <%def name="control(name)">
 <% field = fields.FIELDS[name] %>
 <div class="field" data-field="${name}">
@@ -32,12 +44,10 @@
 <ul id="stars" role="listbox" aria-label="Stars" hidden></ul>
 </div>
 <p class="known"><span id="k-star"></span> <button type="button" class="plain" id="o-star" hidden></button></p>
-<div class="file"><button type="button" class="plain" data-choose="star">Use your own spectrum</button>
-<input type="file" data-upload="star" aria-label="Your own spectrum" tabindex="-1" hidden><span class="hint">nm and erg/s/cm²/Å; text, ECSV, VOTable, FITS; or drop it here</span><span data-uploaded="star"></span></div>
+${upload("star", "Use your own spectrum", "Your own spectrum", "text, ECSV, VOTable or FITS; or drop it here")}
 % elif name == "own_unknown":
 <input id="f-own_unknown" name="own_unknown" type="text" autocomplete="off" spellcheck="false" placeholder="200 1, 450 3, 700 1" aria-describedby="w-own_unknown">
-<div class="file"><button type="button" class="plain" data-choose="own_unknown">Use a file of nm and DN</button>
-<input type="file" data-upload="own_unknown" aria-label="File of the unknown spectrum" tabindex="-1" hidden><span data-uploaded="own_unknown"></span></div>
+${upload("own_unknown", "Use a file of nm and DN", "File of the unknown spectrum", "")}
 % elif field.kind == "targets":
 <textarea id="f-targets" name="targets" hidden></textarea>
 <div class="wide"><table id="targets"><caption class="quiet">Targets</caption><thead><tr></tr></thead><tbody></tbody></table></div>
@@ -58,7 +68,7 @@
 % endif
 % else:
 <div class="number"><input id="f-${name}" name="${name}" type="text" value="${field.first}" autocomplete="off" spellcheck="false"
- ${"inputmode=decimal" if hasattr(field.read, "range") else "list=names" if name == "target" else ""} aria-describedby="w-${name}">
+ ${"inputmode=decimal" if hasattr(field.read, "range") else "list=names" if name == "target" else "list=library" if field.kind == "library" else f"list=s-{name}" if field.suggestions else ""} aria-describedby="w-${name}">
 % if name == "magnitude":
 <label class="aside" for="f-band">in</label>
 <select id="f-band" name="band" aria-describedby="w-band">
@@ -70,6 +80,13 @@
 <span class="unit">${field.unit}</span>
 % endif
 </div>
+% if field.suggestions:
+<datalist id="s-${name}">
+% for text in field.suggestions:
+<option value="${text}"></option>
+% endfor
+</datalist>
+% endif
 % if field.slider:
 <input type="range" data-slider="${name}" aria-label="${field.label}, slider" min="0" max="1" step="1">
 % endif
@@ -182,6 +199,11 @@ ${control(name)}
 </div>
 </div>
 <ul id="notices" aria-label="Notices"></ul>
+<datalist id="library">
+% for name in library:
+<option value="${name}"></option>
+% endfor
+</datalist>
 <datalist id="names">
 % for name in names:
 <option value="${name}"></option>

@@ -40,6 +40,7 @@ class Page {
     this.fields = new Fields(words, (name, last, other) => {
       // A changed question cancels the wait for a file.
       if (other) this.uploads.forget([name])
+      if (other) this.uploads.changed(name, last)
       this.changed(last, other)
     }, (field, file) => this.uploads.choose(field, file))
     this.routing = new Routing(words, this.fields.entered, () => this.moved(), () => { this.front(); this.ask() })
@@ -51,6 +52,7 @@ class Page {
     })
     this.uploads = new Uploads(words, this.fields, this.live, {
       changed: last => this.changed(last, true), none: () => this.none(this.uploads.lacks), again: () => this.ask(),
+      link: () => this.routing.link,
     })
     this.export = new Export(this.live, this.routing, () => this.offer(), refused)
     this.pictures = new Pictures(words, given => this.enter(given), give, () => this.about())
@@ -310,7 +312,7 @@ class Page {
     this.pins.clear()
     // What the server knew of this page is gone with the connection; the browser has it all.
     this.simulations.wanted = this.routing.simulated
-    if (!this.uploads.resend()) this.ask()
+    this.uploads.resend().then(any => { if (!any) this.ask() })
   }
 
   /** @param {number} code */

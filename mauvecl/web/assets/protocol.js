@@ -23,7 +23,7 @@
  * A message of the server: which entries it has depends on what was asked.
  * @typedef {{n: number, faults: Faults, stray: string, answer: Answer, refused: string, tab: string,
  *   pictures: Record<string, Drawn>, rows: string[][], draws: boolean, ended: string, kind: string, progress: number,
- *   message: string, lacks: string, entered: string, file: string, taken: any[], solved?: string, payloads?: string,
+ *   message: string, lacks: string, remedies: [string, string][], entered: string, file: string, taken: any[], solved?: string, payloads?: string,
  *   pins: Record<string, Columns>, hello: string,
  *   known: {star: {about: string, given: Entered, offer: string}, targets: any[]}}} Message
  *
@@ -33,7 +33,7 @@
  * Texts and limits that the page is served with.
  * @typedef {{version: string, fields: Entered, seen: {tab: string, simulated: string}, stars: string[],
  *   example: string, asks: Record<string, string[]>,
- *   uploads: Record<string, string>, under: Record<string, string>, presets: Record<string, Entered>,
+ *   uploads: Record<string, {entered: string, options: string[]}>, under: Record<string, string>, presets: Record<string, Entered>,
  *   sliders: Record<string, {low: number, high: number, step: number, log: boolean}>,
  *   tabs: Record<string, {pictures: PictureWords[], files: Record<string, string | null>, reads: string[], headline: boolean}>,
  *   pins: Record<string, [string, string][]>, most_uploaded: number, unused: number}} Words
