@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import Share
 
 from .response import Order, electrons_per_second
 from .stars.catalogue import embedded, library_table
@@ -96,17 +98,14 @@ class Neighbour:
         return star
 
 
+@validated
 @dataclass(frozen=True, eq=False)
 class Neighbours:
     """Neighbours of one target."""
 
     stars: tuple[Neighbour, ...]
-    share: float = 1.0  # share of the light that enters the fibre, of stars within its radius; an assumption
+    share: Share = 1.0  # share of the light that enters the fibre, of stars within its radius; an assumption
     notes: tuple[str, ...] = ()  # statements on how the table was read
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.share <= 1:
-            raise InputError.of("share", self.share, "0 to 1")
 
     def within(self, instrument: Instrument) -> list[Neighbour]:
         """Return the neighbours within the radius of the fibre."""

@@ -15,7 +15,7 @@ from pydantic_core import PydanticCustomError
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Help, Range, Unit
-from mauvecl.schema.physical import DetectorTemperature, Exposure, Positive, Wavelength
+from mauvecl.schema.physical import DetectorTemperature, Exposure, NotNegative, Positive, Wavelength
 from mauvecl.schema.quantities import count, is_quantity, numbers, word_of
 from mauvecl.schema.records import input_error
 from mauvecl.schema.section import Section
@@ -67,7 +67,6 @@ def _fraction(curve: Curve) -> Curve:
 Efficiency = Annotated[Curve, BeforeValidator(partial(_as_curve, unit=""))]
 Responsivity = Annotated[Curve, BeforeValidator(partial(_as_curve, unit="A / W"))]
 Loss = Annotated[float, Range(0, 1, open_high=True)]
-NotNegative = Annotated[float, Range(0)]
 Count = Annotated[int, Range(0, 20)]
 #: Width of a line spread function; 0 for none.
 Width = Annotated[float, Unit("nm"), Range(0, 500)]

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.calls import validated
+from mauvecl.schema.physical import DetectorTemperature, Duration, NotNegative, Share
 
 from .orbit import Track
 from .radiation import proton_map
 
 
+@validated
 @dataclass(frozen=True)
 class Thermal:
     """First-order thermal model of the detector: dT/dt = (T_end - T) / tau.
@@ -27,16 +29,9 @@ class Thermal:
     time_constant_s : float
     """
 
-    sunlit_c: float = 21.0
-    shadow_c: float = 13.0
-    time_constant_s: float = 3000.0
-
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.time_constant_s) and self.time_constant_s > 0):
-            raise InputError.of("time_constant_s", self.time_constant_s, "> 0")
-        for name in ("sunlit_c", "shadow_c"):
-            if not -100 <= getattr(self, name) <= 60:
-                raise InputError.of(name, getattr(self, name), "-100 to 60 deg C")
+    sunlit_c: DetectorTemperature = 21.0
+    shadow_c: DetectorTemperature = 13.0
+    time_constant_s: Duration = 3000.0
 
     def temperature_c(
         self, sunlight: NDArray[np.float64], step_s: float, start_c: float | None = None
@@ -61,6 +56,7 @@ class Thermal:
         return np.asarray(temperature)
 
 
+@validated
 @dataclass(frozen=True)
 class Particles:
     """Particles that hit the detector: cosmic rays, and trapped protons that penetrate the shielding (assumption).
@@ -74,14 +70,8 @@ class Particles:
         crosses either face of a thin plate.
     """
 
-    cosmic_per_cm2_s: float = 1.0
-    share: float = 0.5
-
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.cosmic_per_cm2_s) and self.cosmic_per_cm2_s >= 0):
-            raise InputError.of("cosmic_per_cm2_s", self.cosmic_per_cm2_s, ">= 0")
-        if not 0 <= self.share <= 1:
-            raise InputError.of("share", self.share, "0 to 1")
+    cosmic_per_cm2_s: NotNegative = 1.0
+    share: Share = 0.5
 
     def rate_per_cm2_s(self, track: Track) -> NDArray[np.float64]:
         """Return the rate of hits along a track, cm^-2 s^-1, shape (n,)."""

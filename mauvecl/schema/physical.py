@@ -54,3 +54,12 @@ Seed = Annotated[int, Range(0, 2**64 - 1)]
 Realisations = Annotated[int, Range(1)]
 FirstRealisation = Annotated[int, Range(0, 2**63 - 1)]
 Positive = Annotated[float, Range(0, open_low=True)]
+NotNegative = Annotated[float, Range(0)]
+#: Share of a whole.
+Share = Annotated[float, Range(0, 1)]
+#: Exponent of a power law of flare energies, dN/dE ~ E^-alpha; the integral over large energies must be finite.
+RateExponent = Annotated[float, Range(1, 10, open_low=True, open_high=True)]
+#: Exponent with which half-widths of flares grow with energy; below 1, since amplitudes grow as well.
+DurationExponent = Annotated[float, Range(0, 1, open_high=True)]
+#: Standard deviation of the decadic logarithm of half-widths about that law.
+DurationScatter = Annotated[float, Range(0, 2)]

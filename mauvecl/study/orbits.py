@@ -12,7 +12,16 @@ from mauvecl.host.files.text_table import read_text_table
 from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, Widget
-from mauvecl.schema.physical import Distance, Duration, Energy, Magnitude
+from mauvecl.schema.physical import (
+    Distance,
+    Duration,
+    DurationExponent,
+    DurationScatter,
+    Energy,
+    Magnitude,
+    RateExponent,
+    Share,
+)
 from mauvecl.schema.records import input_error
 from mauvecl.schema.text import shortened, shown
 from mauvecl.study.sections import Section
@@ -122,9 +131,7 @@ class PlanTarget(Section):
         Help("Mass, for the rates of Davenport et al. 2019", "needs the age"),
     ] = None
     age_myr: Annotated[Annotated[float, Unit("Myr"), Range(0, open_low=True)] | None, Help("Age")] = None
-    alpha: Annotated[
-        Annotated[float, Range(1, open_low=True)] | None, Help("Exponent of a power law of bolometric energies")
-    ] = None
+    alpha: Annotated[RateExponent | None, Help("Exponent of a power law of bolometric energies")] = None
     rate_per_day: Annotated[
         Annotated[float, Unit("1 / d"), Range(0, open_low=True)] | None,
         Help("Rate of flares above an energy, for the power law"),
@@ -135,8 +142,7 @@ class PlanTarget(Section):
     neighbours: Annotated[Path | None, Help("Table of other stars near the target, as for a star")] = None
     neighbours_of: Annotated[str | None, Help("The target's own row in that table, or its coordinates")] = None
     neighbour_share: Annotated[
-        float,
-        Range(0, 1),
+        Share,
         Help("Share of the light of neighbours within the fibre's radius that enters it", "an assumption"),
     ] = 1.0
 
@@ -229,10 +235,8 @@ class PlanQuestion(Section):
     ] = None
     half_width_s: Annotated[Duration, Help("Half-width of flares of the energy at_erg")] = 100.0
     at_erg: Annotated[Energy, Help("That energy")] = 1e33
-    exponent: Annotated[
-        float, Range(0, 1, open_high=True), Help("Exponent with which half-widths grow with energy")
-    ] = 0.39
-    scatter_dex: Annotated[float, Range(0, 2), Help("Scatter of half-widths about that law, dex")] = 0.3
+    exponent: Annotated[DurationExponent, Help("Exponent with which half-widths grow with energy")] = 0.39
+    scatter_dex: Annotated[DurationScatter, Help("Scatter of half-widths about that law, dex")] = 0.3
     completeness: Annotated[
         Literal["injections", "closed form"],
         Help("Completeness", choices="injections (into simulated noise) or 'closed form' (at once)"),

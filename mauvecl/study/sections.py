@@ -25,6 +25,7 @@ from mauvecl.schema.physical import (
     Probability,
     Radius,
     Reddening,
+    Share,
     SkyBrightness,
     Temperature,
 )
@@ -151,8 +152,7 @@ class Star(Section):
         Flag("--neighbours-of"),
     ] = None
     neighbour_share: Annotated[
-        float,
-        Range(0, 1),
+        Share,
         Help("Share of the light of neighbours within the fibre's radius that enters it", "an assumption"),
         Flag("--neighbour-share"),
     ] = 1.0

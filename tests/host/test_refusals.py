@@ -143,6 +143,7 @@ ORBITS: list[Row] = [
     (lambda: Orbit(Orbit.load().elements, "other"), "kind", "'other'"),  # type: ignore[arg-type]
     (lambda: Thermal(20.0, 10.0, 0.0), "time_constant_s"),
     (lambda: Thermal(99.0, 10.0, 600.0), "sunlit_c", "99"),
+    (lambda: Thermal(20.0, -60.0, 600.0), "shadow_c", "-40 to 65"),
     (lambda: Particles(-1.0, 0.5), "cosmic_per_cm2_s"),
     (lambda: Particles(1.0, 1.5), "share"),
     (lambda: Target.of("epsilon Errr"), "target", "eps Eri"),

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,9 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from mauvecl.host.files.text_table import read_text_table
 from mauvecl.host.stars.flare_spectra import Blackbody, FlareSpectrum
 from mauvecl.lightcurve.flares.energies import flux_in_band
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import checked
-from mauvecl.schema.physical import Temperature
+from mauvecl.schema.fields import Range, checked
+from mauvecl.schema.physical import Energy, Positive, RateExponent, Temperature
 from mauvecl.schema.text import shortened
 
 Float = NDArray[np.float64]
@@ -117,6 +118,7 @@ class Rates(ABC):
         return "Kepler" if self.band == BOLOMETRIC else self.band
 
 
+@validated
 @dataclass(frozen=True, kw_only=True)
 class PowerLaw(Rates):
     """Power law dN/dE = beta E^-alpha, in flares per day.
@@ -137,27 +139,18 @@ class PowerLaw(Rates):
     0.074131
     """
 
-    alpha: float
-    log10_beta: float
+    alpha: RateExponent
+    log10_beta: Annotated[float, Range()]
     largest_erg: float = np.inf
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 1 < self.alpha < 10:
-            raise InputError.of("alpha", self.alpha, "above 1, below 10")
-        if not np.isfinite(self.log10_beta):
-            raise InputError.of("log10_beta", self.log10_beta, "a finite number")
         if not self.largest_erg > 0:
             raise InputError.of("largest_erg", self.largest_erg, "above 0")
 
     @classmethod
-    def through(cls, alpha: float, energy_erg: float, per_day: float, **others: object) -> Self:
+    def through(cls, alpha: RateExponent, energy_erg: Energy, per_day: Positive, **others: object) -> Self:
         """Return the power law with a rate of flares above an energy; `others` are attributes of the class."""
-        for name, value in (("energy_erg", energy_erg), ("per_day", per_day)):
-            if not (np.isfinite(value) and value > 0):
-                raise InputError.of(name, value, "above 0")
-        if not 1 < alpha < 10:
-            raise InputError.of("alpha", alpha, "above 1, below 10")
         beta = np.log10(per_day * (alpha - 1)) + (alpha - 1) * np.log10(energy_erg)
         return cls(alpha=alpha, log10_beta=float(beta), **others)  # type: ignore[arg-type]
 
@@ -301,14 +294,13 @@ def sunlike() -> PowerLaw:
     )  # fmt: skip
 
 
-def fiducial2018(quiescent_si_iv_erg_s: float) -> PowerLaw:
+@validated
+def fiducial2018(quiescent_si_iv_erg_s: Positive) -> PowerLaw:
     """Return the bolometric rates of the fiducial M dwarf of Loyd et al. 2018 (arXiv 1809.07322), by its Si IV light.
 
     nu(> delta) = 8 / d (delta / 1000 s)^-0.75 for equivalent durations in Si IV from 1e2 to 1e6 s; the blackbody of
     9000 K has 160 times the energy of Si IV.
     """
-    if not (np.isfinite(quiescent_si_iv_erg_s) and quiescent_si_iv_erg_s > 0):
-        raise InputError.of("quiescent_si_iv_erg_s", quiescent_si_iv_erg_s, "above 0")
     second = 160 * quiescent_si_iv_erg_s
     return PowerLaw.through(
         1.75, 1000 * second, 8.0, band=BOLOMETRIC, source="fiducial flares of Loyd et al. 2018 (arXiv 1809.07322)",

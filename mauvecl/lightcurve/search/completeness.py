@@ -15,8 +15,9 @@ from mauvecl.lightcurve.flares.energies import EnergyScale
 from mauvecl.lightcurve.flares.shapes import Shape, shape_of
 from mauvecl.lightcurve.search.bank import Bank
 from mauvecl.lightcurve.search.false_alarm_rate import TemplateGrid
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.physical import DAY_S
+from mauvecl.schema.physical import DAY_S, Duration, DurationExponent, DurationScatter, Energy, Positive
 
 Float = NDArray[np.float64]
 
@@ -27,6 +28,7 @@ HALF_WIDTHS_S = (2.0, 20_000.0)
 THRESHOLDS = (2.0, 20.0)
 
 
+@validated
 @dataclass(frozen=True)
 class DurationLaw:
     """Assumed half-widths by energy: t_1/2 = half_width_s (E / at_erg)^exponent, with a normal scatter in dex.
@@ -41,19 +43,10 @@ class DurationLaw:
     exponent, scatter_dex : float
     """
 
-    half_width_s: float = 100.0
-    at_erg: float = 1e33
-    exponent: float = 0.39
-    scatter_dex: float = 0.3
-
-    def __post_init__(self) -> None:
-        for name in ("half_width_s", "at_erg"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise InputError.of(name, getattr(self, name), "above 0")
-        if not 0 <= self.exponent < 1:
-            raise InputError.of("exponent", self.exponent, "0 to 1, since amplitudes rise with energy")
-        if not 0 <= self.scatter_dex <= 2:
-            raise InputError.of("scatter_dex", self.scatter_dex, "0 to 2")
+    half_width_s: Duration = 100.0
+    at_erg: Energy = 1e33
+    exponent: DurationExponent = 0.39
+    scatter_dex: DurationScatter = 0.3
 
     def half_width(self, energy_erg: ArrayLike) -> Float:
         """Return the median half-width, s, shape of the energy."""
@@ -116,12 +109,13 @@ class Completeness:
         return float(10 ** (e0 + part * (e1 - e0)))
 
     @classmethod
+    @validated
     def of_search(
         cls,
-        signal_per_frame: float,
+        signal_per_frame: Positive,
         scale: EnergyScale,
         *,
-        window_s: float,
+        window_s: Duration,
         false_alarms_per_day: float,
         bank: Bank | None = None,
         law: DurationLaw | None = None,
@@ -149,9 +143,6 @@ class Completeness:
         """
         if scale.kind != "bolometric":
             raise InputError.of("kind", scale.kind, "bolometric")
-        for name, value in (("signal_per_frame", signal_per_frame), ("window_s", window_s)):
-            if not (np.isfinite(value) and value > 0):
-                raise InputError.of(name, value, "above 0")
         law, bank = law or DurationLaw(), bank or default_bank()
         threshold = search_threshold(false_alarms_per_day, bank)
         widths, gain = _gains(bank.shape, window_s, bank.frame_s)
@@ -183,14 +174,13 @@ def default_bank() -> Bank:
     return Bank(BANK_S, np.ones((1, 1)), shape_of("davenport2014"), 5.0)
 
 
-def search_threshold(false_alarms_per_day: float, bank: Bank | None = None) -> float:
+@validated
+def search_threshold(false_alarms_per_day: Positive, bank: Bank | None = None) -> float:
     """Return the threshold of a bank in white noise, sigma, for a number of false alarms per day of frames.
 
     The threshold follows from `TemplateGrid` and is about 1 % too high at one alarm per day, and less at lower rates.
     Raises InputError if it is not between 2 and 20 sigma.
     """
-    if not (np.isfinite(false_alarms_per_day) and false_alarms_per_day > 0):
-        raise InputError.of("false_alarms_per_day", false_alarms_per_day, "above 0")
     grid = TemplateGrid.from_bank(bank or default_bank())
 
     def over(threshold: float) -> float:

@@ -11,7 +11,9 @@ from scipy import optimize, stats
 
 from mauvecl.lightcurve.flares.rates import PowerLaw, Rates
 from mauvecl.lightcurve.search.completeness import Completeness
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import NotNegative, Positive
 
 Float = NDArray[np.float64]
 
@@ -43,9 +45,10 @@ class Yield:
     at_least_one: float
 
     @classmethod
-    def of(cls, rates: Rates, completeness: Completeness, days: float) -> Yield:
+    @validated
+    def of(cls, rates: Rates, completeness: Completeness, days: NotNegative) -> Yield:
         """Compute the yield from flare rates, completeness and observed days; energies must be in the same band."""
-        expected = recovered_per_day(rates, completeness) * _checked(days)
+        expected = recovered_per_day(rates, completeness) * days
         return cls.of_expected(expected, rates.scatter_dex)
 
     @classmethod
@@ -84,12 +87,6 @@ def recovered_per_day(rates: Rates, completeness: Completeness) -> float:
     return float(np.sum((above[:-1] - above[1:]) * chance) + above[-1] * completeness.probability[-1])
 
 
-def _checked(days: float) -> float:
-    if not (np.isfinite(days) and days >= 0):
-        raise InputError.of("days", days, "at least 0")
-    return days
-
-
 @dataclass(frozen=True)
 class FittedPowerLaw:
     """Power law fitted to recovered flares."""
@@ -106,10 +103,11 @@ class FittedPowerLaw:
         return PowerLaw.through(self.alpha, self.pivot_erg, 10**self.log10_rate, band=band, source="fitted")
 
 
+@validated
 def fit_power_law(
     energy_erg: Float,
     completeness: Completeness,
-    days: float,
+    days: Positive,
     *,
     error_dex: float = 0.0,
     bias_dex: float = 0.0,
@@ -135,8 +133,6 @@ def fit_power_law(
         raise InputError(
             f"energy_erg has {logs.size} flares", "at least 3 with energies above 0", key="energy_erg", value=logs.size
         )
-    if _checked(days) == 0:
-        raise InputError.of("days", days, "a time that was observed")
     pivot = float(np.median(logs))
     x = np.linspace(*completeness.decades, GRID)
     step = float(x[1] - x[0])
