@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from mauvecl.lightcurve.defaults import check_shape
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import Duration
 from mauvecl.schema.text import shortened
 
 Float = NDArray[np.float64]
@@ -260,10 +261,9 @@ class Fiducial(Shape):
     FOLD = BOX / 2
 
     @classmethod
-    def of(cls, equivalent_duration_s: float) -> tuple[float, float]:
+    @validated
+    def of(cls, equivalent_duration_s: Duration) -> tuple[float, float]:
         """Return amplitude, 0.3 (delta/s)^0.6, and half-width (s) for an equivalent duration delta."""
-        if not (np.isfinite(equivalent_duration_s) and equivalent_duration_s > 0):
-            raise InputError.of("equivalent_duration_s", equivalent_duration_s, "a time above 0", unit="s")
         height = 0.3 * equivalent_duration_s**0.6
         return height, equivalent_duration_s / 1.5 / height / cls.BOX
 
