@@ -158,7 +158,7 @@ ${control(name)}
 </details>
 <div class="row">
 <button type="button" id="pin">Pin</button>
-<button type="button" data-opens="export">Take along</button>
+<button type="button" data-opens="export">Share, export, cite</button>
 <button type="button" class="plain" id="afresh">Start afresh</button>
 </div>
 </form>
@@ -248,6 +248,9 @@ ${actions(tab)}
 % for ending in ("svg", "png", "pdf"):
 <button type="button" class="plain" data-save="${ending}">${ending.upper()}</button>
 % endfor
+% if picture.sets:
+<span>A click sets ${" and ".join("the " + fields.FIELDS[part.split("=")[0]].label.lower() for part in picture.sets.split(","))}.</span>
+% endif
 </div>
 <details class="data"><summary>Data as a table</summary><div class="wide" tabindex="0" role="region" aria-label="Data of ${picture.title}"></div></details>
 </figcaption>
@@ -290,7 +293,7 @@ ${actions(tab)}
 </main>
 <footer><p id="nominal">Nominal throughput, pieced together from the paper, datasheets and assumptions: not a flight calibration. Sensible uncertainty: 30 %, and 50 % below 250 nm.</p></footer>
 <dialog id="export" aria-labelledby="export-head">
-<h2 id="export-head">Take this question along</h2>
+<h2 id="export-head">Share, export, cite</h2>
 <p>What this tab shows after its simulation: the same numbers, to the bit, wherever mauvecl runs.</p>
 <p class="row"><label for="of">Answer of</label> <select id="of"></select></p>
 <div class="row"><button type="button" class="main" id="study">Study for the command line</button><button type="button" data-copy="address">Copy the link</button></div>

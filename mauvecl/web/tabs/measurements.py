@@ -84,7 +84,7 @@ class Errors(Picture):
         sources["own"] = {"x": [own], "y": [100 * known.ahead.errors[0] / known.ahead.values[0]]}
         text = (
             f"With everything known the temperature has a standard error of {_error(known)}, with dark level and star "
-            f"unknown one of {_error(free)}. A click chooses another amplitude."
+            f"unknown one of {_error(free)}."
         )
         return PictureData(text, sources)
 
