@@ -25,10 +25,6 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Number of parabolas through three temperatures that refine the best node, and the factor by which they narrow.
-REFINEMENTS, NARROWER = 3, 8.0
-#: The search for the best temperature starts from every `COARSE`-th node of the model.
-COARSE = 4
 #: Steps of the search for the end of an interval.
 STEPS = 12
 #: Temperatures within an interval at which derived quantities are computed.
@@ -56,26 +52,11 @@ class Profile:
 
     def __init__(self, reduction: MeanSums, sums: Float) -> None:
         self.reduction, self.sums = reduction, sums
-        basis, self._inverse = reduction.basis
-        self.along = sums @ basis.T
-        self.rest = sums - self.along @ basis
-        self._basis = basis
+        self._basis, self._inverse = reduction.basis
+        self.along = sums @ self._basis.T
+        self.rest = sums - self.along @ self._basis
         self.nodes = reduction.log_k
-        self.hot_nodes = reduction.hot - (reduction.hot @ basis.T) @ basis
-        self._lengths = np.linalg.norm(self.hot_nodes, axis=1)
-        self._coefficients = np.ascontiguousarray(np.moveaxis(reduction.spline.c, 0, 1))
-
-    def hot(self, log_k: Float) -> Float:
-        """Return the mean sums of a blackbody of amplitude 1, shape (*log_k.shape, n_sum)."""
-        step = self.nodes[1] - self.nodes[0]
-        # Next to a node of an uneven grid the neighbouring cubic is as good.
-        interval = np.clip(((log_k - self.nodes[0]) / step).astype(np.int64), 0, self.nodes.size - 2)
-        offset = (log_k - self.nodes[interval])[..., None]
-        c = self._coefficients
-        cubic = c[interval, 0]
-        for power in (1, 2, 3):
-            cubic = cubic * offset + c[interval, power]
-        return np.asarray(cubic)
+        self.hot = reduction.spline
 
     def parts(self, log_k: Float) -> tuple[Float, Float, Float]:
         """Return the blackbody's amplitude without bounds, its variance, and its sums, at temperatures (n, ...)."""
@@ -92,9 +73,9 @@ class Profile:
         base = np.einsum("nk,nk->n", self.along, self.along).reshape((-1,) + (1,) * (log_k.ndim - 1))
         return np.asarray(base + np.maximum(amplitude, 0.0) ** 2 / variance)
 
-    def gain_at_nodes(self, every: int = 1) -> Float:
-        """Return `gain` at each `every`-th temperature of the model, shape (n, n_node)."""
-        product = self.rest @ (self.hot_nodes[::every] / self._lengths[::every, None]).T
+    def gain_at_nodes(self) -> Float:
+        """Return `gain` at the temperatures of the model, shape (n, n_node)."""
+        product = self.rest @ self.reduction.directions[0].T
         return np.asarray(np.maximum(product, 0.0) ** 2 + np.einsum("nk,nk->n", self.along, self.along)[:, None])
 
     def linear(self, log_k: Float, amplitude: Float, hot: Float) -> Float:
@@ -106,29 +87,22 @@ class Profile:
         return np.concatenate([amplitude[..., None], others], axis=-1)
 
     def best(self, at_nodes: Float | None = None) -> BestFit:
-        """Return the best fit of each frame."""
-        every = COARSE if at_nodes is None else 1
-        at_nodes = self.gain_at_nodes(every) if at_nodes is None else at_nodes
-        low, high = self.nodes[0], self.nodes[-1]
-        step = every * float(self.nodes[1] - self.nodes[0])
-        x = self.nodes[::every][np.argmax(at_nodes, axis=1)]
-        for _ in range(REFINEMENTS):
-            there = np.clip(x[:, None] + step * np.array([-1.0, 0.0, 1.0]), low, high)
-            g = self.gain(there)
-            # The vertex of the parabola through three points, or the best point if there is no maximum.
-            a, b = there[:, 0] - there[:, 1], there[:, 2] - there[:, 1]
-            left, right = g[:, 0] - g[:, 1], g[:, 2] - g[:, 1]
-            under = right * a - left * b
-            over = right * a**2 - left * b**2
-            inside = np.abs(under) > 1e-300
-            vertex = there[:, 1] + np.divide(over, 2 * under, out=np.zeros_like(over), where=inside)
-            three = there[np.arange(x.size), np.argmax(g, axis=1)]
-            good = inside & (vertex >= there[:, 0]) & (vertex <= there[:, 2])
-            vertex = np.where(good, vertex, three)
-            reached = self.gain(vertex)
-            x = np.where(reached >= g.max(axis=1), vertex, three)
-            step /= NARROWER
-        return self.solution(x)
+        """Return the best fit of each frame.
+
+        The gain is the squared product of the sums with a unit vector, which is a cubic polynomial of the temperature
+        between two nodes, so that its maximum has a closed form.
+        """
+        units, cubics = self.reduction.directions
+        node = np.argmax(np.maximum(self.rest @ units.T, 0.0) if at_nodes is None else at_nodes, axis=1)
+        interval = np.minimum(node, self.nodes.size - 2)
+        falling = np.einsum("nk,nk->n", self.rest, cubics[interval, 2]) < 0.0
+        interval = np.where(falling, np.maximum(node - 1, 0), interval)
+        c = np.einsum("npk,nk->pn", cubics[interval], self.rest)
+        span = self.nodes[interval + 1] - self.nodes[interval]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            top = c[2] / (np.sqrt(c[1] ** 2 - 3 * c[0] * c[2]) - c[1])
+        # Otherwise the best node is an end of the model's temperatures, or no light is found.
+        return self.solution(np.where((top >= 0.0) & (top <= span), self.nodes[interval] + top, self.nodes[node]))
 
     def solution(self, log_k: Float) -> BestFit:
         """Return the best fits at temperatures (n,)."""
@@ -294,7 +268,7 @@ def covariance(model: FlareModel, profile: Profile, best: BestFit) -> Float:
     jacobian = np.zeros((n, m + 1, hot.shape[1]))
     jacobian[:, 0], jacobian[:, 1:m] = hot, profile.reduction.fixed
     jacobian[:, m] = best.linear[:, :1] * slope
-    return covariance_of(model, best.log_k, best.linear, np.einsum("nik,njk->nij", jacobian, jacobian))
+    return covariance_of(model, best.log_k, best.linear, jacobian @ jacobian.transpose(0, 2, 1))
 
 
 def covariance_of(model: FlareModel, log_k: Float, linear: Float, information: Float) -> Float:
@@ -313,23 +287,23 @@ def covariance_of(model: FlareModel, log_k: Float, linear: Float, information: F
     inverse = np.linalg.inv(normal) / scale[:, :, None] / scale[:, None, :]
     inverse[~good] = np.nan
     gradient = gradient_of(model, log_k, linear)
-    return np.asarray(np.einsum("nqi,nij,nrj->nqr", gradient, inverse, gradient))
+    return np.asarray(gradient @ inverse @ gradient.transpose(0, 2, 1))
 
 
 def gradient_of(model: FlareModel, log_k: Float, linear: Float) -> Float:
     """Return derivatives with respect to amplitudes and log temperature, (n, n_derived, n_linear + 1)."""
     n, m = linear.shape
     gradient = np.zeros((n, len(model.derived), m + 1))
-    values = derived_values(model, log_k, linear)
-    for q, (one, spline) in enumerate(zip(model.derived, model.splines, strict=True)):
-        if spline is None:
+    which, spline = model.sums
+    gradient[:, which, :m] = spline(log_k)
+    gradient[:, which, m] = np.einsum("nql,nl->nq", spline(log_k, 1), linear)
+    for q in np.flatnonzero(~which):
+        ratio = model.splines[q]
+        if ratio is None:
             gradient[:, q, m] = np.exp(log_k)
-        elif one.ratio is None:
-            gradient[:, q, :m] = spline(log_k)
-            gradient[:, q, m] = np.einsum("nl,nl->n", spline(log_k, 1), linear)
-        else:
-            amplitude = np.where(linear[:, 0] > 0, linear[:, 0], np.nan)
-            gradient[:, q, 0] = (one.offset - values[:, q]) / amplitude
-            gradient[:, q, 1] = spline(log_k) / amplitude
-            gradient[:, q, m] = spline(log_k, 1) * linear[:, 1] / amplitude
+            continue
+        amplitude = np.where(linear[:, 0] > 0, linear[:, 0], np.nan)
+        gradient[:, q, 0] = -ratio(log_k) * linear[:, 1] / amplitude**2
+        gradient[:, q, 1] = ratio(log_k) / amplitude
+        gradient[:, q, m] = ratio(log_k, 1) * linear[:, 1] / amplitude
     return gradient
