@@ -95,7 +95,7 @@ def page_tables(tab: Tab, closed: ClosedForms) -> dict[str, Table]:
     pool = Pool(LocalWorkers([None]))
     for name in tab.simulations:
         answers |= SIMULATIONS[name](closed.study, pool)
-    return {name: tab.table(name, closed, answers) for name in tab.files}
+    return {name: tab.table(name, closed, answers) for name in tab.files if tab.offers(name, answers)}
 
 
 def command_tables(tab: Tab, question: Question, folder: Path) -> dict[str, Table]:

@@ -58,8 +58,7 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
         raise InputError(
             f"{tab.title} has no file {name[:40]!r}.{ending[:10]}", "one of its own", key="name", value=name
         )
-    wanted = tab.files[name]
-    if wanted is not None and wanted not in answers:
+    if not tab.offers(name, answers):
         raise InputError(f"no {name} is computed yet", "a simulation first", key="name", value=name)
     if ending == "study":
         return study_file(tab.study(name, closed, answers), f"mauvecl-{name}")

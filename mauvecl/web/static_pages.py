@@ -100,7 +100,6 @@ def front() -> bytes:
                     {"name": p.name, "sets": p.sets, "logs": list(p.logs), "pins": p.pins, "alike": p.alike}
                     for p in tab.pictures
                 ],
-                "files": dict(tab.files),
                 "reads": sorted(tab.reads),
                 "headline": tab.headline,
             }

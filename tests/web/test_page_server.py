@@ -631,6 +631,8 @@ COMMANDS = {
     "map": ("map", [], "map.ecsv"),
     "measure": ("measure", [], "measure.ecsv"),
     "fits": ("measure", [], "fits.ecsv"),
+    "temperatures": ("measure", [], "temperatures.ecsv"),
+    "joint": ("measure", [], "joint.ecsv"),
     "change": ("change", [], "change.ecsv"),
     "indices": ("change", [], "indices.ecsv"),
     "periods": ("change", [], "periods.ecsv"),
@@ -651,7 +653,7 @@ assert COMMANDS.keys() == {name for tab in TABS.values() for name in tab.files}
 def test_downloads_equal_the_files_of_the_command_line(served: Any, tmp_path: Path) -> None:
     """With a study that is taken from the page, of an uploaded star and an uploaded unknown."""
     link = "?realisations=10000&fap=0.05&statistic=chi2&magnitude=7&star=uploaded+star&own_unknown=uploaded+spectrum"
-    link += "&targets=eps+Eri"
+    link += "&targets=eps+Eri&joint_fit=yes&snr_per_bin=10"
 
     async def work(host: str) -> dict[str, tuple[bytes, bytes, str]]:
         talk = await Talk.begin(host)

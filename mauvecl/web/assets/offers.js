@@ -7,9 +7,8 @@ import {byId, every} from "./dom.js"
  * @param {import("./protocol.js").Answer | null} answer
  * @param {boolean} busy
  * @param {import("./protocol.js").Entered} entered
- * @param {import("./protocol.js").Words["tabs"]} tabs
  */
-export function offer(answer, busy, entered, tabs) {
+export function offer(answer, busy, entered) {
   const ready = answer !== null
   const simulated = new Set(answer?.simulated ?? [])
   byId("simulate").disabled = !ready || busy
@@ -20,13 +19,7 @@ export function offer(answer, busy, entered, tabs) {
     const lacks = ["visible", "plan"].includes(button.dataset.simulate) && !entered.targets.trim()
     button.disabled = !ready || busy || lacks
   }
-  for (const tab of Object.values(tabs)) {
-    for (const [name, needs] of Object.entries(tab.files)) {
-      for (const button of every(`[data-file="${name}"]`)) {
-        button.disabled = !ready || (needs !== null && !simulated.has(needs))
-      }
-    }
-  }
+  for (const button of every("[data-file]")) button.disabled = !answer?.files.includes(button.dataset.file)
   for (const hint of every("[data-needs]")) {
     const lacking = hint.dataset.needs.split(" ").filter((/** @type {string} */ kind) => !simulated.has(kind))
     const buttons = lacking.map((/** @type {string} */ kind) => document.querySelector(`[data-simulate="${kind}"]`) ?? byId("simulate"))

@@ -268,7 +268,7 @@ class Page {
   // Actions that are available now.
   offer() {
     this.uploads.mention()
-    offer(this.answer, this.simulations.running !== null, this.fields.entered, words.tabs)
+    offer(this.answer, this.simulations.running !== null, this.fields.entered)
   }
 
   // The answer again, now with what was simulated.

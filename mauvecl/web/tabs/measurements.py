@@ -183,7 +183,11 @@ class Measurement(Tab):
     )
     pictures = (Errors(), Region(), Course())
     simulations = {"measure": "Simulate fits"}  # noqa: RUF012
-    files = {"measure": "measure", "fits": "measure"}  # noqa: RUF012
+    files = dict.fromkeys(("measure", "fits", "temperatures", "joint"), "measure")
+
+    def offers(self, name: str, answers: Answers) -> bool:
+        # Measurements along a stare are made on request.
+        return super().offers(name, answers) and name in answers["measure"].tables
 
     def shown(self, closed: ClosedForms, answers: Answers) -> View:
         each, fits = expected(closed), simulated(answers)

@@ -165,6 +165,11 @@ class Tab(ABC):
         star = "your own star" if question.uploaded is not None else star_words(question.star)
         return f"{star} of {question.band} = {question.magnitude:g}"
 
+    def offers(self, name: str, answers: Answers) -> bool:
+        """Return whether one of `files` can be taken along: by default, whether the answer it needs is simulated."""
+        needed = self.files[name]
+        return needed is None or needed in answers
+
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         """Return the table of one of `files`: by default that of the answer it needs."""
         table: Table = answers[str(self.files[name])].tables[name]
