@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -146,3 +147,9 @@ def test_invalid_field_of_another_tab_leaves_the_answer() -> None:
     assert state.faults.keys() == {"star"}
     assert state.faults_of(TABS["plan"].reads) == {}
     assert state.question(TABS["plan"].reads).star == "G2V"
+
+
+def test_tables_along_a_stare_are_offered_where_it_is_measured() -> None:
+    tab, answer = TABS["measure"], SimpleNamespace(tables=dict.fromkeys(("measure", "fits", "joint")))
+    assert [name for name in tab.files if tab.offers(name, {"measure": answer})] == ["measure", "fits", "joint"]
+    assert not any(tab.offers(name, {}) for name in tab.files)

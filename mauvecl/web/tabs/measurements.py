@@ -33,7 +33,7 @@ RISE_95 = 5.99
 #: Factors on the amplitude at which errors are computed.
 FACTORS = np.geomspace(0.1, 10.0, 9)
 #: Half-widths before and after the peak of a flare in a stare that are shown.
-NEAR = 8.0
+NEAR = (2.0, 6.0)
 #: Largest number of simulated fits that are shown.
 MOST_DOTS = 500
 
@@ -110,18 +110,19 @@ class Region(Picture):
     def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         all_known, *_, free = expected(closed).values()
         sources: dict[str, Any] = {name: {"x": [], "y": []} for name in ("fits", "own")}
-        if not isinstance(all_known.fitted, FlareModel):
-            sources |= {name: {"x": [], "low": [], "high": []} for name in ("free", "known")}
-            return PictureData("The region is that of models of one temperature.", sources)
-        for name, one in (("known", all_known), ("free", free)):
-            kelvin, low, high = one.region(RISE_95)
-            sources[name] = {"x": kelvin, "low": 100 * low, "high": 100 * high}
         best = all_known.perfect.estimates[0]
         sources["own"] = {"x": [best[0]], "y": [100 * best[1]]}
         fits = simulated(answers)
         if fits is not None:
             some = fits.found.estimates[:MOST_DOTS]
             sources["fits"] = {"x": some[:, 0], "y": 100 * some[:, 1]}
+        if not isinstance(all_known.fitted, FlareModel):
+            sources |= {name: {"x": [], "low": [], "high": []} for name in ("free", "known")}
+            text = "The flare has two temperatures, of which this is the lower one: simulated fits show their region."
+            return PictureData(text, sources)
+        for name, one in (("known", all_known), ("free", free)):
+            kelvin, low, high = one.region(RISE_95)
+            sources[name] = {"x": kelvin, "low": 100 * low, "high": 100 * high}
         x = np.asarray(sources["free"]["x"])
         text = (
             f"With dark level and star unknown the 95 % region reaches from {short(x[0])} to {short(x[-1])} K: hotter "
@@ -153,7 +154,8 @@ class Course(Picture):
         (one,), words = stares, []
         if one.joint is not None:
             (event,), stare = one.events, one.staring.stare
-            near = np.abs(stare.middle_s - event.peak_s) < NEAR * event.half_width_s
+            since = (stare.middle_s - event.peak_s) / event.half_width_s
+            near = (since > -NEAR[0]) & (since < NEAR[1])
             for name, course in (("true", one.joint.true), ("joint", one.joint.fitted)):
                 sources[name] = {"x": stare.middle_s[near], "y": course.kelvin[near]}
             found = one.joint.found
@@ -197,7 +199,7 @@ class Measurement(Tab):
             for name, unit, value, *errors in zip(
                 known.fitted.names,
                 known.fitted.units,
-                known.ahead.values,
+                known.truth,
                 *(one.ahead.errors for one in each.values()),
                 strict=True,
             )
