@@ -335,7 +335,7 @@ def _fitted(
 
 
 def fit_sums(sums: Float, model: FlareModel, reduction: Reduction) -> tuple[Float, Float]:
-    """Fit the sums of exposures, without intervals; a processor core fits about 1e5 exposures per second.
+    """Fit the sums of exposures, without intervals; a processor core fits about 3e5 exposures per second.
 
     Parameters
     ----------
