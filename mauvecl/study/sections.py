@@ -99,6 +99,12 @@ class Star(Section):
         Reddening | None,
         Help("Dust in front of the star, E(B-V)", "needs mauvecl[extinction]"),
         Flag("--ebv"),
+        Widget(
+            label="Reddening",
+            hint="Dust in front of the star, E(B-V) in magnitudes. The magnitude above is that of the reddened star. "
+            "Nothing: no dust.",
+            group="Star",
+        ),
     ] = None
     wavelength_unit: Annotated[
         str | None,
@@ -197,8 +203,6 @@ class Star(Section):
 
     def source(self) -> Source:
         """Load the spectrum and scale it to the magnitude, if one is given."""
-        from dataclasses import replace
-
         from mauvecl.host.stars.source import Source
         from mauvecl.host.stars.star_names import spectrum_name
 
@@ -208,6 +212,12 @@ class Star(Section):
             source = Source.read(
                 self.file or "", wavelength_unit=self.wavelength_unit, flux_unit=self.flux_unit, extend=self.extend
             )
+        return self.applied(source)
+
+    def applied(self, source: Source) -> Source:
+        """Return a spectrum with the star's temperature, bins, dust and magnitude."""
+        from dataclasses import replace
+
         if self.effective_temperature_k is not None:
             source = replace(source, temperature_k=self.effective_temperature_k)
         if self.bin_nm is not None:

@@ -55,7 +55,7 @@ class ClosedForms:
         """
         uploaded = question.uploaded
         # An uploaded spectrum is not read from its file at every change.
-        scaled = None if uploaded is None else lambda star: uploaded.at_magnitude(question.magnitude, question.band)
+        scaled = None if uploaded is None else lambda star: star.applied(uploaded)
         closed = cls(question, Case(question.study(folder), loader=Loader(scaled)))
         if headline:
             _ = closed.odds

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin
 from pydantic.fields import FieldInfo
 
 from mauvecl.host.stars.catalogue import embedded
+from mauvecl.host.stars.model_stars import ModelStar
 from mauvecl.host.stars.star_names import near_names, spectrum_name
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Range, Slider, Unit, Widget, first, found, range_of, unit_of
@@ -210,6 +211,9 @@ def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
 def star_words(name: str) -> str:
     """Describe a star of the library by its type and the star of its spectrum."""
     entry = embedded(name)
+    model = ModelStar.named(name)
+    if model is not None:
+        return f"a {name.replace('body', 'body of').replace('law', 'law of index')}"
     star = name if entry is None else entry["star"]
     if star == name:
         return f"a star like {'the ' if name == 'Sun' else ''}{name}"
@@ -330,8 +334,9 @@ def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> C
 _OWN = {
     "star": Field(
         "Star", "G2V", star_name,
-        "Whose spectrum: a spectral type of the library, one of its stars by any name (GJ 581, HD 40307), or your own "
-        "file.", group="", place=-1, own_keys=("star.library",),
+        "Whose spectrum: a spectral type of the library, one of its stars by any name (GJ 581, HD 40307), a blackbody "
+        "(blackbody 9000 K), a power law of the wavelength (power law -2), or your own file.",
+        group="", place=-1, own_keys=("star.library",),
     ),
     "lines": Field(
         "Emission lines", "", line_fluxes,
@@ -390,6 +395,7 @@ ASKED = ("star", *(name for name in _group("") if name != "star"))
 ADVANCED = {
     name: _group(name)
     for name in (
+        "Star",
         "Detection",
         "Flare's spectrum",
         "Measurement",

@@ -7,7 +7,6 @@ import base64
 import hashlib
 import json
 import logging
-import tempfile
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Coroutine
@@ -27,6 +26,7 @@ from mauvecl.schema.text import shortened
 from mauvecl.web.card import card, without_headline
 from mauvecl.web.closed_forms import ClosedForms
 from mauvecl.web.downloads import as_file, asked_study, taken_along
+from mauvecl.web.folders import visitor_folder
 from mauvecl.web.headline import other_payloads, solved
 from mauvecl.web.known_stars import known
 from mauvecl.web.sentences import field_of, remedies, sentence
@@ -80,7 +80,7 @@ class Visitor(WebSocketHandler):
         self._closed: tuple[tuple[Any, ...], ClosedForms] | None = None
         self._answers: OrderedDict[tuple[str, tuple[Any, ...]], dict[str, Any]] = OrderedDict()
         self._files: OrderedDict[tuple[Any, ...], tuple[str, bytes]] = OrderedDict()
-        self._folder = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
+        self._folder = visitor_folder()
 
     def check_origin(self, origin: str) -> bool:
         """Accept every origin, since `access.AccessMatcher` has checked it."""

@@ -35,8 +35,8 @@ OTHER = {
     "sky_brightness": "21", "target": "53.2 -9", "time": "2027-01-20", "unknown": "the usual",
     "own_unknown": "200 1, 700 2", "targets": "AU Mic", "start": "2027-06-01", "days": "100", "hours": "50",
     "seed": "7", "signal": "paper", "instrument": "mauve-electrons", "visits": "5", "of": "magnitude", "power": "0.5",
-    "skipped_nm": "200:250", "snr_per_bin": "20", "joint_fit": "yes", "changes": "Mg II", "shortest_d": "2",
-    "longest_d": "20",
+    "ebv": "0.1", "skipped_nm": "200:250", "snr_per_bin": "20", "joint_fit": "yes", "changes": "Mg II",
+    "shortest_d": "2", "longest_d": "20",
 }  # fmt: skip
 #: Fields that say how an upload is read, and change nothing without one.
 READS = set().union(*READ_WITH.values())
