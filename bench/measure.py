@@ -4,8 +4,9 @@
 
 M3V at V = 9, a flare of 50 % at 9500 K, 50 s. "Estimates" have standard errors, "intervals" two profile intervals of
 every quantity and goodness of fit; "at a bound" those of flares without a jump, whose intervals end at the bound.
-The other programs fit pixels that are drawn already. Wall time of all processors, median of five rounds in which the
-programs take turns; ratios are medians over rounds. Memory: growth of the peak from a tenth of the fits to all of them.
+The other programs fit pixels that are drawn already; with two temperatures they start at the truth. Wall time of all
+processors, and time of processors, which other work on the machine changes less: medians of five rounds in which the
+programs take turns. Ratios are of the times of processors. Memory: growth of the peak from a tenth of the fits to all.
 """
 
 from __future__ import annotations
@@ -28,7 +29,17 @@ import scipy
 from astropy.table import Table
 from tables import processor, versions, write
 
-from mauvecl import BalmerFlare, Engine, FlareModel, Instrument, Source, expect, fit
+from mauvecl import (
+    BalmerFlare,
+    Engine,
+    FlareModel,
+    Instrument,
+    Source,
+    TwoBlackbodies,
+    expect,
+    fit,
+    fit_two_temperatures,
+)
 from mauvecl.results.measurements.fit import fit_sums
 from mauvecl.results.measurements.reduction import Reduction, drawn_sums
 
@@ -77,29 +88,49 @@ def main() -> None:
         ways |= {program: (other, SLOW) for program, other in peers(raw, quiet, model).items()}
         if not rows:
             growth = growth_mb(sums, options.count)
-        rates = timed(ways)
-        peer = next(rate for program, rate in rates.items() if "least_squares" in program)
-        rows += [(name, program, ways[program][1], float(np.median(rate)), float(np.median(rate / peer)))
-                 for program, rate in rates.items()]  # fmt: skip
-    table = Table(rows=rows, names=("model", "program", "fits", "rate", "ratio"))
+        rows += compared(name, ways)
+    light = TwoBlackbodies(9000.0, 30_000.0, 0.05)
+    raw = engine.realise(expect(star.flaring(2.0, spectrum=light), mauve, exposure=50.0), count=SLOW, seed=1)
+    single = FlareModel.of(star, mauve, quiet)
+
+    def two(count: int) -> None:
+        fit_two_temperatures(raw[:count], quiet, single)
+
+    ways = {"mauvecl, intervals": (two, SLOW)}
+    ways |= {program: (other, SLOW) for program, other in two_temperature_peers(raw, quiet, single).items()}
+    rows += compared("two temperatures (4)", ways)
+    table = Table(rows=rows, names=("model", "program", "fits", "rate", "cpu_rate", "ratio"))
+    table["cpu_rate"].unit, table["cpu_rate"].format = "1 / s", ".3g"
+    table["cpu_rate"].description = "fits in a second of one processor"
     table["rate"].unit, table["rate"].format, table["rate"].description = "1 / s", ".3g", "fits in a second"
-    table["ratio"].format, table["ratio"].description = ".3g", "over least_squares in the same round"
+    table["ratio"].format, table["ratio"].description = (
+        ".3g",
+        "of cpu_rate, over least_squares in the same round",
+    )
     write(
         table, options.output, memory_growth_mb=round(growth, 1), processor=processor(), device=engine.device_name,
         versions=versions(),
     )  # fmt: skip
 
 
+def compared(model: str, ways: dict[str, tuple[Callable[[int], None], int]]) -> list[tuple]:
+    """Return a row for each program that fits a model."""
+    rates = timed(ways)
+    peer = next(rate[1] for program, rate in rates.items() if "least_squares" in program)
+    return [(model, program, ways[program][1], *np.median(rate, axis=1).tolist(), float(np.median(rate[1] / peer)))
+            for program, rate in rates.items()]  # fmt: skip
+
+
 def timed(ways: dict[str, tuple[Callable[[int], None], int]]) -> dict[str, np.ndarray]:
-    """Return fits per second of each program in each round; kernels are compiled before."""
-    rates = {name: np.empty(ROUNDS) for name in ways}
+    """Return fits per second, and per second of a processor, (2, n_round); kernels are compiled before."""
+    rates = {name: np.empty((2, ROUNDS)) for name in ways}
     for work, count in ways.values():
         work(min(count, 50))
     for k in range(ROUNDS):
         for name, (work, count) in ways.items():
-            begun = time.perf_counter()
+            begun = time.perf_counter(), time.process_time()
             work(count)
-            rates[name][k] = count / (time.perf_counter() - begun)
+            rates[name][:, k] = count / (time.perf_counter() - begun[0]), count / (time.process_time() - begun[1])
     return rates
 
 
@@ -123,14 +154,30 @@ def peers(raw: np.ndarray, quiet, model: FlareModel) -> dict[str, Callable[[int]
         linear = np.concatenate([theta[1:2], scale * theta[2:]])
         return linear[0] * model.hot_spline(np.log(1e3 * np.clip(theta[0], 3.0, 200.0))) + linear[1:] @ model.fixed
 
+    return minimisers(mean, excess, quiet, np.array([10.0, 0.4, 1.0])[: 1 + len(model.linear)])
+
+
+def two_temperature_peers(raw: np.ndarray, quiet, model: FlareModel) -> dict[str, Callable[[int], None]]:
+    """Return what fits the same pixels one by one: both temperatures in thousands of K, and both amplitudes."""
+
+    def mean(theta: np.ndarray) -> np.ndarray:
+        bodies = model.hot_spline(np.log(1e3 * np.clip(theta[:2], 3.0, 200.0)))
+        return np.asarray(theta[2:] @ bodies)
+
+    return minimisers(mean, raw - quiet.recorded_dn, quiet, np.array([9.0, 30.0, 1.5, 0.5]))
+
+
+def minimisers(
+    mean: Callable[[np.ndarray], np.ndarray], excess: np.ndarray, quiet, start: np.ndarray
+) -> dict[str, Callable[[int], None]]:
+    """Return the programs that minimise chi-squared over parameters of the mean."""
+
     def residual(theta: np.ndarray, x: np.ndarray) -> np.ndarray:
         counts = mean(theta)
         return (x - counts) / np.sqrt(quiet.variance_dn2 + quiet.gain_dn_per_electron * np.maximum(counts, 0.0))
 
     def cost_of(x: np.ndarray) -> Callable[[np.ndarray], float]:
         return lambda theta: float(np.sum(residual(theta, x) ** 2))
-
-    start = np.array([10.0, 0.4, 1.0])[: 1 + len(model.linear)]
 
     def least_squares(count: int) -> None:
         for x in excess[:count]:

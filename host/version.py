@@ -1,3 +1,3 @@
-"""Version of the package."""
+"""Version of the package; `tests/test_release.py` compares what repeats it."""
 
-VERSION = "0.1.0"
+VERSION = "1.0.0"

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-import yaml
 
 from mauvecl.host.version import VERSION
 
@@ -138,7 +137,3 @@ def test_licences_are_in_both(packages: Packages, tmp_path: Path) -> None:
             member = sdist.extractfile(f"mauvecl-{VERSION}/{path}")
             assert member is not None
             assert member.read() == text.read_bytes()
-
-
-def test_citation_states_the_version() -> None:
-    assert str(yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))["version"]) == VERSION

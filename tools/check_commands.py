@@ -40,7 +40,8 @@ from mauvecl.web.tabs.tab import Tab
 WRITTEN = {"observation": "observation-2", "snr": "snr-element"}
 #: Entered texts of fields that are neither numbers nor choices, or that would make a question slow or impossible.
 TEXTS: dict[str, tuple[str, ...]] = {
-    "star": ("G2V", "K3V", "M3V", "GJ 581", "F5V"),
+    "star": ("G2V", "K3V", "M3V", "GJ 581", "F5V", "blackbody 9000 K", "power law -1.5"),
+    "ebv": ("", "0.1"),
     "lines": ("", "Mg II=0.03", "Mg II=0.02, 280=0.01, Balmer=0.1"),
     "own_unknown": ("", "200 1, 450 3, 700 1"),
     "target": ("290.68 +11.12", "30 -10"),
@@ -95,7 +96,7 @@ def page_tables(tab: Tab, closed: ClosedForms) -> dict[str, Table]:
     pool = Pool(LocalWorkers([None]))
     for name in tab.simulations:
         answers |= SIMULATIONS[name](closed.study, pool)
-    return {name: tab.table(name, closed, answers) for name in tab.files}
+    return {name: tab.table(name, closed, answers) for name in tab.files if tab.offers(name, answers)}
 
 
 def command_tables(tab: Tab, question: Question, folder: Path) -> dict[str, Table]:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.physical import DAY_S
+from mauvecl.schema.fields import Range, Unit
+from mauvecl.schema.physical import DAY_S, Duration
 
 from ..sky.helioecliptic import offline, parse_time
 
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
 MAX_STEPS = 4_300_000
 
 
+@validated
 @dataclass(frozen=True)
 class TimeGrid:
     """Evenly spaced times in UTC, which stands in for UT1 (they differ by less than a second).
@@ -29,13 +32,10 @@ class TimeGrid:
     """
 
     start: str  # ISO 8601, UTC
-    days: float  # length of the plan
-    step_s: float = 60.0  # length of a step; conditions are evaluated at its middle
+    days: Annotated[float, Unit("d"), Range(0, open_low=True)]  # length of the plan
+    step_s: Duration = 60.0  # length of a step; conditions are evaluated at its middle
 
     def __post_init__(self) -> None:
-        for name in ("days", "step_s"):
-            if not (np.isfinite(value := getattr(self, name)) and value > 0):
-                raise InputError.of(name, value, "a number > 0")
         if not 1 <= self.n <= MAX_STEPS:
             raise InputError(
                 f"{self.days:g} days in steps of {self.step_s:g} s are {self.days * DAY_S / self.step_s:.3g} steps",

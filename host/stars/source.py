@@ -35,6 +35,7 @@ from ..spectra.wavelength_range import SPAN_NM
 from . import bands, catalogue, own_stars
 from .flare import Geometry, with_flare
 from .flare_spectra import Blackbody, FlareSpectrum
+from .model_stars import ModelStar
 
 if TYPE_CHECKING:
     import astropy.units as u
@@ -117,14 +118,21 @@ class Source(Drawable, ContentEquality):
 
     @classmethod
     def from_library(cls, name: str) -> Self:
-        """Return an embedded spectrum or one of the user's own stars, by name in any case.
+        """Return an embedded spectrum, one of the user's own stars, a blackbody or a power law, by name in any case.
 
+        "blackbody 9000 K" is a blackbody, and "power law -2" a flux proportional to a power of the wavelength.
         `catalogue.library_table` lists the names. For an unknown name the error suggests the nearest ones, and for a
         well-known star without a spectrum that of its type.
         """
         from .star_names import spectrum_name
 
         name = spectrum_name(name, "name")
+        model = ModelStar.named(name)
+        if model is not None:
+            return cls(
+                *model.spectrum(), model.name, model.origin,
+                unscaled="a formula has no level of its own", temperature_k=model.temperature_k,
+            )  # fmt: skip
         mine = own_stars.find(name) if catalogue.embedded(name) is None else None
         if mine is not None:
             wavelength, flux = own_stars.spectrum(mine)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from mauvecl.schema.errors import InputError
 
 from . import catalogue, own_stars, well_known
+from .model_stars import EXAMPLES, ModelStar
 from .spectral_types import as_type, nearest_spectrum
 from .well_known import WellKnown, name_key
 
@@ -34,10 +35,14 @@ def resolve(text: str, *, own: bool = True) -> NamedStar | None:
     Parameters
     ----------
     text : str
-        A name of the library ("M3V", short "M3"), a star ("GJ 581", "Proxima", "HD 1835"), or any other spectral type.
+        A name of the library ("M3V", short "M3"), a star ("GJ 581", "Proxima", "HD 1835"), any other spectral type, or
+        a formula ("blackbody 9000 K", "power law -2").
     own : bool
         Whether to search among the user's own stars.
     """
+    model = ModelStar.named(text)
+    if model is not None:
+        return NamedStar(model.name, model.name, None)
     entry, known = catalogue.embedded(text), well_known.by_key().get(name_key(text))
     if entry is None and known is not None:
         # The library has the star under another of its names.
@@ -94,8 +99,8 @@ def spectrum_name(text: str, key: str = "star", *, own: bool = True) -> str:
 
 
 def all_names() -> list[str]:
-    """Return the names of all embedded spectra and well-known stars, without their other designations."""
-    return list(dict.fromkeys([*catalogue.names(), *(star.name for star in well_known.stars())]))
+    """Return the names of all embedded spectra and well-known stars, without designations, and of two formulas."""
+    return list(dict.fromkeys([*catalogue.names(), *EXAMPLES, *(star.name for star in well_known.stars())]))
 
 
 def near_names(text: str, *, stars_only: bool = False) -> list[str]:

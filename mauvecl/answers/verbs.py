@@ -324,7 +324,6 @@ VERBS: dict[str, Verb] = {
                 "run.seed",
             ),
             without="observation.exposure_s",
-            tab=True,
         ),
         Verb(
             "change",

@@ -171,6 +171,10 @@ def _is_there(name: str) -> bool:
 def _is_file(name: str) -> bool:
     if _is_there(name):
         return True
-    # "K2.5V" looks like a file name but is a star.
+    from mauvecl.host.stars.model_stars import ModelStar
+
+    # "K2.5V" and "power law -1.5" look like file names but are stars.
+    if ModelStar.named(name) is not None:
+        return False
     suffix = Path(name).suffix
     return bool(suffix) and not suffix[1:].isupper()

@@ -23,6 +23,11 @@ WORDS = {
     "mag": "magnitudes",
     "mag / arcsec2": "mag/arcsec2",
     "s": "seconds",
+    "h": "hours",
+    "d": "days",
+    "deg": "degrees",
+    "1 / h": "a number per hour",
+    "1 / d": "a number per day",
 }
 
 

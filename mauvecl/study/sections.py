@@ -99,6 +99,12 @@ class Star(Section):
         Reddening | None,
         Help("Dust in front of the star, E(B-V)", "needs mauvecl[extinction]"),
         Flag("--ebv"),
+        Widget(
+            label="Reddening",
+            hint="Dust in front of the star, E(B-V) in magnitudes. The magnitude above is that of the reddened star. "
+            "Nothing: no dust.",
+            group="Star",
+        ),
     ] = None
     wavelength_unit: Annotated[
         str | None,
@@ -136,17 +142,7 @@ class Star(Section):
     bin_nm: Annotated[BinWidth | None, Help("Width of bins over which the spectrum is averaged"), Flag("--bin-nm")] = (
         None
     )
-    distance_pc: Annotated[
-        Distance | None,
-        Help("Distance of the star", "for energies"),
-        Flag("--distance"),
-        Widget(
-            label="Distance",
-            hint="With it, measured flares have luminosities and energies. Nothing: fluxes at the telescope alone.",
-            group="Measurement",
-            place=-1,
-        ),
-    ] = None
+    distance_pc: Annotated[Distance | None, Help("Distance of the star", "for energies"), Flag("--distance")] = None
     radius_rsun: Annotated[Radius | None, Help("Radius of the star", "for energies"), Flag("--radius")] = None
     effective_temperature_k: Annotated[
         Temperature | None, Help("Effective temperature of the star", "for energies"), Flag("--star-temperature")
@@ -155,37 +151,16 @@ class Star(Section):
         Path | None,
         Help("Table of other stars near the star", "with separation, magnitude and spectral type, or of a Gaia query"),
         Flag("--neighbours"),
-        Widget(
-            label="Neighbours",
-            hint="Other stars near the star, as CSV: name, separation (arcsec), magnitude and spectral_type, or the "
-            "columns of a Gaia query. The light of those within 47 arcsec enters.",
-            group="Neighbours",
-            kind="table",
-        ),
     ] = None
     neighbours_of: Annotated[
         str | None,
         Help("The star's own row in that table, by name, or its coordinates"),
         Flag("--neighbours-of"),
-        Widget(
-            label="The star itself",
-            hint="Its own row in that table, by name, or its coordinates, such as 290.68 +11.12; needed if the table "
-            "has positions but no separations.",
-            group="Neighbours",
-            place=1,
-        ),
     ] = None
     neighbour_share: Annotated[
         Share,
         Help("Share of the light of neighbours within the fibre's radius that enters it", "an assumption"),
         Flag("--neighbour-share"),
-        Widget(
-            label="Share that enters",
-            hint="Share of the light of neighbours within 47 arcsec that enters the fibre; an assumption, since it is "
-            "not published.",
-            group="Neighbours",
-            place=2,
-        ),
     ] = 1.0
 
     @model_validator(mode="after")
@@ -228,8 +203,6 @@ class Star(Section):
 
     def source(self) -> Source:
         """Load the spectrum and scale it to the magnitude, if one is given."""
-        from dataclasses import replace
-
         from mauvecl.host.stars.source import Source
         from mauvecl.host.stars.star_names import spectrum_name
 
@@ -239,6 +212,12 @@ class Star(Section):
             source = Source.read(
                 self.file or "", wavelength_unit=self.wavelength_unit, flux_unit=self.flux_unit, extend=self.extend
             )
+        return self.applied(source)
+
+    def applied(self, source: Source) -> Source:
+        """Return a spectrum with the star's temperature, bins, dust and magnitude."""
+        from dataclasses import replace
+
         if self.effective_temperature_k is not None:
             source = replace(source, temperature_k=self.effective_temperature_k)
         if self.bin_nm is not None:

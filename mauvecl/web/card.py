@@ -10,6 +10,7 @@ from mauvecl.web.closed_forms import ClosedForms, percent, short
 from mauvecl.web.headline import TITLES, chances
 from mauvecl.web.sentences import note
 from mauvecl.web.simulations import OTHER
+from mauvecl.web.tabs import TABS
 from mauvecl.web.tabs.tab import Answers, Tab
 
 #: Part of the message about the throughput, which the page shows once.
@@ -26,7 +27,7 @@ def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     dict
         ``numbers``, one for each choice of what is unknown; ``chosen``, ``shown`` and ``interval`` of the question's
         choice, and ``words``; ``facts``, pairs of names and values; ``notes``, pairs of sentences and kinds;
-        ``simulated``, names of what is simulated.
+        ``simulated``, names of what is simulated; ``files``, names of tables that can be taken along.
     """
     q, x = closed.question, closed.quiet
     cut, both = closed.odds.threshold, chances(closed, answers)
@@ -56,6 +57,7 @@ def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
         "facts": facts,
         "notes": _with_kinds(_messages(closed, answers)),
         "simulated": _simulated(answers),
+        "files": _files(answers),
     }
 
 
@@ -72,11 +74,16 @@ def without_headline(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[st
         "facts": [],
         "notes": _with_kinds([m for m in dict.fromkeys(messages) if not m.startswith(NOMINAL)]),
         "simulated": _simulated(answers),
+        "files": _files(answers),
     }
 
 
 def _simulated(answers: Answers) -> list[str]:
     return sorted(name for name in answers if name not in ("snr", "draw", "seen", OTHER))
+
+
+def _files(answers: Answers) -> list[str]:
+    return [name for tab in TABS.values() for name in tab.files if tab.offers(name, answers)]
 
 
 def _with_kinds(messages: list[str]) -> list[tuple[str, str]]:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,13 +35,9 @@ class ClosedForms:
 
     question: Question
     case: Case
-    #: What was read of the visitor's files, as arguments of the verb by name.
-    given: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def of(
-        cls, question: Question, folder: Path, *, headline: bool = True, given: Mapping[str, Any] | None = None
-    ) -> ClosedForms:
+    def of(cls, question: Question, folder: Path, *, headline: bool = True) -> ClosedForms:
         """Answer a question.
 
         Parameters
@@ -52,8 +47,6 @@ class ClosedForms:
             Folder to which an uploaded spectrum is written for the study.
         headline : bool
             Whether the chance of detection is asked, without which a star may be too bright for it.
-        given : mapping, optional
-            What was read of the visitor's files.
 
         Raises
         ------
@@ -62,8 +55,8 @@ class ClosedForms:
         """
         uploaded = question.uploaded
         # An uploaded spectrum is not read from its file at every change.
-        scaled = None if uploaded is None else lambda star: uploaded.at_magnitude(question.magnitude, question.band)
-        closed = cls(question, Case(question.study(folder), loader=Loader(scaled)), given or {})
+        scaled = None if uploaded is None else lambda star: star.applied(uploaded)
+        closed = cls(question, Case(question.study(folder), loader=Loader(scaled)))
         if headline:
             _ = closed.odds
         return closed

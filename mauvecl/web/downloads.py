@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import io
 import tempfile
-import threading
 import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mauvecl.schema.errors import InputError
 from mauvecl.web.commands import as_command, as_program
+from mauvecl.web.question import STAR_FILE
 from mauvecl.web.simulations import asked
 from mauvecl.web.tabs import TABS
 
@@ -21,30 +21,17 @@ if TYPE_CHECKING:
     from mauvecl.web.tabs.tab import Answers, Tab
 
 
-#: Held while matplotlib draws.
-_drawing = threading.Lock()
-
-
 def study_file(study: Study, name: str) -> tuple[str, bytes]:
-    """Return name and content of the study file, in a zip archive with the visitor's files if there are any."""
-    files, text = list(visitor_files(study).values()), study.toml()
-    if not files:
-        return f"{name}.toml", text.encode()
+    """Return name and content of the study file, in a zip archive with an uploaded star."""
+    file = study.star[0].file
+    if file is None:
+        return f"{name}.toml", study.toml().encode()
     out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
-        for file in files:
-            archive.write(file, file.name)
-            # Paths relative to the study, instead of those on the server.
-            text = text.replace(str(file.resolve()), file.name)
-        archive.writestr("study.toml", text)
+    with zipfile.ZipFile(out, "w") as archive:
+        archive.write(file, STAR_FILE)
+        # Path relative to the study, instead of that on the server.
+        archive.writestr("study.toml", study.toml().replace(str(file.resolve()), STAR_FILE))
     return f"{name}.zip", out.getvalue()
-
-
-def visitor_files(study: Study) -> dict[tuple[str, str], Path]:
-    """Return the files of the visitor's that a study names, by section and key."""
-    sections = {"star": (study.star[0], ("file", "neighbours")), "data": (study.data, ("file", "mapping"))}
-    every = {(name, key): getattr(section, key) for name, (section, keys) in sections.items() for key in keys}
-    return {place: file for place, file in every.items() if file is not None}
 
 
 def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answers) -> tuple[str, bytes]:
@@ -56,7 +43,6 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
     name : str
         One of the tab's `files`.
     ending : {"ecsv", "fits", "study"}
-        Empty for a document.
     closed : ClosedForms
     answers : mapping
         Answers that are simulated, by name.
@@ -68,16 +54,11 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
     """
     from mauvecl.answers.files import write_table
 
-    if name in tab.documents and tab.documents[name] in answers:
-        # Matplotlib's settings are those of the process.
-        with _drawing:
-            return name, answers[tab.documents[name]].documents[name]()
     if name not in tab.files or ending not in ("ecsv", "fits", "study"):
         raise InputError(
             f"{tab.title} has no file {name[:40]!r}.{ending[:10]}", "one of its own", key="name", value=name
         )
-    wanted = tab.files[name]
-    if wanted is not None and wanted not in answers:
+    if not tab.offers(name, answers):
         raise InputError(f"no {name} is computed yet", "a simulation first", key="name", value=name)
     if ending == "study":
         return study_file(tab.study(name, closed, answers), f"mauvecl-{name}")
@@ -95,14 +76,14 @@ def taken_along(tab: Tab, question: Question, folder: Path) -> list[dict[str, st
     tab : Tab
     question : Question
     folder : Path
-        Where the visitor's files are.
+        Where an uploaded spectrum is written for the study.
     """
     found = []
     for name in tab.questions:
         verb, study = asked(name, question.study(folder))
-        for place, file in visitor_files(study).items():
+        if question.uploaded is not None:
             # Relative to the study, instead of that on the server.
-            study = study.with_value(place, Path(file.name))
+            study = study.with_value(("star", "file"), Path(STAR_FILE))
         found.append({"question": name, "command": as_command(verb, study), "python": as_program(verb, study)})
     return found
 

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin
 from pydantic.fields import FieldInfo
 
 from mauvecl.host.stars.catalogue import embedded
+from mauvecl.host.stars.model_stars import ModelStar
 from mauvecl.host.stars.star_names import near_names, spectrum_name
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Range, Slider, Unit, Widget, first, found, range_of, unit_of
@@ -22,8 +23,6 @@ from mauvecl.study.keys import study_keys
 from mauvecl.web.simulations import SIMULATIONS
 
 UPLOADED, UPLOADED_UNKNOWN = "uploaded star", "uploaded spectrum"
-#: Text of a field whose file is kept as it is.
-UPLOADED_FILE = "uploaded file"
 #: Realisations that a visitor may ask for, and with a tail by importance sampling.
 REALISATIONS, SAMPLED = (10_000, 100_000, 1_000_000, 4_000_000), (100_000, 1_000_000)
 
@@ -34,8 +33,6 @@ SKIES = ("brightness", "target and time", "none")
 MOST_CHARACTERS = 200
 #: Targets whose visibility and plan a visitor may ask for.
 MOST_TARGETS = 30
-#: Characters of a table of neighbours, which links hold.
-MOST_TABLE = 3000
 
 
 @dataclass(frozen=True)
@@ -211,27 +208,12 @@ def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
     return tuple(rows)
 
 
-def neighbours(text: str) -> str | None:
-    """Check that a text is a CSV table of neighbours without names of files, and return it; None for nothing."""
-    from mauvecl.host.files.text_table import text_table
-    from mauvecl.host.neighbour_table import FILES
-
-    if not text.strip():
-        return None
-    if text.startswith("# %ECSV"):
-        raise InputError("the table of neighbours is ECSV", "CSV, or the command line", key="neighbours")
-    names = {name.strip().lower() for name in text_table(text, "the table of neighbours", commas=True).colnames}
-    if files := names & {*FILES}:
-        raise InputError(
-            f"the table of neighbours has a column {min(files)}",
-            "spectral_type; the command line reads files of spectra", key="neighbours",
-        )  # fmt: skip
-    return text
-
-
 def star_words(name: str) -> str:
     """Describe a star of the library by its type and the star of its spectrum."""
     entry = embedded(name)
+    model = ModelStar.named(name)
+    if model is not None:
+        return f"a {name.replace('body', 'body of').replace('law', 'law of index')}"
     star = name if entry is None else entry["star"]
     if star == name:
         return f"a star like {'the ' if name == 'Sun' else ''}{name}"
@@ -265,7 +247,7 @@ class Field:
     most : int
         Largest number of characters.
     kind : str
-        Kind of the widget if not that of what is read: "day", "library", "targets", "table" or "file".
+        Kind of the widget if not that of what is read: "day", "library" or "targets".
     suggestions : tuple of str
         Texts that the page offers.
     own_keys : tuple of str
@@ -305,12 +287,12 @@ def _text(value: Any) -> str:
 def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
     """Return the field of a key from its metadata."""
     default = field.get_default()
-    text = _text(default * widget.scale if isinstance(default, float) else default)
+    text = _text(default)
     unit = first(field, Unit) or Unit("")
     return Field(
         widget.label,
         text if widget.first is None else widget.first,
-        _reader(field, widget, unit.name, optional=text == "" if widget.first is None else not widget.first),
+        _reader(field, widget, unit.name, optional=default is None and widget.first is None),
         widget.hint,
         unit.written if widget.unit is None else widget.unit,
         widget.slider,
@@ -318,7 +300,6 @@ def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
         widget.place,
         path,
         widget.scale,
-        most=MOST_TABLE if widget.kind == "table" else MOST_CHARACTERS,
         kind=widget.kind,
         suggestions=widget.suggestions,
     )
@@ -332,10 +313,6 @@ def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> C
         return day
     if widget.kind == "library":
         return lambda text: spectrum_name(text, own=False) if text.strip() else None
-    if widget.kind == "table":
-        return neighbours
-    if widget.kind == "file":
-        return Choice(("", UPLOADED_FILE))
     if field.annotation is bool:
         return Choice(("no", "yes"), lambda text: text == "yes")
     flag = first(field, Flag)
@@ -357,8 +334,9 @@ def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> C
 _OWN = {
     "star": Field(
         "Star", "G2V", star_name,
-        "Whose spectrum: a spectral type of the library, one of its stars by any name (GJ 581, HD 40307), or your own "
-        "file.", group="", place=-1, own_keys=("star.library",),
+        "Whose spectrum: a spectral type of the library, one of its stars by any name (GJ 581, HD 40307), a blackbody "
+        "(blackbody 9000 K), a power law of the wavelength (power law -2), or your own file.",
+        group="", place=-1, own_keys=("star.library",),
     ),
     "lines": Field(
         "Emission lines", "", line_fluxes,
@@ -417,6 +395,7 @@ ASKED = ("star", *(name for name in _group("") if name != "star"))
 ADVANCED = {
     name: _group(name)
     for name in (
+        "Star",
         "Detection",
         "Flare's spectrum",
         "Measurement",
@@ -424,17 +403,14 @@ ADVANCED = {
         "Sky",
         "Unknown",
         "Change",
-        "Search",
-        "Neighbours",
-        "Pointing",
     )
 }
 #: Fields of the card.
 SOLVED = _group("Limit")
 #: Fields that say how the file of another field is read.
 READ_WITH = {"star": _group("Own spectrum")}
-#: Fields of forms of their own, which stand in the panels of the tabs that read them.
-FORMS = {"campaign": _group("Campaign"), "frames": _group("Frames")}
+#: Fields of the form above the tabs of targets.
+CAMPAIGN = _group("Campaign")
 #: Fields that ask for something under one sky only.
 ASKED_UNDER = {"sky_brightness": "brightness", "target": "target and time", "time": "target and time"}
 #: Questions to begin with; the amplitudes of the first two are the paper's smallest, the others are examples (assumed).

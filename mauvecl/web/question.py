@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,15 +16,10 @@ if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
 
 #: Fields whose values only apply together with those of others, and those that an upload was read with.
-CONDITIONAL = (
-    "sky_brightness", "target", "time", "second_area", "hours", "pointing_rate", "pointing_duration", "pointing_depth",
-    *itertools.chain(*READ_WITH.values()),
-)  # fmt: skip
+CONDITIONAL = ("sky_brightness", "target", "time", "second_area", "hours", *itertools.chain(*READ_WITH.values()))
 Points = tuple[tuple[float, float], ...]
 #: Name of an uploaded star's file in the folder of its study.
 STAR_FILE = "star.ecsv"
-#: Name of the file of a table of neighbours.
-NEIGHBOURS_FILE = "neighbours.csv"
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,36 +46,33 @@ class Question:
         Parameters
         ----------
         folder : Path, optional
-            Where an uploaded spectrum and a table of neighbours are written for the study to find.
+            Where an uploaded spectrum is written for the study to find.
 
         Raises
         ------
         InputError
             For values that cannot be together.
         """
-        if folder is None and (self.uploads.keys() - {"own_unknown"} or self.neighbours is not None):
-            raise InputError("no folder for the visitor's files", "a folder", key="folder")
-        return Study.build(self._data(folder), "page")
+        if self.uploaded is None:
+            return Study.build(self.data(), "page")
+        if folder is None:
+            raise InputError("no folder for the uploaded star", "a folder", key="folder")
+        return Study.build(self.data(str(write_spectrum(self.uploaded, folder))), "page")
 
-    def _data(self, folder: Path | None) -> dict[str, Any]:
-        """Return the question as the data of a study, whose files are written to a folder."""
+    def data(self, file: str = STAR_FILE) -> dict[str, Any]:
+        """Return the question as the data of a study.
+
+        Parameters
+        ----------
+        file : str
+            Where an uploaded spectrum is.
+        """
         values = self.values
         data: dict[str, Any] = {}
         for name, one in FIELDS.items():
-            if not one.path or name in CONDITIONAL or values[name] is None:
-                continue
-            if one.kind != "file":
+            if one.path and name not in CONDITIONAL and values[name] is not None:
                 self._set(data, one, values[name])
-            elif folder is not None and name in self.uploads:
-                self._set(data, one, str(self.uploads[name].written(folder)))
-        star = data["star"]
-        if folder is not None and self.neighbours is not None:
-            star["neighbours"] = str(write_table(self.neighbours, folder))
-        if folder is not None and self.uploaded is not None:
-            star["file"] = str(write_spectrum(self.uploaded, folder))
-        else:
-            star["library"] = values["star"]
-        data["star"] = [star]
+        data["star"] = [data["star"] | ({"file": file} if self.uploaded else {"library": values["star"]})]
         data["sky"] = {
             "brightness": {"surface_brightness": values["sky_brightness"]},
             "target and time": {"target": values["target"], "time": values["time"]},
@@ -89,9 +80,6 @@ class Question:
         }[values["sky"]]
         if values["second_temperature_k"] is not None:
             self._set(data, FIELDS["second_area"], values["second_area"])
-        if values["pointing_rate"] is not None:
-            for name in ("pointing_rate", "pointing_duration", "pointing_depth"):
-                self._set(data, FIELDS[name], values[name])
         if values["lines"]:
             data["flare"].setdefault("spectrum", {})["lines"] = dict(values["lines"])
         points = self.uploads.get("own_unknown", values["own_unknown"])
@@ -117,15 +105,6 @@ class Question:
             value = value / one.scale
         # A single flare.
         data[key] = [value] if key == "amplitudes" else value
-
-
-def write_table(text: str, folder: Path) -> Path:
-    """Write a table of neighbours to a file, once per text, and return its path."""
-    path = folder / hashlib.sha256(text.encode()).hexdigest() / NEIGHBOURS_FILE
-    if not path.exists():
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(text)
-    return path
 
 
 def write_spectrum(source: Source, folder: Path) -> Path:

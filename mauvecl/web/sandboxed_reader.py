@@ -1,4 +1,4 @@
-"""Reader of visitors' files in a child process with limits, which protects the server."""
+"""Reader of visitors' spectra in a child process with limits, which protects the server."""
 
 from __future__ import annotations
 
@@ -10,16 +10,11 @@ import sys
 import tempfile
 import threading
 from collections.abc import Mapping
-from dataclasses import fields
-from importlib import import_module
-from operator import attrgetter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from mauvecl.host.stars.source import Source
-from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError
 
 #: Memory of the reading process, MiB: Python with astropy and synphot maps some 400, a spectrum of 4 MiB as text 300.
@@ -32,16 +27,8 @@ CONTENT_MIB = 64
 TOGETHER = 2
 #: Exit codes of the reading process.
 _REFUSED, _NO_ROOM = 2, 3
-#: Functions that read files, by module: of a path, and of options by name.
-READERS = {
-    "spectrum": ("mauvecl.host.stars.source", "Source.read"),
-    "frames": ("mauvecl.observations.reading", "read_frames"),
-}
-#: What an upload is expected to be, by the function that reads it.
-EXPECTED = {
-    "spectrum": ("a spectrum of some thousand points", "a spectrum as text, ECSV, VOTable or FITS"),
-    "frames": ("fewer frames", "frames as FITS, ECSV or CSV"),
-}
+#: Attributes of a source other than its numbers.
+WORDS = ("name", "origin", "notes", "messages", "measured_nm", "unscaled")
 _turns = threading.BoundedSemaphore(TOGETHER)
 
 
@@ -62,38 +49,28 @@ def read_limited(content: bytes, options: Mapping[str, str | None] | None = None
     InputError
         If it holds no usable spectrum, or reading it takes more memory or time than allowed.
     """
-    return Source(**_read("spectrum", {"upload": content}, options or {}))
-
-
-def read_frames_limited(files: Mapping[str, bytes], mapping: str | None = None) -> Frames:
-    """Read frames like `read_frames`, in a process with limited memory and time.
-
-    Parameters
-    ----------
-    files : mapping
-        Contents by name: the file of frames first, and files that the mapping or the frames need.
-    mapping : str, optional
-        Name of the file that is the mapping.
-    """
-    return Frames(**_read("frames", files, {"mapping": mapping}))
-
-
-def _read(reader: str, files: Mapping[str, bytes], options: Mapping[str, str | None]) -> dict[str, Any]:
-    """Run a reading process, and return the attributes of what it has read."""
     if not _turns.acquire(timeout=SECONDS):
         raise InputError("too many uploads are read at the same time", "yours again in a minute", key="upload")
     try:
-        answer = _read_apart(reader, files, options)
+        answer = _read_apart(content, dict(options or {}))
     finally:
         _turns.release()
     with np.load(io.BytesIO(answer), allow_pickle=False) as read:
         words = json.loads(str(read["words"]))
-        return {name: tuple(value) if isinstance(value, list) else value for name, value in words.items()} | {
-            name: read[name] for name in read.files if name != "words"
-        }
+        measured = words["measured_nm"]
+        return Source(
+            read["wavelength"],
+            read["flux"],
+            words["name"],
+            words["origin"],
+            tuple(words["notes"]),
+            messages=tuple(words["messages"]),
+            measured_nm=None if measured is None else (measured[0], measured[1]),
+            unscaled=words["unscaled"],
+        )
 
 
-def _read_apart(reader: str, files: Mapping[str, bytes], options: Mapping[str, str | None]) -> bytes:
+def _read_apart(content: bytes, options: dict[str, str | None]) -> bytes:
     """Run the reading process and return its output."""
     environment = os.environ | {
         # One thread of a numerical library needs no stacks of many.
@@ -102,19 +79,17 @@ def _read_apart(reader: str, files: Mapping[str, bytes], options: Mapping[str, s
         "PYTHONIOENCODING": "utf-8",
         "PYTHONPATH": os.pathsep.join(filter(None, (_here(), os.environ.get("PYTHONPATH")))),
     }
-    words = json.dumps({"reader": reader, "file": next(iter(files)), "options": dict(options)})
     # A fresh interpreter, as spawn makes one: OpenCL does not survive a fork.
-    command = [sys.executable, "-m", "mauvecl.web.sandboxed_reader", str(MEMORY_MIB), str(SECONDS), words]
-    smaller, other = EXPECTED[reader]
+    command = [sys.executable, "-m", "mauvecl.web.sandboxed_reader", str(MEMORY_MIB), str(SECONDS), json.dumps(options)]
     with tempfile.TemporaryDirectory(prefix="mauvecl-upload-") as folder:
-        for name, content in files.items():
-            (Path(folder) / name).write_bytes(content)
         try:
             done = subprocess.run(
-                command, capture_output=True, timeout=SECONDS, cwd=folder, env=environment, check=False
+                command, input=content, capture_output=True, timeout=SECONDS, cwd=folder, env=environment, check=False
             )
         except subprocess.TimeoutExpired as error:
-            raise InputError(f"the upload takes more than {SECONDS} s to read", smaller, key="upload") from error
+            raise InputError(
+                f"the upload takes more than {SECONDS} s to read", "a spectrum of some thousand points", key="upload"
+            ) from error
         except OSError as error:
             raise InputError(
                 f"the upload cannot be read now ({error.strerror})",
@@ -129,8 +104,12 @@ def _read_apart(reader: str, files: Mapping[str, bytes], options: Mapping[str, s
         fault, _, expected = done.stderr.decode("utf-8", "replace").strip().partition(", expected ")
         raise InputError(fault, expected or None, key="upload")
     if done.returncode == _NO_ROOM:
-        raise InputError(f"the upload takes more than {MEMORY_MIB} MiB of memory to read", smaller, key="upload")
-    raise InputError("the upload ends its reader", other, key="upload")
+        raise InputError(
+            f"the upload takes more than {MEMORY_MIB} MiB of memory to read",
+            "a spectrum of some thousand points",
+            key="upload",
+        )
+    raise InputError("the upload ends its reader", "a spectrum as text, ECSV, VOTable or FITS", key="upload")
 
 
 def _here() -> str:
@@ -155,20 +134,20 @@ def _limit(memory_mib: int, seconds: int) -> None:
 
 
 def _main() -> int:
-    """Run the reading process: files in its folder, arrays on standard output, errors on standard error."""
-    memory_mib, seconds, words = sys.argv[1:]
-    asked = json.loads(words)
+    """Run the reading process: file on standard input, arrays on standard output, errors on standard error."""
+    memory_mib, seconds, options = sys.argv[1:]
     _limit(int(memory_mib), int(seconds))
     try:
-        module, names = READERS[asked["reader"]]
-        read: Any = attrgetter(names)(import_module(module))
-        found = read(Path(asked["file"]), **asked["options"])
-        values = {field.name: getattr(found, field.name) for field in fields(found)}
-        arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
-        rest = json.dumps({name: value for name, value in values.items() if name not in arrays})
+        file = Path("upload")
+        file.write_bytes(sys.stdin.buffer.read())
+        source = Source.read(file, **json.loads(options))
         out = io.BytesIO()
-        save: Any = np.savez
-        save(out, words=np.array(rest), **arrays)
+        np.savez(
+            out,
+            wavelength=source.wavelength_nm,
+            flux=source.flux_flam,
+            words=np.array(json.dumps({key: getattr(source, key) for key in WORDS})),
+        )
     except InputError as error:
         print(error, file=sys.stderr)
         return _REFUSED

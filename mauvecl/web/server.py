@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 import time
 from collections.abc import Sequence
 from typing import Any
 
 #: Largest size in bytes of a message, an upload with a margin, and of a request's body, of which the page has none.
-MESSAGE, BODY = 17 * 2**20, 2**16
+MESSAGE, BODY = 8 * 2**20, 2**16
 #: Seconds that a connection may take for the headers and the body of each request.
 REQUEST_S = 20.0
 #: Largest number of open connections, beyond which the oldest without a page is closed; browsers open up to six.
@@ -133,11 +134,16 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
     import asyncio
 
     from mauvecl.web.access import local, netloc
+    from mauvecl.web.folders import remove_abandoned
     from mauvecl.web.plain_log import install
+    from mauvecl.web.visitor import Visitor
 
     async def run() -> None:
         from tornado.ioloop import PeriodicCallback
 
+        # A server that is told to end leaves through Python's own exit, which removes its folders.
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+        remove_abandoned()
         make(address, port, allow_origin)
         warm()
         if not local(address):
@@ -152,7 +158,12 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
             import webbrowser
 
             webbrowser.open(url)
-        await asyncio.Event().wait()
+        try:
+            await asyncio.Event().wait()
+        finally:
+            # Simulations would keep the process until they end.
+            for one in list(Visitor.here):
+                one.on_close()
 
     install()
     asyncio.run(run())

@@ -7,7 +7,6 @@ import base64
 import hashlib
 import json
 import logging
-import tempfile
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Coroutine
@@ -27,6 +26,7 @@ from mauvecl.schema.text import shortened
 from mauvecl.web.card import card, without_headline
 from mauvecl.web.closed_forms import ClosedForms
 from mauvecl.web.downloads import as_file, asked_study, taken_along
+from mauvecl.web.folders import visitor_folder
 from mauvecl.web.headline import other_payloads, solved
 from mauvecl.web.known_stars import known
 from mauvecl.web.sentences import field_of, remedies, sentence
@@ -77,11 +77,10 @@ class Visitor(WebSocketHandler):
         self._coming: dict[str, Any] | None = None
         self._uploads: dict[str, Any] = {}
         self._digests: dict[str, str] = {}
-        self._given: tuple[tuple[Any, ...], dict[str, Any]] | None = None
         self._closed: tuple[tuple[Any, ...], ClosedForms] | None = None
         self._answers: OrderedDict[tuple[str, tuple[Any, ...]], dict[str, Any]] = OrderedDict()
         self._files: OrderedDict[tuple[Any, ...], tuple[str, bytes]] = OrderedDict()
-        self._folder = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
+        self._folder = visitor_folder()
 
     def check_origin(self, origin: str) -> bool:
         """Accept every origin, since `access.AccessMatcher` has checked it."""
@@ -176,16 +175,8 @@ class Visitor(WebSocketHandler):
         key = self._key(state, tab.reads), tab.headline
         if self._closed is None or self._closed[0] != key:
             question = state.question(tab.reads)
-            given = self.given(state, tab)
-            self._closed = key, ClosedForms.of(question, Path(self._folder.name), headline=tab.headline, given=given)
+            self._closed = key, ClosedForms.of(question, Path(self._folder.name), headline=tab.headline)
         return self._closed[1]
-
-    def given(self, state: State, tab: Tab) -> dict[str, Any]:
-        """Return what was read of the files that a tab reads; the last ones are cached."""
-        key = tab.name, self._key(state, tab.reads & UPLOADS.keys())
-        if self._given is None or self._given[0] != key:
-            self._given = key, tab.given(state.question(tab.reads))
-        return self._given[1]
 
     def answers(self, state: State) -> dict[str, Any]:
         """Return the simulated answers that hold for a question, by name."""
@@ -293,17 +284,14 @@ class Visitor(WebSocketHandler):
 
     async def _simulate(self, n: int, kind: str, state: State) -> None:
         key = kind, self._key(state, reads_of(kind))
-        question, tab = state.question(reads_of(kind)), asking(kind)
-        given = await self._in_thread(partial(self.given, state, tab))
-        made = partial(ClosedForms.of, question, Path(self._folder.name), headline=tab.headline, given=given)
-        closed = await self._in_thread(made)
+        question, headline = state.question(reads_of(kind)), asking(kind).headline
+        closed = await self._in_thread(partial(ClosedForms.of, question, Path(self._folder.name), headline=headline))
         if self.job is not None:
             raise InputError("there is a simulation already", "its end first", key="simulate", value=kind)
         # Several verbs count the realisations of all in the pool.
         verbs = verbs_of(kind)
         unit = VERBS[verbs[0]].counts if len(verbs) == 1 else ""
-        work = partial(SIMULATIONS[kind], closed.study, given=closed.given)
-        job = self.job = Job(work, kind in DRAWING, unit)
+        job = self.job = Job(partial(SIMULATIONS[kind], closed.study), kind in DRAWING, unit)
         done = asyncio.wrap_future(job.future)
         try:
             while not (await asyncio.wait([done], timeout=LOOK_S))[0]:
@@ -355,7 +343,7 @@ class Visitor(WebSocketHandler):
                 log.exception("an upload failed")
                 self.send(
                     n=n, field=field,
-                    lacks=f"upload {shortened(name)} cannot be read ({type(error).__name__}), expected another",
+                    lacks=f"upload {shortened(name)} cannot be read ({type(error).__name__}), expected a spectrum",
                 )  # fmt: skip
             else:
                 self.send(n=n, field=field, entered=upload.entered)

@@ -82,7 +82,10 @@ def test_every_answer_reports_the_cost_of_unknowns(engine: Engine) -> None:
     for ask in (detect, limiting_magnitude, detection_map):
         plain, other = (ask(s, engine) for s in (small, marginal))
         for answer in (plain, other):
-            assert len(of_kind(answer.messages, "cost of unknowns")) == 1
+            # One sentence on unknowns: where a detection takes all as known, it is that on the chance.
+            chance = ask is detect and answer is plain
+            assert len(of_kind(answer.messages, "chance with unknowns")) == chance
+            assert len(of_kind(answer.messages, "cost of unknowns")) == 1 - chance
         assert any("marginalised over the dark level (+-0.1 deg C)" in m for m in other.messages)
         assert "[nuisances]" in other.table.meta["study"]
         assert "[nuisances]" not in plain.table.meta["study"]

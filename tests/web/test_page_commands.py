@@ -40,6 +40,8 @@ LINKS = (
     "?star=Vega&magnitude=3&band=GALEX+NUV&sky=none&realisations=100000+sampled&fap=1e-06&unknown=the+usual",
     "?sky=target+and+time&target=290.68+%2B11.12&time=2026-09-01T12:00&own_unknown=200+1,+450+3&seed=7&targets=eps+Eri"
     "&signal=paper&instrument=mauve-electrons",
+    "?star=blackbody+9000+K&ebv=0.1&targets=AU+Mic",
+    "?star=power+law+-2&targets=AU+Mic",
     "?balmer_jump=2.5&lines=Mg+II%3D0.03,+280%3D0.01&targets=AU+Mic",
     "?second_temperature_k=30000&second_area=0.1&visits=7",
     "?joint_fit=yes&snr_per_bin=20&skipped_nm=200:250,322:368",

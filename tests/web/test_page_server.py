@@ -55,7 +55,7 @@ from mauvecl.web.simulations import SIMULATIONS, asked, campaign_plan
 from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS, limit
 from mauvecl.web.tabs.tab import FIXED
-from mauvecl.web.upload import UPLOADS, Upload, read_pairs, read_upload
+from mauvecl.web.upload import MOST_UPLOADED, Upload, read_pairs, read_upload
 
 NUMBERS = [name for name, field in FIELDS.items() if isinstance(field.read, Number)]
 HOSTILE = "![x](http://127.0.0.1:1/x.png) <img src=http://127.0.0.1:1/y.png>"
@@ -631,6 +631,8 @@ COMMANDS = {
     "map": ("map", [], "map.ecsv"),
     "measure": ("measure", [], "measure.ecsv"),
     "fits": ("measure", [], "fits.ecsv"),
+    "temperatures": ("measure", [], "temperatures.ecsv"),
+    "joint": ("measure", [], "joint.ecsv"),
     "change": ("change", [], "change.ecsv"),
     "indices": ("change", [], "indices.ecsv"),
     "periods": ("change", [], "periods.ecsv"),
@@ -644,15 +646,14 @@ COMMANDS = {
     "energies": ("plan", [], "energies.ecsv"),
     "assumptions": ("plan", [], "assumptions.ecsv"),
 }
-# Tables of a visitor's frames are compared in `test_uploaded_frames`.
-assert COMMANDS.keys() == {name for tab in TABS.values() if tab.name != "analyse" for name in tab.files}
+assert COMMANDS.keys() == {name for tab in TABS.values() for name in tab.files}
 
 
 @pytest.mark.long
 def test_downloads_equal_the_files_of_the_command_line(served: Any, tmp_path: Path) -> None:
     """With a study that is taken from the page, of an uploaded star and an uploaded unknown."""
     link = "?realisations=10000&fap=0.05&statistic=chi2&magnitude=7&star=uploaded+star&own_unknown=uploaded+spectrum"
-    link += "&targets=eps+Eri"
+    link += "&targets=eps+Eri&joint_fit=yes&snr_per_bin=10"
 
     async def work(host: str) -> dict[str, tuple[bytes, bytes, str]]:
         talk = await Talk.begin(host)
@@ -985,7 +986,7 @@ def test_first_load_is_small_and_compressed(served: Any) -> None:
 
 
 def test_upload_limit_fits_into_a_message() -> None:
-    assert max(one.most for one in UPLOADS.values()) + 4096 < server.MESSAGE
+    assert MOST_UPLOADED + 4096 < server.MESSAGE
 
 
 def test_tab_of_a_verb_follows_from_its_row() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,22 +16,17 @@ pytest.importorskip("bokeh")
 from mauvecl.answers.verbs import VERBS
 from mauvecl.web.card import card
 from mauvecl.web.closed_forms import ClosedForms
-from mauvecl.web.fields import FIELDS, READ_WITH, UPLOADED_FILE
+from mauvecl.web.fields import FIELDS, READ_WITH
 from mauvecl.web.simulations import SIMULATIONS, asked, verbs_of
 from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS, reads_of
 from mauvecl.web.tabs.tab import Tab
-from mauvecl.web.upload import VisitorFile
 from mauvecl.web.visitor import shown
 
 pytestmark = pytest.mark.long
 
-#: Files of the visitor's.
-FILES = {"frames": VisitorFile("a.csv", b"1"), "mapping": VisitorFile("a.toml", b"2")}
 Given = tuple[tuple[str, str], ...]
 
-#: A table of neighbours, and the same with positions from which separations are measured.
-NEAR, PLACES = "name,separation,magnitude,spectral_type\nB,8,9,G2V", "name,ra,dec,V,spectral_type\nB,0,0.002,9,G2V"
 #: Another valid text for every field.
 OTHER = {
     "star": "K5V", "magnitude": "9", "band": "B", "amplitude_percent": "3", "exposure_s": "100", "fap": "0.01",
@@ -39,19 +35,14 @@ OTHER = {
     "sky_brightness": "21", "target": "53.2 -9", "time": "2027-01-20", "unknown": "the usual",
     "own_unknown": "200 1, 700 2", "targets": "AU Mic", "start": "2027-06-01", "days": "100", "hours": "50",
     "seed": "7", "signal": "paper", "instrument": "mauve-electrons", "visits": "5", "of": "magnitude", "power": "0.5",
-    "skipped_nm": "200:250", "snr_per_bin": "20", "joint_fit": "yes", "changes": "Mg II", "shortest_d": "2",
-    "longest_d": "20",
-    "distance_pc": "7", "false_alarms": "2",
-    "per": "day", "neighbours": NEAR, "neighbours_of": "0 0", "neighbour_share": "0.5", "pointing_rate": "2",
-    "pointing_duration": "100", "pointing_depth": "10", "frames": UPLOADED_FILE, "mapping": UPLOADED_FILE,
+    "ebv": "0.1", "skipped_nm": "200:250", "snr_per_bin": "20", "joint_fit": "yes", "changes": "Mg II",
+    "shortest_d": "2", "longest_d": "20",
 }  # fmt: skip
 #: Fields that say how an upload is read, and change nothing without one.
 READS = set().union(*READ_WITH.values())
 #: What must be entered first for a field to apply.
 SKY = {"sky": "target and time", "target": "eps Eri", "time": "2027-01-15"}
 BEFORE = {"target": SKY, "time": SKY, "second_area": {"second_temperature_k": "20000"},
-          "neighbours_of": {"neighbours": PLACES, "neighbours_of": "0 0.001"}, "neighbour_share": {"neighbours": NEAR},
-          "pointing_duration": {"pointing_rate": "1"}, "pointing_depth": {"pointing_rate": "1"},
           **{name: {"targets": "eps Eri"} for name in ("start", "days", "hours")}}  # fmt: skip
 #: Fields of the headline that the tabs of pictures show with it.
 HEADLINE = TABS["detection"].reads
@@ -65,7 +56,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @cache
 def forms(tab: str, given: Given, folder: Path, *, everything: bool = False) -> ClosedForms:
-    state = State(FILES)
+    state = State()
     state.enter(dict(given))
     question = state.question() if everything else state.question(TABS[tab].reads)
     return ClosedForms.of(question, folder, headline=TABS[tab].headline)
@@ -156,3 +147,9 @@ def test_invalid_field_of_another_tab_leaves_the_answer() -> None:
     assert state.faults.keys() == {"star"}
     assert state.faults_of(TABS["plan"].reads) == {}
     assert state.question(TABS["plan"].reads).star == "G2V"
+
+
+def test_tables_along_a_stare_are_offered_where_it_is_measured() -> None:
+    tab, answer = TABS["measure"], SimpleNamespace(tables=dict.fromkeys(("measure", "fits", "joint")))
+    assert [name for name in tab.files if tab.offers(name, {"measure": answer})] == ["measure", "fits", "joint"]
+    assert not any(tab.offers(name, {}) for name in tab.files)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from mauvecl.answers.detection.unknown_cost import spoken
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.messages import Message
 from mauvecl.statistics.linear import Matched
@@ -40,7 +41,7 @@ def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
     text = (
         f"Everything but the noise is taken as known: {of} is then detected by the matched statistic with a chance of "
         f"{100 * known[case, flare]:.1f} %, with the usual unknowns of {100 * unknown:.1f} % (closed forms; "
-        "`nuisances.usual` draws them)."
+        f"`nuisances.usual` draws them). These are {spoken(NuisanceChoice(usual=True))}."
     )
     return [Message(text, BOTH_CHANCES)]
 

@@ -265,16 +265,25 @@ def detect(
             f"{100 * errors.max():.1f} % of it: {run.realisations} realisations leave fewer than "
             "100 beyond them."
         )
-    unknown = [
-        unknown_cost(f"{case.label}, flare of {100 * a:g} %", case.quiet, flare, study.nuisances, run.comparison())
-        for case in prepared
-        for a, flare in zip(case.amplitudes, case.flares, strict=True)
-    ]
-    last = [*_few_terms(stars), *marginal_lines(study.nuisances), *cost_lines(unknown, study.nuisances)]
-    last += chance_with_unknowns(prepared)
+    last = [*_few_terms(stars), *marginal_lines(study.nuisances)]
+    # One sentence on unknowns: what they would do to the chance, or to the S/N where they are taken into account.
+    last += chance_with_unknowns(prepared) or _cost_of_unknowns(prepared)
     answer.messages = list(dict.fromkeys([*messages, *campaigns, *costs, *last]))
     answer.paper = paper
     return answer
+
+
+def _cost_of_unknowns(prepared: Sequence[Case]) -> list[str]:
+    """Return the sentence on the S/N that the faintest flare loses to unknowns."""
+    study = prepared[0].study
+    costs = [
+        unknown_cost(
+            f"{case.label}, flare of {100 * a:g} %", case.quiet, flare, study.nuisances, study.run.comparison()
+        )
+        for case in prepared
+        for a, flare in zip(case.amplitudes, case.flares, strict=True)
+    ]
+    return cost_lines(costs, study.nuisances)
 
 
 def _few_terms(stars: Sequence[StarDetection]) -> list[str]:

@@ -9,7 +9,7 @@ over.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -28,7 +28,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import Duration, Moment, Probability, Wavelength
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from mauvecl.host.expectation import Expectation
     from mauvecl.lightcurve.stares.stare import Stare
@@ -76,8 +76,16 @@ class _Data:
         added = np.einsum("ip,jp,tp->tij", weights, weights, self.model.hot * self.gain, optimize=True)
         return scipy.interpolate.CubicSpline(self.model.log_k, added)
 
+    @cached_property
+    def _latest(self) -> Callable[[bytes], tuple[Float, Float]]:
+        # Residuals, derivatives and quantities are asked for at the same parameters in turn.
+        return lru_cache(maxsize=2)(lambda theta: self._strengths(np.frombuffer(theta)))
+
     def strengths(self, theta: Float) -> tuple[Float, Float]:
         """Return the amplitude and log temperature of each frame."""
+        return self._latest(theta.tobytes())
+
+    def _strengths(self, theta: Float) -> tuple[Float, Float]:
         rise = np.exp(theta[2]) * self.light * self.shape.mean_over(self.edges, theta[0], np.exp(theta[1]))
         log_k = theta[3] + np.log(self._cooled(theta)[0])
         return rise, np.clip(log_k, self.model.log_k[0], self.model.log_k[-1])
@@ -480,17 +488,27 @@ def _end(
     def rise(log_factor: float) -> float:
         nonlocal there
 
-        def residuals(values: Float) -> Float:
+        def with_rest(values: Float) -> Float:
             trial = there.copy()
             trial[rest] = values
             trial = held(log_factor, trial)
             trial[4] = min(trial[4], 0.0)
-            return data.residuals(trial, whitening)
+            return trial
+
+        def residuals(values: Float) -> Float:
+            return data.residuals(with_rest(values), whitening)
+
+        def jacobian(values: Float) -> Float:
+            trial = with_rest(values)
+            each, slope = data.jacobian(trial, whitening), quantity.slope(trial, data)
+            return np.asarray(each[:, rest] - np.outer(each[:, place], slope[rest] / slope[place]))
 
         low, high = limits[0][rest], limits[1][rest]
         start = np.clip(there[rest], low + 1e-9, high - 1e-9)
         scale = np.where(rest == 0, np.exp(theta[1]), 1.0)
-        found = scipy.optimize.least_squares(residuals, start, bounds=(low, high), x_scale=scale, xtol=1e-6, ftol=1e-8)
+        found = scipy.optimize.least_squares(
+            residuals, start, jacobian, bounds=(low, high), x_scale=scale, xtol=1e-6, ftol=1e-8
+        )
         there = there.copy()
         there[rest] = found.x
         return float(2 * found.cost - allowed)

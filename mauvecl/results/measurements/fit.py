@@ -174,8 +174,8 @@ def fit(
     """Fit one flare to each exposure.
 
     The likelihood is Gaussian with the variance of the fitted flare and star. Intervals are from the profile likelihood
-    with Wilks' thresholds. Light is at least 0 and a jump at least 1. An interval that reaches this bound, or an end of
-    the model's temperatures, is a one-sided limit.
+    with Wilks' thresholds, scaled where a quantity bends within the error of the temperature. Light is at least 0 and a
+    jump at least 1. An interval that reaches this bound, or an end of the model's temperatures, is a one-sided limit.
 
     Parameters
     ----------
@@ -335,7 +335,7 @@ def _fitted(
 
 
 def fit_sums(sums: Float, model: FlareModel, reduction: Reduction) -> tuple[Float, Float]:
-    """Fit the sums of exposures, without intervals; a processor core fits about 1e5 exposures per second.
+    """Fit the sums of exposures, without intervals; a processor core fits about 3e5 exposures per second.
 
     Parameters
     ----------

@@ -227,6 +227,14 @@ class FlareModel:
         values = [one.factors if one.ratio is None else one.ratio for one in self.derived]
         return tuple(None if value is None else scipy.interpolate.CubicSpline(self.log_k, value) for value in values)
 
+    @cached_property
+    def sums(self) -> tuple[NDArray[np.bool_], scipy.interpolate.CubicSpline]:
+        """Which derived quantities are sums of amplitudes, and the spline of their factors, (n_sums, n_linear)."""
+        factors = [one.factors for one in self.derived]
+        which = np.array([one is not None for one in factors])
+        stacked = np.stack([one for one in factors if one is not None], axis=1)
+        return which, scipy.interpolate.CubicSpline(self.log_k, stacked)
+
     def counts(self, temperature_k: Temperature, amplitudes: Sequence[float] | Float) -> Float:
         """Return the mean DN that a flare adds to each pixel of the exposure, shape (n_pixel,)."""
         linear = self._checked(temperature_k, amplitudes)
@@ -268,17 +276,17 @@ class FlareModel:
 
 def derived_values(model: FlareModel, log_k: Float, linear: Float) -> Float:
     """Return the reported quantities, shape (n, n_derived), of temperatures (n,) and amplitudes (n, n_linear)."""
-    columns = []
-    for one, spline in zip(model.derived, model.splines, strict=True):
-        if spline is None:
-            columns.append(np.exp(log_k))
-        elif one.ratio is None:
-            columns.append(np.einsum("nl,nl->n", spline(log_k), linear))
-        else:
+    values = np.empty((log_k.size, len(model.derived)))
+    which, spline = model.sums
+    values[:, which] = np.einsum("nql,nl->nq", spline(log_k), linear)
+    for q in np.flatnonzero(~which):
+        one, ratio = model.derived[q], model.splines[q]
+        values[:, q] = np.exp(log_k)
+        if ratio is not None:
             positive = linear[:, 0] > 0.0
             over = np.divide(linear[:, 1], linear[:, 0], out=np.full(log_k.size, np.nan), where=positive)
-            columns.append(one.offset + spline(log_k) * over)
-    return np.column_stack(columns)
+            values[:, q] = one.offset + ratio(log_k) * over
+    return values
 
 
 def _between(grid: Float, fluxes: Float, low: float, high: float) -> Float:

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
+#: Number of parabolas through three temperatures that refine the best node, and the factor by which they narrow.
+REFINEMENTS, NARROWER = 3, 8.0
+#: The search for the best temperature starts from every `COARSE`-th node of the model.
+COARSE = 4
 #: Amplitudes below minus this many standard errors are negative; smaller deviations are due to rounding.
 ROUNDING = 1e-9
 
@@ -153,6 +157,31 @@ class BoundedProfile(Profile):
     def gain_at_nodes(self, every: int = 1) -> Float:
         """Return `gain` at each `every`-th temperature of the model, shape (n, n_node)."""
         return self.gain(self.nodes[None, ::every])
+
+    def best(self, at_nodes: Float | None = None) -> BestFit:
+        """Return the best fit of each frame."""
+        every = COARSE if at_nodes is None else 1
+        at_nodes = self.gain_at_nodes(every) if at_nodes is None else at_nodes
+        low, high = self.nodes[0], self.nodes[-1]
+        step = every * float(self.nodes[1] - self.nodes[0])
+        x = self.nodes[::every][np.argmax(at_nodes, axis=1)]
+        for _ in range(REFINEMENTS):
+            there = np.clip(x[:, None] + step * np.array([-1.0, 0.0, 1.0]), low, high)
+            g = self.gain(there)
+            # The vertex of the parabola through three points, or the best point if there is no maximum.
+            a, b = there[:, 0] - there[:, 1], there[:, 2] - there[:, 1]
+            left, right = g[:, 0] - g[:, 1], g[:, 2] - g[:, 1]
+            under = right * a - left * b
+            over = right * a**2 - left * b**2
+            inside = np.abs(under) > 1e-300
+            vertex = there[:, 1] + np.divide(over, 2 * under, out=np.zeros_like(over), where=inside)
+            three = there[np.arange(x.size), np.argmax(g, axis=1)]
+            good = inside & (vertex >= there[:, 0]) & (vertex <= there[:, 2])
+            vertex = np.where(good, vertex, three)
+            reached = self.gain(vertex)
+            x = np.where(reached >= g.max(axis=1), vertex, three)
+            step /= NARROWER
+        return self.solution(x)
 
     def solution(self, log_k: Float) -> BestFit:
         """Return the best fits at temperatures (n,)."""

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-
-from mauvecl.results.measurements.flare_model import derived_values
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
@@ -25,14 +25,17 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Number of parabolas through three temperatures that refine the best node, and the factor by which they narrow.
-REFINEMENTS, NARROWER = 3, 8.0
-#: The search for the best temperature starts from every `COARSE`-th node of the model.
-COARSE = 4
 #: Steps of the search for the end of an interval.
 STEPS = 12
 #: Temperatures within an interval at which derived quantities are computed.
 SAMPLES = 33
+#: Second over first order of a quantity's change within the standard error of the temperature, above which Wilks'
+#: thresholds are scaled: where it is 0.1, 95 % intervals with the thresholds as they are cover up to 96 %.
+CURVED = 0.03
+#: Number of scalings of a threshold, draws of half of the noise, and ends that are simulated at once.
+CORRECTIONS, DRAWS, ENDS_AT_ONCE = 2, 64, 32
+#: Number of temperatures that simulated fits try, and their reach in standard errors.
+TRIED, REACH = 33, 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,26 +59,11 @@ class Profile:
 
     def __init__(self, reduction: MeanSums, sums: Float) -> None:
         self.reduction, self.sums = reduction, sums
-        basis, self._inverse = reduction.basis
-        self.along = sums @ basis.T
-        self.rest = sums - self.along @ basis
-        self._basis = basis
+        self._basis, self._inverse = reduction.basis
+        self.along = sums @ self._basis.T
+        self.rest = sums - self.along @ self._basis
         self.nodes = reduction.log_k
-        self.hot_nodes = reduction.hot - (reduction.hot @ basis.T) @ basis
-        self._lengths = np.linalg.norm(self.hot_nodes, axis=1)
-        self._coefficients = np.ascontiguousarray(np.moveaxis(reduction.spline.c, 0, 1))
-
-    def hot(self, log_k: Float) -> Float:
-        """Return the mean sums of a blackbody of amplitude 1, shape (*log_k.shape, n_sum)."""
-        step = self.nodes[1] - self.nodes[0]
-        # Next to a node of an uneven grid the neighbouring cubic is as good.
-        interval = np.clip(((log_k - self.nodes[0]) / step).astype(np.int64), 0, self.nodes.size - 2)
-        offset = (log_k - self.nodes[interval])[..., None]
-        c = self._coefficients
-        cubic = c[interval, 0]
-        for power in (1, 2, 3):
-            cubic = cubic * offset + c[interval, power]
-        return np.asarray(cubic)
+        self.hot = reduction.spline
 
     def parts(self, log_k: Float) -> tuple[Float, Float, Float]:
         """Return the blackbody's amplitude without bounds, its variance, and its sums, at temperatures (n, ...)."""
@@ -92,9 +80,9 @@ class Profile:
         base = np.einsum("nk,nk->n", self.along, self.along).reshape((-1,) + (1,) * (log_k.ndim - 1))
         return np.asarray(base + np.maximum(amplitude, 0.0) ** 2 / variance)
 
-    def gain_at_nodes(self, every: int = 1) -> Float:
-        """Return `gain` at each `every`-th temperature of the model, shape (n, n_node)."""
-        product = self.rest @ (self.hot_nodes[::every] / self._lengths[::every, None]).T
+    def gain_at_nodes(self) -> Float:
+        """Return `gain` at the temperatures of the model, shape (n, n_node)."""
+        product = self.rest @ self.reduction.directions[0].T
         return np.asarray(np.maximum(product, 0.0) ** 2 + np.einsum("nk,nk->n", self.along, self.along)[:, None])
 
     def linear(self, log_k: Float, amplitude: Float, hot: Float) -> Float:
@@ -106,29 +94,22 @@ class Profile:
         return np.concatenate([amplitude[..., None], others], axis=-1)
 
     def best(self, at_nodes: Float | None = None) -> BestFit:
-        """Return the best fit of each frame."""
-        every = COARSE if at_nodes is None else 1
-        at_nodes = self.gain_at_nodes(every) if at_nodes is None else at_nodes
-        low, high = self.nodes[0], self.nodes[-1]
-        step = every * float(self.nodes[1] - self.nodes[0])
-        x = self.nodes[::every][np.argmax(at_nodes, axis=1)]
-        for _ in range(REFINEMENTS):
-            there = np.clip(x[:, None] + step * np.array([-1.0, 0.0, 1.0]), low, high)
-            g = self.gain(there)
-            # The vertex of the parabola through three points, or the best point if there is no maximum.
-            a, b = there[:, 0] - there[:, 1], there[:, 2] - there[:, 1]
-            left, right = g[:, 0] - g[:, 1], g[:, 2] - g[:, 1]
-            under = right * a - left * b
-            over = right * a**2 - left * b**2
-            inside = np.abs(under) > 1e-300
-            vertex = there[:, 1] + np.divide(over, 2 * under, out=np.zeros_like(over), where=inside)
-            three = there[np.arange(x.size), np.argmax(g, axis=1)]
-            good = inside & (vertex >= there[:, 0]) & (vertex <= there[:, 2])
-            vertex = np.where(good, vertex, three)
-            reached = self.gain(vertex)
-            x = np.where(reached >= g.max(axis=1), vertex, three)
-            step /= NARROWER
-        return self.solution(x)
+        """Return the best fit of each frame.
+
+        The gain is the squared product of the sums with a unit vector, which is a cubic polynomial of the temperature
+        between two nodes, so that its maximum has a closed form.
+        """
+        units, cubics = self.reduction.directions
+        node = np.argmax(np.maximum(self.rest @ units.T, 0.0) if at_nodes is None else at_nodes, axis=1)
+        interval = np.minimum(node, self.nodes.size - 2)
+        falling = np.einsum("nk,nk->n", self.rest, cubics[interval, 2]) < 0.0
+        interval = np.where(falling, np.maximum(node - 1, 0), interval)
+        c = np.einsum("npk,nk->pn", cubics[interval], self.rest)
+        span = self.nodes[interval + 1] - self.nodes[interval]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            top = c[2] / (np.sqrt(c[1] ** 2 - 3 * c[0] * c[2]) - c[1])
+        # Otherwise the best node is an end of the model's temperatures, or no light is found.
+        return self.solution(np.where((top >= 0.0) & (top <= span), self.nodes[interval] + top, self.nodes[node]))
 
     def solution(self, log_k: Float) -> BestFit:
         """Return the best fits at temperatures (n,)."""
@@ -206,7 +187,7 @@ def intervals(
                 (np.where(np.isnan(low), -np.inf, np.exp(low)), np.where(np.isnan(high), np.inf, np.exp(high)))
             )
         elif one.ratio is None:
-            columns.append(_linear_interval(profile, spline, x, linear, variance, hot, left))
+            columns.append(_linear_interval(profile, spline, x, linear, variance, hot, left, allowed))
         else:
             columns.append(_ratio_interval(profile, spline(x), hot, best.gain - allowed))
     return np.column_stack([c[0] for c in columns]), np.column_stack([c[1] for c in columns])
@@ -222,7 +203,14 @@ def temperature_samples(profile: Profile, low: Float, high: Float) -> Float:
 
 
 def _linear_interval(
-    profile: Profile, spline: CubicSpline, x: Float, linear: Float, variance: Float, hot: Float, left: Float
+    profile: Profile,
+    spline: CubicSpline,
+    x: Float,
+    linear: Float,
+    variance: Float,
+    hot: Float,
+    left: Float,
+    allowed: float,
 ) -> tuple[Float, Float]:
     factors = spline(x)
     value = np.einsum("nsl,nsl->ns", factors, linear)
@@ -233,12 +221,99 @@ def _linear_interval(
         spread = slope**2 * variance + np.einsum("nsk,nsk->ns", others, others)
     else:
         spread = factors[..., 0] ** 2 * variance
-    reach = np.sqrt(np.maximum(left, 0.0) * spread)
     outside = left < 0.0
     outside[:, [0, -1]] = False  # rounding decides at the ends themselves
-    low = extreme(np.where(outside, np.inf, value - reach), np.minimum)
-    high = extreme(np.where(outside, -np.inf, value + reach), np.maximum)
-    return low, high
+    ends = [_hull(value, spread, left, outside, sign)[0] for sign in (-1.0, 1.0)]
+    bend = np.abs(value[:, 0] + value[:, -1] - 2 * value[:, SAMPLES // 2])
+    bent = np.flatnonzero(bend > CURVED * np.sqrt(allowed) * (ends[1] - ends[0]))
+    for end, sign in zip(ends, (-1.0, 1.0), strict=True) if bent.size else ():
+        each = value[bent], spread[bent]
+        room, error = left[bent], (x[bent, -1] - x[bent, 0]) / np.sqrt(4 * allowed)
+        for _ in range(CORRECTIONS):
+            end[bent], k = _hull(*each, room, room < 0.0, sign)
+            place = np.arange(bent.size), k
+            moved = sign * np.sqrt(np.maximum(room[place], 0.0))
+            rise = _expected_rise(profile, bent, spline, x[bent][place], moved, error)
+            room = left[bent] + allowed * (rise[:, None] - 1.0)
+        end[bent] = _hull(*each, room, room < 0.0, sign)[0]
+    return ends[0], ends[1]
+
+
+def _hull(
+    value: Float, spread: Float, left: Float, outside: NDArray[np.bool_], sign: float
+) -> tuple[Float, NDArray[np.intp]]:
+    """Return the lowest or highest value that samples (n, n_sample) allow, and the sample."""
+    reached = np.where(outside, sign * -np.inf, value + sign * np.sqrt(np.maximum(left, 0.0) * spread))
+    which = np.maximum if sign > 0 else np.minimum
+    return extreme(reached, which), np.argmax(sign * reached, axis=1)
+
+
+def _expected_rise(
+    profile: Profile, rows: NDArray[np.intp], spline: CubicSpline, x: Float, moved: Float, error: Float
+) -> Float:
+    """Return the mean of the likelihood ratio of a quantity at the best fits with the quantity held at an end, (n,).
+
+    With one degree of freedom it is 1, but another number where the quantity bends within the error of the temperature.
+    Fits are simulated with the same noise for all ends, of which the means and covariances are exact.
+
+    Parameters
+    ----------
+    profile : Profile
+    rows : ndarray, shape (n,)
+        Numbers of the frames.
+    spline : CubicSpline
+        Factors of the quantity.
+    x, moved : ndarray, shape (n,)
+        Log temperature at the end, and its distance from the best value there in standard errors.
+    error : ndarray, shape (n,)
+        Standard error of the log temperature.
+    """
+    reduction = profile.reduction
+    body, there = _directions(reduction, spline, x)
+    # The fitted sums at the end, with the quantity moved there.
+    amplitude = np.einsum("nk,nk->n", profile.rest[rows], body) / np.einsum("nk,nk->n", body, body)
+    mean = profile.along[rows] @ reduction.basis[0] + amplitude[:, None] * body
+    mean += (moved / np.linalg.norm(there, axis=1))[:, None] * there
+    held = np.einsum("nk,nk->n", mean, there)
+    # Noise along the changes of the mean sums, to second order of the temperature: other noise has little effect.
+    fixed = np.broadcast_to(reduction.fixed[:, None], (len(reduction.fixed), *there.shape))
+    changes = np.linalg.qr(np.dstack([there, reduction.spline(x, 1), *fixed, reduction.spline(x, 2)]))[0]
+    noise = _noise(changes.shape[2]) @ changes.transpose(0, 2, 1)
+    first, last = (np.clip(x + side * REACH * error, *profile.nodes[[0, -1]]) for side in (-1.0, 1.0))
+    grid = first[:, None] + (last - first)[:, None] * np.linspace(0.0, 1.0, TRIED)
+    rises = []
+    for start in range(0, rows.size, ENDS_AT_ONCE):
+        some = slice(start, start + ENDS_AT_ONCE)
+        sums = mean[some, None] + noise[some]
+        bodies, along = (each.transpose(0, 2, 1) for each in _directions(reduction, spline, grid[some]))
+        gain = np.maximum(sums @ bodies, 0.0) ** 2 / np.sum(bodies**2, axis=1)[:, None]
+        away = (held[some, None, None] - sums @ along) ** 2 / np.sum(along**2, axis=1)[:, None]
+        free, bound = (extreme(each.reshape(-1, TRIED), np.maximum) for each in (gain, gain - away))
+        rises.append(np.mean((free - bound).reshape(len(sums), -1), axis=1))
+    return np.concatenate(rises)
+
+
+def _directions(reduction: MeanSums, spline: CubicSpline, log_k: Float) -> tuple[Float, Float]:
+    """Return directions of sums at temperatures (...,), each of shape (..., n_sum).
+
+    Of the blackbody less its projections on the fixed components, and those whose product with the sums is the best
+    value of a quantity.
+    """
+    (basis, inverse), hot, factors = reduction.basis, reduction.spline(log_k), spline(log_k)
+    along = hot @ basis.T
+    body = hot - along @ basis
+    others = factors[..., 1:] @ inverse
+    slope = factors[..., 0] - np.einsum("...k,...k->...", others, along)
+    return body, (slope / np.einsum("...k,...k->...", body, body))[..., None] * body + others @ basis
+
+
+@cache
+def _noise(n: int) -> Float:
+    """Return normal noise in n dimensions, shape (n_draw, n), with odd moments of zero and unit covariance."""
+    even = scipy.stats.qmc.Sobol(n, rng=28).random(DRAWS)
+    half = scipy.special.ndtri(even)
+    half = half @ np.linalg.inv(np.linalg.cholesky(half.T @ half / DRAWS)).T
+    return np.concatenate([half, -half])
 
 
 def extreme(values: Float, which: Callable[..., Float]) -> Float:
@@ -294,7 +369,7 @@ def covariance(model: FlareModel, profile: Profile, best: BestFit) -> Float:
     jacobian = np.zeros((n, m + 1, hot.shape[1]))
     jacobian[:, 0], jacobian[:, 1:m] = hot, profile.reduction.fixed
     jacobian[:, m] = best.linear[:, :1] * slope
-    return covariance_of(model, best.log_k, best.linear, np.einsum("nik,njk->nij", jacobian, jacobian))
+    return covariance_of(model, best.log_k, best.linear, jacobian @ jacobian.transpose(0, 2, 1))
 
 
 def covariance_of(model: FlareModel, log_k: Float, linear: Float, information: Float) -> Float:
@@ -313,23 +388,23 @@ def covariance_of(model: FlareModel, log_k: Float, linear: Float, information: F
     inverse = np.linalg.inv(normal) / scale[:, :, None] / scale[:, None, :]
     inverse[~good] = np.nan
     gradient = gradient_of(model, log_k, linear)
-    return np.asarray(np.einsum("nqi,nij,nrj->nqr", gradient, inverse, gradient))
+    return np.asarray(gradient @ inverse @ gradient.transpose(0, 2, 1))
 
 
 def gradient_of(model: FlareModel, log_k: Float, linear: Float) -> Float:
     """Return derivatives with respect to amplitudes and log temperature, (n, n_derived, n_linear + 1)."""
     n, m = linear.shape
     gradient = np.zeros((n, len(model.derived), m + 1))
-    values = derived_values(model, log_k, linear)
-    for q, (one, spline) in enumerate(zip(model.derived, model.splines, strict=True)):
-        if spline is None:
+    which, spline = model.sums
+    gradient[:, which, :m] = spline(log_k)
+    gradient[:, which, m] = np.einsum("nql,nl->nq", spline(log_k, 1), linear)
+    for q in np.flatnonzero(~which):
+        ratio = model.splines[q]
+        if ratio is None:
             gradient[:, q, m] = np.exp(log_k)
-        elif one.ratio is None:
-            gradient[:, q, :m] = spline(log_k)
-            gradient[:, q, m] = np.einsum("nl,nl->n", spline(log_k, 1), linear)
-        else:
-            amplitude = np.where(linear[:, 0] > 0, linear[:, 0], np.nan)
-            gradient[:, q, 0] = (one.offset - values[:, q]) / amplitude
-            gradient[:, q, 1] = spline(log_k) / amplitude
-            gradient[:, q, m] = spline(log_k, 1) * linear[:, 1] / amplitude
+            continue
+        amplitude = np.where(linear[:, 0] > 0, linear[:, 0], np.nan)
+        gradient[:, q, 0] = -ratio(log_k) * linear[:, 1] / amplitude**2
+        gradient[:, q, 1] = ratio(log_k) / amplitude
+        gradient[:, q, m] = ratio(log_k, 1) * linear[:, 1] / amplitude
     return gradient

@@ -56,6 +56,17 @@ class MeanSums:
         return q.T, np.linalg.inv(r)
 
     @cached_property
+    def directions(self) -> tuple[Float, Float]:
+        """Unit vectors of blackbodies less their projections on the fixed components, and their cubics over log_k.
+
+        Shapes (n_node, n_sum) and, of the spline's coefficients, (n_node - 1, 4, n_sum).
+        """
+        basis, _ = self.basis
+        free = self.hot - (self.hot @ basis.T) @ basis
+        units = free / np.linalg.norm(free, axis=1)[:, None]
+        return units, np.moveaxis(scipy.interpolate.CubicSpline(self.log_k, units).c, 0, 1).copy()
+
+    @cached_property
     def spline(self) -> scipy.interpolate.CubicSpline:
         """Sums of the blackbody over log temperature."""
         return scipy.interpolate.CubicSpline(self.log_k, self.hot)

@@ -138,12 +138,12 @@ export class Compare {
         cell.append(element("strong", one.shown))
         return cell
       }))
-      row("", pinned.map(one => element("td", one.interval)))
+      row("Assumed", pinned.map(one => element("td", one.interval)))
       for (const [head, of] of ROWS) row(head, pinned.map(one => element("td", of(one.entered))))
       for (const [head] of pinned[0].facts) {
         row(head, pinned.map(one => element("td", Object.fromEntries(one.facts)[head] ?? "")))
       }
-      row("", pinned.map((one, k) => {
+      row("Actions", pinned.map((one, k) => {
         const cell = element("td")
         cell.append(...this.handles(one, `scenario ${k + 1}`))
         return cell

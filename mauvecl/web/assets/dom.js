@@ -1,5 +1,9 @@
 // @ts-check
-// Elements of the page: those that the template holds, and new ones.
+// Elements of the page: those that the template holds, and new ones; and keys that they share.
+
+/** Steps of the arrow keys.
+ * @type {Record<string, number>} */
+export const STEPS = {ArrowUp: 1, ArrowDown: -1}
 
 /** The element with this id; the template holds every one that is asked for.
  * @param {string} id

@@ -1,41 +1,14 @@
 // @ts-check
-// Fields of the page: entered text, valid or not, sliders, the list of stars, and files.
+// Fields of the page: entered text, valid or not, with their sliders and files.
 
-import {byId, every} from "./dom.js"
-import {Targets, knownColumns} from "./targets.js"
+import {STEPS, byId, every} from "./dom.js"
+import {Scale} from "./scale.js"
+import {Stars} from "./stars.js"
+import {Targets} from "./targets.js"
 
 /** @typedef {import("./protocol.js").Entered} Entered */
 /** @typedef {import("./protocol.js").Faults} Faults */
 /** @typedef {import("./protocol.js").Words} Words */
-
-/** Steps of the arrow keys.
- * @type {Record<string, number>} */
-const steps = {ArrowUp: 1, ArrowDown: -1}
-
-// Conversion between a slider's position and the value, with as many digits as needed.
-class Scale {
-  /** @param {Words["sliders"][string]} slider */
-  constructor({low, high, step, log}) {
-    this.low = low
-    this.high = high
-    this.step = step
-    this.log = log
-    this.count = Math.round(log ? Math.log(high / low) / Math.log(step) : (high - low) / step)
-  }
-
-  /** @param {number} place */
-  value(place) {
-    if (this.log) return String(Number((this.low * this.step ** place).toPrecision(2)))
-    const digits = Math.max(0, -Math.floor(Math.log10(this.step) + 1e-9))
-    return (this.low + place * this.step).toFixed(digits).replace(/\.?0+$/, digits ? "" : "$&")
-  }
-
-  /** @param {number} value */
-  place(value) {
-    const found = this.log ? Math.log(value / this.low) / Math.log(this.step) : (value - this.low) / this.step
-    return Math.min(Math.max(Math.round(found), 0), this.count)
-  }
-}
 
 export class Fields {
   /**
@@ -81,25 +54,6 @@ export class Fields {
         if (one) chosen(button.dataset.choose, one)
       })
     }
-    for (const button of every("[data-open-text]")) {
-      const [file] = every(`[data-text="${button.dataset.openText}"]`), field = byId(`f-${button.dataset.openText}`)
-      const put = (/** @type {string} */ text) => {
-        field.value = knownColumns(text, words.columns)
-        this.take(field.name, true)
-      }
-      button.addEventListener("click", () => file.click())
-      file.addEventListener("change", async () => {
-        const [one] = file.files
-        file.value = ""
-        if (one) put(await one.text())
-      })
-      field.addEventListener("paste", (/** @type {ClipboardEvent} */ event) => {
-        const text = event.clipboardData?.getData("text") ?? ""
-        if (field.value || !text.includes("\n")) return
-        event.preventDefault()
-        put(text)
-      })
-    }
     this.show()
   }
 
@@ -120,7 +74,7 @@ export class Fields {
     slider.addEventListener("input", () => move(false))
     slider.addEventListener("change", () => move(true))
     field.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => {
-      const step = steps[event.key]
+      const step = STEPS[event.key]
       const value = Number(field.value)
       if (!step || !(Math.abs(value) >= 0)) return
       event.preventDefault()
@@ -268,87 +222,5 @@ export class Fields {
         if (byId("advanced").contains(field)) byId("advanced").open = true
       } else field.removeAttribute("aria-invalid")
     }
-  }
-}
-
-// List below the field of stars with the names that contain the typed text.
-class Stars {
-  /**
-   * @param {HTMLInputElement} field
-   * @param {HTMLElement} list
-   * @param {string[]} names
-   * @param {() => void} chosen
-   */
-  constructor(field, list, names, chosen) {
-    this.field = field
-    this.list = list
-    this.names = names
-    this.chosen = chosen
-    this.at = -1
-    field.addEventListener("input", () => this.open(field.value))
-    field.addEventListener("focus", () => field.select())
-    field.addEventListener("click", () => { if (list.hidden) this.open("") })
-    field.addEventListener("blur", () => this.close())
-    field.addEventListener("keydown", event => this.key(event))
-    // Before the field loses the focus.
-    list.addEventListener("mousedown", event => {
-      event.preventDefault()
-      const item = /** @type {HTMLElement} */ (event.target)
-      if (item.role === "option") this.choose(item)
-    })
-  }
-
-  /** @param {string} text */
-  open(text) {
-    const wanted = text.trim().toLowerCase()
-    const found = this.names.filter(name => name.toLowerCase().includes(wanted))
-    this.list.replaceChildren(...found.map((name, k) => {
-      const item = document.createElement("li")
-      item.role = "option"
-      item.id = `star-${k}`
-      item.textContent = name
-      item.setAttribute("aria-selected", "false")
-      return item
-    }))
-    this.at = -1
-    // A complete name needs no list, which would cover the fields below.
-    this.show(found.length > 0 && !(found.length === 1 && found[0].toLowerCase() === wanted))
-  }
-
-  /** @param {boolean} open */
-  show(open) {
-    this.list.hidden = !open
-    this.field.setAttribute("aria-expanded", String(open))
-    if (!open) this.field.removeAttribute("aria-activedescendant")
-  }
-
-  close() { this.show(false) }
-
-  /** @param {KeyboardEvent} event */
-  key(event) {
-    const step = -steps[event.key]
-    if (step) {
-      event.preventDefault()
-      if (this.list.hidden) this.open("")
-      const items = this.list.children
-      items[this.at]?.setAttribute("aria-selected", "false")
-      this.at = (this.at + step + items.length) % items.length
-      const item = items[this.at]
-      item.setAttribute("aria-selected", "true")
-      item.scrollIntoView({block: "nearest"})
-      this.field.setAttribute("aria-activedescendant", item.id)
-    } else if (event.key === "Enter") {
-      event.preventDefault()
-      const item = this.list.hidden ? null : this.list.children[this.at]
-      if (item) this.choose(item)
-      else { this.close(); this.chosen() }
-    } else if (event.key === "Escape") this.close()
-  }
-
-  /** @param {Element} item */
-  choose(item) {
-    this.field.value = item.textContent
-    this.close()
-    this.chosen()
   }
 }

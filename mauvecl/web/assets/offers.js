@@ -7,9 +7,8 @@ import {byId, every} from "./dom.js"
  * @param {import("./protocol.js").Answer | null} answer
  * @param {boolean} busy
  * @param {import("./protocol.js").Entered} entered
- * @param {import("./protocol.js").Words} words
  */
-export function offer(answer, busy, entered, {tabs, needs}) {
+export function offer(answer, busy, entered) {
   const ready = answer !== null
   const simulated = new Set(answer?.simulated ?? [])
   byId("simulate").disabled = !ready || busy
@@ -17,17 +16,10 @@ export function offer(answer, busy, entered, {tabs, needs}) {
   byId("pin").disabled = !ready
   byId("study").disabled = !ready
   for (const button of every("[data-simulate]")) {
-    const need = needs[button.dataset.simulate]
-    const lacks = need !== undefined && !entered[need].trim()
+    const lacks = ["visible", "plan"].includes(button.dataset.simulate) && !entered.targets.trim()
     button.disabled = !ready || busy || lacks
   }
-  for (const [front, tab] of Object.entries(tabs)) {
-    for (const [name, after] of Object.entries(tab.files)) {
-      for (const button of every(`#panel-${front} [data-file="${name}"]`)) {
-        button.disabled = !ready || (after !== null && !simulated.has(after))
-      }
-    }
-  }
+  for (const button of every("[data-file]")) button.disabled = !answer?.files.includes(button.dataset.file)
   for (const hint of every("[data-needs]")) {
     const lacking = hint.dataset.needs.split(" ").filter((/** @type {string} */ kind) => !simulated.has(kind))
     const buttons = lacking.map((/** @type {string} */ kind) => document.querySelector(`[data-simulate="${kind}"]`) ?? byId("simulate"))

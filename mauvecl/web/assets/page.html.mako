@@ -55,14 +55,6 @@ ${upload("own_unknown", "Use a file of nm and DN", "File of the unknown spectrum
 <button type="button" class="plain" id="targets-open">Open a CSV table</button><input type="file" id="targets-file" accept=".csv,.ecsv,.txt" aria-label="CSV table of targets" tabindex="-1" hidden>
 <button type="button" class="plain" id="targets-clear" hidden>Remove all</button>
 <p class="wrong" id="w-targets" hidden></p><span class="hint">Type names or paste a list or table; what is known of a star stands in grey and can be overwritten.</span></div>
-% elif field.kind == "table":
-<textarea id="f-${name}" name="${name}" rows="3" spellcheck="false" placeholder="name,separation,magnitude,spectral_type" aria-describedby="w-${name}"></textarea>
-<div class="file"><button type="button" class="plain" data-open-text="${name}">Open a CSV table</button><input type="file" data-text="${name}" accept=".csv,.txt" aria-label="CSV table: ${field.label}" tabindex="-1" hidden></div>
-% elif field.kind == "file":
-<input id="f-${name}" name="${name}" type="hidden" value="">
-<div class="file"><button type="button" data-choose="${name}" aria-describedby="w-${name}">Choose a file</button>
-<input type="file" data-upload="${name}" aria-label="${field.label}" tabindex="-1" hidden><span class="hint">or drop it here, at most ${uploads[name].most // 2**20} MiB</span>
-<span data-uploaded="${name}"></span> <span data-remedies="${name}"></span> <button type="button" class="plain" data-remove="${name}" hidden>Remove</button></div>
 % elif field.kind == "day":
 <input id="f-${name}" name="${name}" type="date" value="${field.first}" aria-describedby="w-${name}">
 % elif hasattr(field.read, "options"):
@@ -166,7 +158,7 @@ ${control(name)}
 </details>
 <div class="row">
 <button type="button" id="pin">Pin</button>
-<button type="button" data-opens="export">Take along</button>
+<button type="button" data-opens="export">Share, export, cite</button>
 <button type="button" class="plain" id="afresh">Start afresh</button>
 </div>
 </form>
@@ -217,13 +209,11 @@ ${control(name)}
 <option value="${name}"></option>
 % endfor
 </datalist>
-% for form, names in fields.FORMS.items():
-<div class="form" id="${form}" data-form="${names[0]}" hidden>
-% for name in names:
+<div id="campaign" hidden>
+% for name in fields.CAMPAIGN:
 ${control(name)}
 % endfor
 </div>
-% endfor
 <div class="tabs">
 <div role="tablist" aria-label="Pictures of the answer">
 % for k, tab in enumerate(tabs.values()):
@@ -233,8 +223,7 @@ ${control(name)}
 % for k, tab in enumerate(tabs.values()):
 <div role="tabpanel" id="panel-${tab.name}" aria-labelledby="tab-${tab.name}"${"" if k == 0 else " hidden"}>
 <p class="about">${tab.about}</p>
-<% has_form = any(names[0] in tab.reads for names in fields.FORMS.values()) %>
-% if has_form:
+% if "targets" in tab.reads:
 ${actions(tab)}
 % endif
 % if any(p.pins for p in tab.pictures):
@@ -259,6 +248,9 @@ ${actions(tab)}
 % for ending in ("svg", "png", "pdf"):
 <button type="button" class="plain" data-save="${ending}">${ending.upper()}</button>
 % endfor
+% if picture.sets:
+<span>A click sets ${" and ".join("the " + fields.FIELDS[part.split("=")[0]].label.lower() for part in picture.sets.split(","))}.</span>
+% endif
 </div>
 <details class="data"><summary>Data as a table</summary><div class="wide" tabindex="0" role="region" aria-label="Data of ${picture.title}"></div></details>
 </figcaption>
@@ -272,7 +264,7 @@ ${actions(tab)}
 <ol id="history" reversed></ol>
 <p id="no-history">Nothing is simulated yet.</p>
 % else:
-% if not has_form:
+% if "targets" not in tab.reads:
 ${actions(tab)}
 % endif
 % if tab.pictures:
@@ -288,9 +280,6 @@ ${actions(tab)}
 <button type="button" data-file="${name}" data-ending="study" disabled>${name} (study)</button>
 % endif
 % endfor
-% for name in tab.documents:
-<button type="button" data-file="${name}" data-ending="" disabled>${name}</button>
-% endfor
 % if any(tab.files.values()):
 <span class="hint" data-needs="${" ".join(dict.fromkeys(filter(None, tab.files.values())))}"></span>
 % endif
@@ -304,7 +293,7 @@ ${actions(tab)}
 </main>
 <footer><p id="nominal">Nominal throughput, pieced together from the paper, datasheets and assumptions: not a flight calibration. Sensible uncertainty: 30 %, and 50 % below 250 nm.</p></footer>
 <dialog id="export" aria-labelledby="export-head">
-<h2 id="export-head">Take this question along</h2>
+<h2 id="export-head">Share, export, cite</h2>
 <p>What this tab shows after its simulation: the same numbers, to the bit, wherever mauvecl runs.</p>
 <p class="row"><label for="of">Answer of</label> <select id="of"></select></p>
 <div class="row"><button type="button" class="main" id="study">Study for the command line</button><button type="button" data-copy="address">Copy the link</button></div>

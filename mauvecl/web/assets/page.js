@@ -90,10 +90,9 @@ class Page {
     const {reads, headline} = this.tab
     this.fields.front(reads)
     byId("card").hidden = !headline
-    for (const form of every("[data-form]")) {
-      form.hidden = !reads.includes(form.dataset.form)
-      if (!form.hidden) byId(`panel-${this.routing.seen.tab}`).querySelector(".about").after(form)
-    }
+    const campaign = byId("campaign")
+    campaign.hidden = !reads.includes("targets")
+    if (!campaign.hidden) byId(`panel-${this.routing.seen.tab}`).querySelector(".about").after(campaign)
     if (this.simulations.running === null) this.simulations.place()
   }
 
@@ -269,7 +268,7 @@ class Page {
   // Actions that are available now.
   offer() {
     this.uploads.mention()
-    offer(this.answer, this.simulations.running !== null, this.fields.entered, words)
+    offer(this.answer, this.simulations.running !== null, this.fields.entered)
   }
 
   // The answer again, now with what was simulated.

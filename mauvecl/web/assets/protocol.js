@@ -18,7 +18,7 @@
  * The answer to a question, as the card shows it; notes are sentences with their kind.
  * @typedef {{numbers: {unknown: string, title: string, shown: string, interval: string}[], chosen: string,
  *   shown: string, interval: string, words: string, facts: [string, string][], notes: [string, string][],
- *   simulated: string[], headline: boolean}} Answer
+ *   simulated: string[], files: string[], headline: boolean}} Answer
  *
  * A message of the server: which entries it has depends on what was asked.
  * @typedef {{n: number, faults: Faults, stray: string, answer: Answer, refused: string, tab: string,
@@ -33,11 +33,10 @@
  * Texts and limits that the page is served with.
  * @typedef {{version: string, fields: Entered, seen: {tab: string, simulated: string}, stars: string[],
  *   example: string, asks: Record<string, string[]>,
- *   uploads: Record<string, {entered: string, options: string[], most: number}>, needs: Record<string, string>,
- *   columns: string[], under: Record<string, string>, presets: Record<string, Entered>,
+ *   uploads: Record<string, {entered: string, options: string[]}>, under: Record<string, string>, presets: Record<string, Entered>,
  *   sliders: Record<string, {low: number, high: number, step: number, log: boolean}>,
- *   tabs: Record<string, {pictures: PictureWords[], files: Record<string, string | null>, reads: string[], headline: boolean}>,
- *   pins: Record<string, [string, string][]>, unused: number}} Words
+ *   tabs: Record<string, {pictures: PictureWords[], reads: string[], headline: boolean}>,
+ *   pins: Record<string, [string, string][]>, most_uploaded: number, unused: number}} Words
  */
 
 const AGAIN_MS = 1000

@@ -155,7 +155,7 @@ class Trade(Picture):
         where = "half of them at " if half else "half of them still below "
         text = (
             f"At a false-alarm probability of {q.fap:g} {percent(closed.chance)} are detected; {where}"
-            f"{faps[min(half, faps.size - 1)]:.2g}. A click chooses another false-alarm probability."
+            f"{faps[min(half, faps.size - 1)]:.2g}."
         )
         return PictureData(text, sources)
 

@@ -170,7 +170,7 @@ class Curve(Picture):
                     sources["simulated"] = dict(zip(("x", "y"), np.array(points).T, strict=True))
                 value, low, high = map(words.value, (one.value.value, one.value.low, one.value.high))
                 text += f" Simulated: {100 * power:g} % are detected {words.before} {value} [{low} to {high}]."
-        return PictureData(text + " A click chooses a magnitude.", sources, {"power": {"location": power}})
+        return PictureData(text, sources, {"power": {"location": power}})
 
 
 class Map(Picture):
@@ -246,7 +246,7 @@ class Map(Picture):
             at_x, at_y = np.meshgrid(np.array(got.x, float), np.log10(100 * np.array(got.y, float)))
             sources["simulated"] = {"x": at_x.ravel(), "y": at_y.ravel(), "p": got.probability[0].ravel()}
             text += f" {at_x.size} cells are simulated."
-        return PictureData(text + " A click chooses magnitude and amplitude.", sources)
+        return PictureData(text, sources)
 
 
 def _image(x: Float, y: Float, p: Float) -> dict[str, Any]:

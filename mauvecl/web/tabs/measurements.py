@@ -33,7 +33,7 @@ RISE_95 = 5.99
 #: Factors on the amplitude at which errors are computed.
 FACTORS = np.geomspace(0.1, 10.0, 9)
 #: Half-widths before and after the peak of a flare in a stare that are shown.
-NEAR = 8.0
+NEAR = (2.0, 6.0)
 #: Largest number of simulated fits that are shown.
 MOST_DOTS = 500
 
@@ -84,7 +84,7 @@ class Errors(Picture):
         sources["own"] = {"x": [own], "y": [100 * known.ahead.errors[0] / known.ahead.values[0]]}
         text = (
             f"With everything known the temperature has a standard error of {_error(known)}, with dark level and star "
-            f"unknown one of {_error(free)}. A click chooses another amplitude."
+            f"unknown one of {_error(free)}."
         )
         return PictureData(text, sources)
 
@@ -110,18 +110,19 @@ class Region(Picture):
     def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         all_known, *_, free = expected(closed).values()
         sources: dict[str, Any] = {name: {"x": [], "y": []} for name in ("fits", "own")}
-        if not isinstance(all_known.fitted, FlareModel):
-            sources |= {name: {"x": [], "low": [], "high": []} for name in ("free", "known")}
-            return PictureData("The region is that of models of one temperature.", sources)
-        for name, one in (("known", all_known), ("free", free)):
-            kelvin, low, high = one.region(RISE_95)
-            sources[name] = {"x": kelvin, "low": 100 * low, "high": 100 * high}
         best = all_known.perfect.estimates[0]
         sources["own"] = {"x": [best[0]], "y": [100 * best[1]]}
         fits = simulated(answers)
         if fits is not None:
             some = fits.found.estimates[:MOST_DOTS]
             sources["fits"] = {"x": some[:, 0], "y": 100 * some[:, 1]}
+        if not isinstance(all_known.fitted, FlareModel):
+            sources |= {name: {"x": [], "low": [], "high": []} for name in ("free", "known")}
+            text = "The flare has two temperatures, of which this is the lower one: simulated fits show their region."
+            return PictureData(text, sources)
+        for name, one in (("known", all_known), ("free", free)):
+            kelvin, low, high = one.region(RISE_95)
+            sources[name] = {"x": kelvin, "low": 100 * low, "high": 100 * high}
         x = np.asarray(sources["free"]["x"])
         text = (
             f"With dark level and star unknown the 95 % region reaches from {short(x[0])} to {short(x[-1])} K: hotter "
@@ -153,7 +154,8 @@ class Course(Picture):
         (one,), words = stares, []
         if one.joint is not None:
             (event,), stare = one.events, one.staring.stare
-            near = np.abs(stare.middle_s - event.peak_s) < NEAR * event.half_width_s
+            since = (stare.middle_s - event.peak_s) / event.half_width_s
+            near = (since > -NEAR[0]) & (since < NEAR[1])
             for name, course in (("true", one.joint.true), ("joint", one.joint.fitted)):
                 sources[name] = {"x": stare.middle_s[near], "y": course.kelvin[near]}
             found = one.joint.found
@@ -177,15 +179,17 @@ class Measurement(Tab):
     """Measurement of the flare's spectrum."""
 
     verb = "measure"
-    # Fits along a flare have no pointing losses.
-    never = ("pointing_rate", "pointing_duration", "pointing_depth")
     about = (
         "What is measured of the flare once it is detected: its temperature, size and light, with errors in closed "
         "form; simulated fits count how often their intervals hold the truth."
     )
     pictures = (Errors(), Region(), Course())
     simulations = {"measure": "Simulate fits"}  # noqa: RUF012
-    files = {"measure": "measure", "fits": "measure"}  # noqa: RUF012
+    files = dict.fromkeys(("measure", "fits", "temperatures", "joint"), "measure")
+
+    def offers(self, name: str, answers: Answers) -> bool:
+        # Measurements along a stare are made on request.
+        return super().offers(name, answers) and name in answers["measure"].tables
 
     def shown(self, closed: ClosedForms, answers: Answers) -> View:
         each, fits = expected(closed), simulated(answers)
@@ -195,7 +199,7 @@ class Measurement(Tab):
             for name, unit, value, *errors in zip(
                 known.fitted.names,
                 known.fitted.units,
-                known.ahead.values,
+                known.truth,
                 *(one.ahead.errors for one in each.values()),
                 strict=True,
             )

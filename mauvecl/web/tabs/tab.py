@@ -128,8 +128,6 @@ class Tab(ABC):
     never: ClassVar[tuple[str, ...]] = ()
     #: Tables that can be taken along, with the simulation that each needs, or none.
     files: ClassVar[Mapping[str, str | None]] = {}
-    #: Documents of answers that can be taken along, by file name, with the simulation that each needs.
-    documents: ClassVar[Mapping[str, str]] = {}
 
     def __init_subclass__(cls, **words: Any) -> None:
         super().__init_subclass__(**words)
@@ -162,17 +160,15 @@ class Tab(ABC):
         }
         return frozenset(taken | set(self.also)) - set(self.never)
 
-    def given(self, question: Question) -> dict[str, Any]:
-        """Read the visitor's files, and return them as arguments of the verb: by default none.
-
-        Raises InputError with the name of the field whose file cannot be read. Called on a thread of its own.
-        """
-        return {}
-
     def words(self, question: Question) -> str:
         """Return what a tab without a headline is asked, in words."""
         star = "your own star" if question.uploaded is not None else star_words(question.star)
         return f"{star} of {question.band} = {question.magnitude:g}"
+
+    def offers(self, name: str, answers: Answers) -> bool:
+        """Return whether one of `files` can be taken along: by default, whether the answer it needs is simulated."""
+        needed = self.files[name]
+        return needed is None or needed in answers
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         """Return the table of one of `files`: by default that of the answer it needs."""

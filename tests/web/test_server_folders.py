@@ -1,0 +1,63 @@
+"""Folders of visitors end with their server, however it ends."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("bokeh")
+
+from tornado.httpclient import HTTPRequest
+from tornado.websocket import websocket_connect
+
+from mauvecl.web import folders
+
+pytestmark = pytest.mark.long
+
+
+def test_folders_end_with_their_server(tmp_path: Path) -> None:
+    """By Ctrl-C and SIGTERM at once; those of a killed server with the start of the next one."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    environment = os.environ | {"TMPDIR": str(tmp_path)}
+    command = [sys.executable, "-m", "mauvecl", "serve", "--port", str(port)]
+
+    def left(end: signal.Signals) -> int:
+        """Serve a visitor who stays, end the server by a signal, and return the number of folders that are left."""
+
+        async def visit() -> None:
+            asked = HTTPRequest(f"ws://127.0.0.1:{port}/live", headers={"Origin": f"http://127.0.0.1:{port}"})
+            connection = await websocket_connect(asked)
+            assert await connection.read_message() is not None
+            assert len(list(tmp_path.glob(f"{folders.PREFIX}*/*/"))) == 1
+            server.send_signal(end)
+            await asyncio.to_thread(server.wait, 60)
+
+        with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as server:
+            assert server.stdout is not None
+            assert "serves at" in server.stdout.readline()
+            asyncio.run(visit())
+        return len(list(tmp_path.glob(f"{folders.PREFIX}*")))
+
+    assert left(signal.SIGTERM) == 0
+    assert left(signal.SIGKILL) == 1, "nothing can clean up after this"
+    assert left(signal.SIGINT) == 0, "nor is the folder of the killed one left"
+
+
+def test_folder_of_a_running_server_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(folders.tempfile, "gettempdir", lambda: str(tmp_path))
+    for name in ("running", "killed"):
+        (tmp_path / f"{folders.PREFIX}{name}").mkdir()
+    with (tmp_path / f"{folders.PREFIX}running" / folders.LOCK).open("wb") as lock:
+        assert folders._locked(lock)
+        (tmp_path / f"{folders.PREFIX}killed" / folders.LOCK).touch()
+        folders.remove_abandoned()
+        assert [path.name for path in tmp_path.iterdir()] == [f"{folders.PREFIX}running"]
