@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -75,12 +76,21 @@ class Node:
     sky: float
     scores: dict[str, float]  # normal score of each factor
 
-    def on(self, x: Expectation) -> tuple[Float, Float]:
-        """Return the changes of an exposure's means (DN) and variances (DN^2), each shape (n_pixel,)."""
-        # Factors on all light include the sky's.
-        more = (self.light - 1.0) * x.recorded_light_dn + self.light * (self.sky - 1.0) * x.sky_dn
-        dark = (self.dark - 1.0) * x.n_frames
-        return more + dark * x.dark_dn, x.gain_dn_per_electron * more + dark * x.dark_variance_dn2
+    @property
+    def amounts(self) -> tuple[float, float, float]:
+        """Amounts of the changes of `changes_of`."""
+        return self.light - 1.0, self.light * (self.sky - 1.0), self.dark - 1.0
+
+
+def changes_of(x: Expectation) -> tuple[Float, Float]:
+    """Return what factors add to an exposure's means (DN) and variances (DN^2), each shape (3, n_pixel).
+
+    Rows are for all light, which includes the sky's, for the sky's alone, and for the dark current, each for an amount
+    of one.
+    """
+    means = np.array([x.recorded_light_dn, x.sky_dn, x.n_frames * x.dark_dn])
+    dark = x.n_frames * x.dark_variance_dn2
+    return means, np.array([*(x.gain_dn_per_electron * means[:2]), dark])
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +164,7 @@ class FactorDistributions:
         nodes = []
         for chosen in product(*grids):
             weights, (warm, lit, grey), scores = zip(*chosen, strict=True)
-            nodes.append(Node(float(np.prod(weights)), warm, lit, grey, dict(zip(moved, scores, strict=True))))
+            nodes.append(Node(math.prod(weights), warm, lit, grey, dict(zip(moved, scores, strict=True))))
         return nodes, np.array(rows).reshape(len(rows), light.size)
 
 

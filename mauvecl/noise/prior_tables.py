@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from mauvecl.noise.priors import Prior
 Float = NDArray[np.float64]
 
 
+@cache
 def nodes() -> Float:
     """Return the probabilities of the table's nodes from an end of a prior to its median.
 
@@ -25,7 +27,18 @@ def nodes() -> Float:
     cells = 2**layout.PRIOR_BITS
     number = np.arange(layout.PRIOR_NODES - 1)
     probability = np.ldexp(1.0 + (number % cells) / cells, number // cells - layout.PRIOR_FINEST)
-    return np.append(probability, probability[-1])
+    probability = np.append(probability, probability[-1])
+    probability.flags.writeable = False
+    return probability
+
+
+@lru_cache(32)
+def _quantiles(prior: Prior) -> tuple[Float, Float]:
+    """Return a prior's values at the nodes from the low end, then from the high end, and its median."""
+    tail = nodes()
+    values = np.append(prior.quantile(tail, 1.0 - tail), prior.quantile(1.0 - tail, tail))
+    values.flags.writeable = False
+    return values, prior.quantile(np.array([0.5]))
 
 
 def table_of(prior: Prior, change: Callable[[Float], Float]) -> tuple[NDArray[np.float32], float]:
@@ -45,7 +58,6 @@ def table_of(prior: Prior, change: Callable[[Float], Float]) -> tuple[NDArray[np
     centre : float
         Factor at the median, minus one.
     """
-    tail = nodes()
-    values = change(np.append(prior.quantile(tail, 1.0 - tail), prior.quantile(1.0 - tail, tail)))
-    centre = float(change(prior.quantile(np.array([0.5])))[0])
+    at_nodes, median = _quantiles(prior)
+    values, centre = change(at_nodes), float(change(median)[0])
     return ((values - centre) / (1.0 + centre)).astype(np.float32), centre

@@ -157,7 +157,20 @@ class Mixture:
 
     def sf(self, value: float) -> float:
         """Return the probability of exceeding `value`."""
-        return min(float(self.weights @ [part.sf(value) for part in self.parts]), 1.0)
+        normal = self._normal
+        if normal is None:
+            each = np.array([part.sf(value) for part in self.parts])
+        else:
+            mean, std = normal
+            each = special.ndtr((mean - value) / std)
+        return min(float(self.weights @ each), 1.0)
+
+    @cached_property
+    def _normal(self) -> NDArray[np.float64] | None:
+        """Means and standard deviations if all parts are normal, shape (2, n)."""
+        if not all(isinstance(part, Gaussian) for part in self.parts):
+            return None
+        return np.array([(part.mean, part.std) for part in self.parts]).T
 
     def isf(self, probability: float) -> float:
         """Return the value that is exceeded with a probability in (0, 1)."""

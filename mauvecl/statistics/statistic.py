@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
-from mauvecl.noise.factor_distributions import FactorDistributions
+from mauvecl.noise.factor_distributions import FactorDistributions, changes_of
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.distributions import Form, Gaussian, Mixture, QuadraticForm
 from mauvecl.statistics.nuisances import Nuisances, join_names
@@ -179,12 +179,27 @@ class Statistic(ABC):
         others = setting.nuisances.without(tuple(setting.drawn.spreads))
         if priors:
             rows = np.vstack([rows, others.finite(others.spectra)])
-        parts = []
-        for node in nodes:
-            shift, more = node.on(observed)
-            moved = Differences(seen.mean + shift * setting.used, seen.variance + more, scatter=rows)
-            parts.append(self.form(setting, moved, flare))
+        means, variances = changes_of(observed)
+        amounts = np.array([node.amounts for node in nodes])
+        moved = Differences(seen.mean, seen.variance, scatter=rows)
+        parts = self.moved_forms(setting, moved, amounts, means * setting.used, variances, flare)
         return parts[0] if len(parts) == 1 else Mixture(tuple(parts), np.array([node.probability for node in nodes]))
+
+    def moved_forms(
+        self,
+        setting: Setting,
+        seen: Differences,
+        amounts: Float,
+        means: Float,
+        variances: Float,
+        flare: Expectation | None,
+    ) -> Sequence[QuadraticForm | Gaussian]:
+        """Return `form` for several amounts of changes of the means and variances.
+
+        `amounts` has the shape (n, k), `means` and `variances` the shape (k, n_pixel).
+        """
+        moved = ((seen.mean + each @ means, seen.variance + each @ variances) for each in amounts)
+        return [self.form(setting, Differences(*one, scatter=seen.scatter), flare) for one in moved]
 
     @abstractmethod
     def dof(self, setting: Setting) -> int:
@@ -251,15 +266,32 @@ class LinearStatistic(Statistic):
         return 1
 
     def form(self, setting: Setting, seen: Differences, flare: Expectation | None = None) -> Gaussian:
+        none = np.zeros((0, seen.mean.size))
+        (found,) = self.moved_forms(setting, seen, np.zeros((1, 0)), none, none, flare)
+        return found
+
+    def moved_forms(
+        self,
+        setting: Setting,
+        seen: Differences,
+        amounts: Float,
+        means: Float,
+        variances: Float,
+        flare: Expectation | None,
+    ) -> Sequence[Gaussian]:
+        # The sums over pixels are linear in the amounts.
         weights, scatter = self.weights_per_dn(setting, flare), seen.scatter
-        mean, variance = float(weights @ seen.mean), float(weights**2 @ seen.variance)
+        mean = weights @ seen.mean + amounts @ (means @ weights)
+        variance = weights**2 @ seen.variance + amounts @ (variances @ weights**2)
         if scatter is None and setting.nuisances:
             scatter = setting.nuisances.finite(setting.nuisances.spectra)
         if scatter is not None:
-            variance += float(np.sum((scatter @ weights) ** 2))
-        spread = float(np.sqrt(variance))
-        # With estimated variances a linear statistic is in units of its standard deviation.
-        return Gaussian(mean / spread, 1.0) if seen.estimated else Gaussian(mean, spread)
+            variance += np.sum((scatter @ weights) ** 2)
+        spread = np.sqrt(variance)
+        if seen.estimated:
+            # In units of its standard deviation.
+            mean, spread = mean / spread, np.ones(mean.size)
+        return [Gaussian(*one) for one in zip(mean.tolist(), spread.tolist(), strict=True)]
 
     def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
         weights = self.weights_per_dn(setting, flare)

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 
+#: Sections of a study on which no expectation depends.
+WITHOUT_LIGHT = frozenset({"nuisances"})
 #: Number of stars whose spectra a study's cases keep, since a sweep may have any number of them.
 MAX_SOURCES = 16
 
@@ -193,7 +195,10 @@ class Case:
 
     def with_sections(self, **sections: Any) -> Self:
         """Return the case with other sections of the study, such as ``flare``."""
-        return replace(self, study=self.study.model_copy(update=sections))
+        case = replace(self, study=self.study.model_copy(update=sections))
+        if sections.keys() <= WITHOUT_LIGHT:
+            vars(case).update({name: vars(self)[name] for name in ("quiet", "flares") if name in vars(self)})
+        return case
 
     def at_observed_brightness(self) -> Self:
         """Return the case with the amplitude at which the flare has the flux of its file at the telescope."""

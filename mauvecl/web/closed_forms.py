@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,10 +98,10 @@ class ClosedForms:
         if question.items() <= self.question.values.items():
             return self
         study = self.study
-        case = self.case.with_sections(
-            nuisances=study.nuisances.model_copy(update={"usual": unknown == UNKNOWN[1]}),
-            observation=study.observation.model_copy(update={"instrument": question["instrument"]}),
-        )
+        sections: dict[str, Any] = {"nuisances": study.nuisances.model_copy(update={"usual": unknown == UNKNOWN[1]})}
+        if question["instrument"] != self.question.instrument:
+            sections["observation"] = study.observation.model_copy(update={"instrument": question["instrument"]})
+        case = self.case.with_sections(**sections)
         return ClosedForms(replace(self.question, values={**self.question.values, **question}), case)
 
     @cached_property

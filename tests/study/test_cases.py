@@ -11,6 +11,7 @@ from mauvecl.host.expectation import expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.study.cases import Case, cases
+from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
@@ -133,3 +134,19 @@ def test_documented_unknowns_follow_the_swept_detector_temperature() -> None:
         prior = case.draw_options["processes"].detector_temperature
         low, high = prior.quantile(np.array([0.0, 1.0]))
         assert low < case.at["detector_temperature"] < high
+
+
+def test_expectations_do_not_depend_on_what_is_unknown() -> None:
+    """They are computed once for both choices; another payload has others."""
+    case = Case(Study.build({"star": [{"library": "G2V", "magnitude": 8.0}], "flare": {"amplitudes": [0.02]}}, "test"))
+    usual = NuisanceChoice(usual=True)
+    other = case.with_sections(nuisances=usual)
+    before = case.expectations
+    assert case.with_sections(nuisances=usual).expectations == before
+    for kept, anew in zip(before, other.expectations, strict=True):
+        assert kept is not anew
+        np.testing.assert_array_equal(kept.source_electrons, anew.source_electrons)
+        np.testing.assert_array_equal(kept.variance_dn2, anew.variance_dn2)
+    payload = case.study.observation.model_copy(update={"instrument": "mauve-electrons"})
+    changed = case.with_sections(nuisances=usual, observation=payload)
+    assert (changed.quiet.variance_dn2 != case.quiet.variance_dn2).all()
