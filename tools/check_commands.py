@@ -73,6 +73,7 @@ def random_link(generator: np.random.Generator) -> str:
     if entered["balmer_jump"]:
         # A flare's spectrum has one of them.
         entered["second_temperature_k"] = ""
+    entered["shortest_d"], entered["longest_d"] = sorted((entered["shortest_d"], entered["longest_d"]), key=float)
     if STATISTICS[entered["statistic"]].paired or entered["statistic"] == "paper":
         entered |= {"unknown": "nothing", "own_unknown": ""}
     return "?" + urlencode(entered)
