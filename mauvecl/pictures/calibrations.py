@@ -50,13 +50,8 @@ def calibration_residuals(plt: Any, answer: CalibrateAnswer) -> Any:
     f = answer.throughput
     figure, axes = plt.subplots(len(f.residual), 1, figsize=(5.2, 1.0 + 1.1 * len(f.residual)), sharex=True,
                                 sharey=True, squeeze=False)  # fmt: skip
-    n = f.wavelength_nm.size // BIN
-    nm = f.wavelength_nm[: n * BIN].reshape(n, BIN).mean(axis=1)
-    for axis, one, residual in zip(axes[:, 0], answer.stars, f.residual, strict=True):
-        part = residual[: n * BIN].reshape(n, BIN)
-        count = np.isfinite(part).sum(axis=1)
-        sums = np.nansum(part, axis=1)
-        binned = np.divide(sums, np.sqrt(count), out=np.full(n, np.nan), where=count > 0)
+    nm, each = f.binned_residuals(BIN)
+    for axis, one, binned in zip(axes[:, 0], answer.stars, each, strict=True):
         axis.axhspan(-2, 2, color=NULL, alpha=0.2, linewidth=0)
         axis.plot(nm, binned, ".", color=COLOURS[0], markersize=4)
         axis.set_title(one.name)

@@ -24,17 +24,17 @@ AROUND_NM = 15.0
 @styled_picture
 def change_against_magnitude(plt: Any, answer: ChangeAnswer) -> Any:
     """Plot the smallest detectable changes against the magnitude of the star, one panel for each unit."""
-    units = list(dict.fromkeys(row.change.unit for _, row in answer.along))
+    units = list(dict.fromkeys(row.change.unit for row in answer.along))
     figure, axes = plt.subplots(1, len(units), figsize=(1.0 + 3.3 * len(units), 3.6), squeeze=False)
     titles = First(list(dict.fromkeys(row.title for row in answer.changes)), 1, "stars")
     (title,) = titles
     for axis, unit in zip(axes[0], units, strict=True):
-        names = list(dict.fromkeys(row.change.name for _, row in answer.along if row.change.unit == unit))
+        names = list(dict.fromkeys(row.change.name for row in answer.along if row.change.unit == unit))
         for colour, name in zip(cycle(COLOURS), names, strict=False):
-            own = [one for one in answer.along if one[1].change.name == name]
+            own = [one for one in answer.along if one.change.name == name]
             own = own[: len(own) // answer.many]
-            x = np.array([magnitude for magnitude, _ in own])
-            y = np.array([row.smallest.one for _, row in own]) * (1 if unit else 100)
+            x = np.array([row.magnitude for row in own])
+            y = np.array([row.smallest.one for row in own]) * (1 if unit else 100)
             axis.plot(x[np.isfinite(y)], y[np.isfinite(y)], color=colour, label=name)
         magnitude = answer.study.star[0].magnitude
         if magnitude is not None:

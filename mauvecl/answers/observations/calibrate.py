@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import io
+import tempfile
+import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
+from mauvecl.answers.files import ecsv_text
 from mauvecl.host.expectation import expect
+from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.instrument.paths import shipped_names
 from mauvecl.host.instrument.throughput_errors import CALIBRATED, MODE, ThroughputErrors
 from mauvecl.observations.calibration.dark import DarkFit, assumed_dark, fit_dark
@@ -36,7 +41,7 @@ if TYPE_CHECKING:
 
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
-    from mauvecl.host.instrument.instrument import Instrument
+    from mauvecl.host.stars.source import Source
     from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use
     from mauvecl.study.study import Study
@@ -159,28 +164,19 @@ class CalibrateAnswer(Answer):
         d, t, f, n = self.dark, self.transfer, self.throughput, self.nominal
         level = float(np.mean(d.level_dn_per_s))
         at = float(n.dark_scale_dn_per_s * np.exp(n.dark_slope_per_c * d.reference_c))
+        assumed = (*d.assumed, *t.assumed)
         rows = [
-            ("dark current", level, float(np.sqrt(d.shared[1, 1])), at, "DN / s", "dark current" not in d.assumed),
-            (
-                "dark slope",
-                d.slope_per_c,
-                d.slope_error,
-                n.dark_slope_per_c,
-                "1 / deg_C",
-                "dark slope" not in d.assumed,
-            ),
-            ("bias", float(d.bias_dn.mean()), float(d.bias_error.mean()), n.bias_dn, "DN", "bias" not in d.assumed),
-            ("gain", t.noise.gain, t.gain_error, n.gain_dn_per_electron, "DN / electron", "gain" not in t.assumed),
-            ("read noise", t.read_noise_dn, t.read_noise_error, n.read_noise_dn, "DN", "read noise" not in t.assumed),
-        ]
-        for name, found, usual, unit in (
-            ("wavelength shift", f.shift_nm, 0.0, "nm"),
-            ("wavelength stretch", f.stretch_nm, 0.0, "nm"),
-            ("line width", f.fwhm_nm, n.gaussian_fwhm_nm, "nm"),
-            ("line width, change to the red", f.fwhm_change_nm, 0.0, "nm"),
-        ):
-            known = found is not None
-            rows.append((name, found.value if found else usual, found.error if found else np.nan, usual, unit, known))
+            ("dark current", level, float(np.sqrt(d.shared[1, 1])), at, "DN / s", "dark current" not in assumed),
+            ("dark slope", d.slope_per_c, d.slope_error, n.dark_slope_per_c, "1 / deg_C", "dark slope" not in assumed),
+            ("bias", float(d.bias_dn.mean()), float(d.bias_error.mean()), n.bias_dn, "DN", "bias" not in assumed),
+            ("gain", t.noise.gain, t.gain_error, n.gain_dn_per_electron, "DN / electron", "gain" not in assumed),
+            ("read noise", t.read_noise_dn, t.read_noise_error, n.read_noise_dn, "DN", "read noise" not in assumed),
+            *((name, found.value if found else usual, found.error if found else np.nan, usual, "nm", found is not None)
+              for name, found, usual in (
+                  ("wavelength shift", f.shift_nm, 0.0), ("wavelength stretch", f.stretch_nm, 0.0),
+                  ("line width", f.fwhm_nm, n.gaussian_fwhm_nm),
+                  ("line width, change to the red", f.fwhm_change_nm, 0.0))),
+        ]  # fmt: skip
         return [Fitted(name, value, error if known else float("nan"), usual, unit, known)
                 for name, value, error, usual, unit, known in rows]  # fmt: skip
 
@@ -306,26 +302,10 @@ class CalibrateAnswer(Answer):
 
     @cached_property
     def instrument(self) -> Instrument:
-        """The fitted instrument."""
-        from mauvecl.host.instrument.curve import Curve
-        from mauvecl.host.instrument.pixel_map import PixelMap
-
-        changes: dict[str, Any] = dict(self.changes)
-        tables = self.instrument_tables
-        factor, errors, pixels = tables["throughput-factor"], tables["throughput-errors"], tables["pixel-map"]
-        changes["throughput_factor"] = Curve(
-            tuple(factor["wavelength"].to_value("nm").tolist()),
-            tuple(np.asarray(factor["factor"]).tolist()),
-            f"C: {self.source}",
-        )
-        modes = np.array([errors[name] for name in errors.colnames[1:]])
-        changes["throughput_errors"] = ThroughputErrors(
-            errors["wavelength"].to_value("nm"), modes, f"C: {self.source}", errors.meta["values"]
-        )
-        columns = {name: np.asarray(pixels[name].value if hasattr(pixels[name], "value") else pixels[name])
-                   for name in pixels.colnames[1:]}  # fmt: skip
-        changes["pixel_map"] = PixelMap(**columns, source=f"C: {self.source}")
-        return self.nominal.with_(name=self.name, notice=self.notice, **changes)
+        """The fitted instrument, as its file has it."""
+        with tempfile.TemporaryDirectory() as folder:
+            zipfile.ZipFile(io.BytesIO(self.instrument_zip())).extractall(folder)
+            return Instrument.load(Path(folder) / "instrument.toml")
 
     @property
     def name(self) -> str:
@@ -479,8 +459,17 @@ class CalibrateAnswer(Answer):
 
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:
-        """The instrument file, in addition to those of every answer."""
-        return super().documents | {"instrument.toml": self.instrument_toml}
+        """The instrument file, alone and with the tables that it names, in addition to those of every answer."""
+        return super().documents | {"instrument.toml": self.instrument_toml, "instrument.zip": self.instrument_zip}
+
+    def instrument_zip(self) -> bytes:
+        """Return an archive of the instrument file and of the tables that it names."""
+        out = io.BytesIO()
+        with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("instrument.toml", self.instrument_toml())
+            for name, table in self.instrument_tables.items():
+                archive.writestr(f"{name}.ecsv", ecsv_text(table))
+        return out.getvalue()
 
 
 @validated
@@ -490,6 +479,7 @@ def calibrate(
     progress: Callable[[int, int], None] | None = None,
     *,
     frames: tuple[Frames, ...] | None = None,
+    stars: tuple[Source | None, ...] | None = None,
 ) -> CalibrateAnswer:
     """Fit an instrument to raw frames of standard stars and to frames without light.
 
@@ -501,6 +491,8 @@ def calibrate(
         Not used: nothing is drawn on a device.
     frames : tuple of Frames, optional
         Frames in memory, in place of the files of the observations, in their order.
+    stars : tuple of Source or None, optional
+        Spectra in memory, in place of those of the observations; None for frames without light.
 
     Raises
     ------
@@ -511,20 +503,22 @@ def calibrate(
     if not any(one.library or one.spectrum for one in asked.observations):
         raise InputError("no observation of a standard star is given",
                          "calibrate.observations with library or spectrum", key="calibrate.observations")  # fmt: skip
-    if frames is not None and len(frames) != len(asked.observations):
-        raise InputError.of("frames", len(frames), f"{len(asked.observations)}, one for each observation")
+    for name, given in (("frames", frames), ("stars", stars)):
+        if given is not None and len(given) != len(asked.observations):
+            raise InputError.of(name, len(given), f"{len(asked.observations)}, one for each observation")
     nominal = study.observation.load_instrument()
     read = frames or tuple(read_frames(one.frames, one.mapping) for one in asked.observations)
+    sources = stars or tuple(one.source() for one in asked.observations)
     observations = tuple(
-        CalibrationFrames.of(given, nominal, one.source(), one.temperature_c)
-        for given, one in zip(read, asked.observations, strict=True)
+        CalibrationFrames.of(given, nominal, star, one.temperature_c)
+        for given, star, one in zip(read, sources, asked.observations, strict=True)
     )
     for k, one in enumerate(observations):
         if not one.usable(nominal).any():
             raise InputError.of("observations", one.name, "frames with a pixel below saturation")
         if any(np.array_equal(one.raw_dn, other.raw_dn) for other in observations[:k]):
             raise InputError.of("observations", one.name, "frames that no other observation has")
-    stars = [one for one in observations if one.star is not None]
+    lit = [one for one in observations if one.star is not None]
     without = [one for one in observations if one.star is None]
     dark = assumed_dark(nominal, nominal.wavelength_nm.size)
     if without:
@@ -535,7 +529,7 @@ def calibrate(
         error = float(np.sqrt(dark.shared[0, 0]))
         transfer = fit_photon_transfer(_variances(observations, dark, nominal), nominal, error)
     throughput = fit_throughput(
-        stars, nominal, dark, transfer, knots=asked.knots, sky=study.sky.sky(), order=study.observation.order,
+        lit, nominal, dark, transfer, knots=asked.knots, sky=study.sky.sky(), order=study.observation.order,
         light_error=asked.light_error, spectrum_error=asked.spectrum_error,
     )  # fmt: skip
     return CalibrateAnswer(study, nominal, observations, dark, transfer, throughput)

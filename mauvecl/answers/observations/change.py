@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,12 +50,15 @@ class ChangeRow(InCell):
         Standard error of one visit, with unknowns marginalised over and with everything known.
     smallest : Smallest
         In the unit of the change.
+    magnitude : float or None
+        Of the star.
     """
 
     change: Change
     error: float
     error_known: float
     smallest: Smallest
+    magnitude: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,12 +127,7 @@ INDEX_COLUMNS = (
            kind=str),
 )  # fmt: skip
 #: Columns of the changes against magnitude.
-MAGNITUDE_COLUMNS = (
-    Column("magnitude", "magnitude", "mag", "of the star in its band"),
-    Column("change", "row.change.name", "", "what changes", kind=str),
-    Column("unit", "row.change.unit", "", "of the change; empty if relative", kind=str),
-    Column("smallest", "row.smallest.one", "", "smallest detected difference of one visit from the others"),
-)
+MAGNITUDE_COLUMNS = (Column("magnitude", "magnitude", "mag", "of the star in its band"), *COLUMNS[:2], COLUMNS[4])
 #: Columns of the recovered periods.
 PERIOD_COLUMNS = (
     Column("change", "change.name", "", "what varies", "change", kind=str),
@@ -157,7 +155,7 @@ class ChangeAnswer(Answer):
     changes : list of ChangeRow
         Every change of every star in every cell of the sweep.
     indices : list of IndexRow
-    along : list of (float, ChangeRow)
+    along : list of ChangeRow
         Changes of stars at other magnitudes.
     periods : list of PeriodRow
         Empty unless the study asks for them.
@@ -170,7 +168,7 @@ class ChangeAnswer(Answer):
     study: Study
     changes: list[ChangeRow]
     indices: list[IndexRow]
-    along: list[tuple[float, ChangeRow]]
+    along: list[ChangeRow]
     periods: list[PeriodRow]
     expectations: list[Expectation]
 
@@ -202,10 +200,8 @@ class ChangeAnswer(Answer):
     @cached_property
     def magnitude_table(self) -> QTable:
         """One row per star, cell, change and magnitude."""
-        place = (column.of(lambda row: row["row"]) for column in self._place if column.name != "magnitude")
-        rows = [{"magnitude": magnitude, "row": row} for magnitude, row in self.along]
-        columns = (replace(one, get=_inner(str(one.get))) for one in MAGNITUDE_COLUMNS)
-        return table_of((*place, *columns), rows)
+        place = (column for column in self._place if column.name != "magnitude")
+        return table_of((*place, *MAGNITUDE_COLUMNS), self.along)
 
     @cached_property
     def period_table(self) -> QTable:
@@ -259,19 +255,6 @@ class ChangeAnswer(Answer):
         return self.expectations
 
 
-def _inner(path: str) -> Callable[[dict[str, Any]], Any]:
-    """Return a function that follows a path of keys and attributes."""
-    first, *rest = path.split(".")
-
-    def get(row: dict[str, Any]) -> Any:
-        value = row[first]
-        for name in rest:
-            value = getattr(value, name)
-        return value
-
-    return get
-
-
 @validated
 def change(
     study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
@@ -305,7 +288,7 @@ def change(
     file = None if asked.file is None else Source.read(asked.file)
     prepared = cases(study)
     times = _visits(study) if asked.periods else None
-    rows, indices, along, periods = [], [], list[tuple[float, ChangeRow]](), []
+    rows, indices, along, periods = [], [], list[ChangeRow](), []
     for done, case in enumerate(prepared, 1):
         own = _changes(case, file)
         rows += own
@@ -313,8 +296,7 @@ def change(
         magnitude = case.star.magnitude
         if magnitude is not None:
             for step in MAGNITUDES:
-                moved = case.with_value("magnitude", float(magnitude + step))
-                along += [(float(magnitude + step), row) for row in _changes(moved, file)]
+                along += _changes(case.with_value("magnitude", float(magnitude + step)), file)
         if times is not None:
             recovery = recover_periods(
                 times, np.geomspace(asked.shortest_d, asked.longest_d, asked.steps),
@@ -336,7 +318,7 @@ def _changes(case: Case, file: Source | None) -> list[ChangeRow]:
         one = Change.named(name, case.source, quiet, case.instrument, study.observation.order, file, study.change.band)
         error, known = error_of_change(one.counts_dn, quiet, unknown), error_of_change(one.counts_dn, quiet, None)
         smallest = Smallest(error * unit.one, error * unit.scatter)
-        rows.append(ChangeRow(case.label, case.at, one, error, known, smallest))
+        rows.append(ChangeRow(case.label, case.at, one, error, known, smallest, case.star.magnitude))
     return rows
 
 

@@ -117,6 +117,17 @@ class ThroughputFit:
         """Probability of a chi-squared at least as large."""
         return float(scipy.stats.chi2.sf(self.chi2, self.dof))
 
+    def binned_residuals(self, pixels: int) -> tuple[Float, Float]:
+        """Return middles of groups of pixels, nm, and the residuals of each star, in their standard deviations.
+
+        Residuals are NaN in groups of which no pixel is used.
+        """
+        n = self.wavelength_nm.size // pixels
+        nm = self.wavelength_nm[: n * pixels].reshape(n, pixels).mean(axis=1)
+        part = self.residual[:, : n * pixels].reshape(-1, n, pixels)
+        count = np.isfinite(part).sum(axis=2)
+        return nm, np.divide(np.nansum(part, axis=2), np.sqrt(count), out=np.full(count.shape, np.nan), where=count > 0)
+
 
 @dataclass(frozen=True, eq=False)
 class _Linearised:

@@ -38,7 +38,7 @@ class AgainstMagnitude(Picture):
         found, words, own = [], [], []
         for row in here:
             name, scale = row.change.name, self.units[row.change.unit]
-            along = np.array([(at, one.smallest.one) for at, one in answer.along if one.change.name == name])
+            along = np.array([(one.magnitude, one.smallest.one) for one in answer.along if one.change.name == name])
             x, y = along[np.isfinite(along[:, 1])].T
             found.append((x, scale * y))
             hidden = np.isinf(row.smallest.one)
