@@ -56,6 +56,7 @@ TEXTS: dict[str, tuple[str, ...]] = {
     "amplitude_percent": ("0.7", "2", "13"),
     "seed": ("1", "7", "123456789"),
     "joint_fit": ("no",),
+    "flare_file": ("",),
 }
 
 

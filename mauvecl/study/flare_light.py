@@ -84,20 +84,59 @@ class FlareLight(Section):
         Help("Factor on all line fluxes"),
         Quantity("line_scale", "factor of all line fluxes of the flare", "line fluxes"),
     ] = 1.0
-    file: Annotated[Path | None, Help("Spectrum file of an observed or computed flare"), Flag("--flare-file")] = None
+    file: Annotated[
+        Path | None,
+        Help("Spectrum file of an observed or computed flare"),
+        Flag("--flare-file"),
+        Widget(
+            label="Own flare spectrum",
+            hint="Spectrum of an observed or computed flare without its star, in place of a blackbody. The amplitude "
+            "scales it.",
+            group="Flare's spectrum",
+            name="flare_file",
+            place=2,
+            kind="file",
+        ),
+    ] = None
     quiescent: Annotated[
         Path | None,
         Help("Spectrum file of its star without the flare, which is subtracted"),
         Flag("--flare-quiescent"),
     ] = None
     wavelength_unit: Annotated[
-        str | None, Help("Unit of the wavelengths of the flare's files"), Flag("--flare-wavelength-unit")
+        str | None,
+        Help("Unit of the wavelengths of the flare's files"),
+        Flag("--flare-wavelength-unit"),
+        Widget(
+            label="Flare: unit of wavelengths",
+            hint="Such as Angstrom or Angstrom air. Nothing: what the file says.",
+            group="Own flare",
+            name="flare_wavelength_unit",
+            suggestions=("nm", "Angstrom", "um", "nm air", "Angstrom air"),
+        ),
     ] = None
-    flux_unit: Annotated[str | None, Help("Unit of the fluxes of the flare's files"), Flag("--flare-flux-unit")] = None
+    flux_unit: Annotated[
+        str | None,
+        Help("Unit of the fluxes of the flare's files"),
+        Flag("--flare-flux-unit"),
+        Widget(
+            label="Flare: unit of fluxes",
+            hint="Such as W m-2 nm-1 or Jy. Nothing: what the file says.",
+            group="Own flare",
+            name="flare_flux_unit",
+            suggestions=("erg s-1 cm-2 Angstrom-1", "W m-2 nm-1", "Jy"),
+        ),
+    ] = None
     continue_at_k: Annotated[
         Temperature | None,
         Help("Temperature of a blackbody that continues the flare's file beyond its ends"),
         Flag("--continue-at"),
+        Widget(
+            label="Continue at",
+            hint="Temperature of a blackbody that continues the flare's spectrum beyond its ends. Nothing: it must "
+            "cover what the instrument sees.",
+            group="Own flare",
+        ),
     ] = None
     as_observed: Annotated[
         bool,

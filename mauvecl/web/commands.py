@@ -84,7 +84,7 @@ def as_program(verb: str, study: Study) -> str:
 def as_command(verb: str, study: Study) -> str:
     """Return a question to a verb as a command, which names a study file if flags cannot say all of it."""
     from_file = ["mauvecl", verb, STUDY_FILE]
-    if any(star.file is not None for star in study.star):
+    if any(file is not None for file in (study.flare.spectrum.file, *(star.file for star in study.star))):
         return shlex.join(from_file)
     one = VERBS[verb]
     base = Study().with_settings([f"{key}={value}" for key, value in (one.defaults or {}).items()])

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from mauvecl.schema.errors import InputError
 from mauvecl.web.commands import as_command, as_program
-from mauvecl.web.question import STAR_FILE
+from mauvecl.web.question import FLARE_FILE, STAR_FILE
 from mauvecl.web.simulations import asked
 from mauvecl.web.tabs import TABS
 
@@ -22,15 +22,18 @@ if TYPE_CHECKING:
 
 
 def study_file(study: Study, name: str) -> tuple[str, bytes]:
-    """Return name and content of the study file, in a zip archive with an uploaded star."""
-    file = study.star[0].file
-    if file is None:
-        return f"{name}.toml", study.toml().encode()
+    """Return name and content of the study file, in a zip archive with uploaded spectra."""
+    files = [file for file in (study.star[0].file, study.flare.spectrum.file) if file is not None]
+    text = study.toml()
+    if not files:
+        return f"{name}.toml", text.encode()
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
-        archive.write(file, STAR_FILE)
-        # Path relative to the study, instead of that on the server.
-        archive.writestr("study.toml", study.toml().replace(str(file.resolve()), STAR_FILE))
+        for file in files:
+            archive.write(file, file.name)
+            # Path relative to the study, instead of that on the server.
+            text = text.replace(str(file.resolve()), file.name)
+        archive.writestr("study.toml", text)
     return f"{name}.zip", out.getvalue()
 
 
@@ -84,6 +87,8 @@ def taken_along(tab: Tab, question: Question, folder: Path) -> list[dict[str, st
         if question.uploaded is not None:
             # Relative to the study, instead of that on the server.
             study = study.with_value(("star", "file"), Path(STAR_FILE))
+        if "flare_file" in question.uploads:
+            study = study.with_value(("flare", "spectrum", "file"), Path(FLARE_FILE))
         found.append({"question": name, "command": as_command(verb, study), "python": as_program(verb, study)})
     return found
 

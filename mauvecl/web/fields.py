@@ -22,7 +22,7 @@ from mauvecl.statistics.registry import STATISTICS
 from mauvecl.study.keys import study_keys
 from mauvecl.web.simulations import SIMULATIONS
 
-UPLOADED, UPLOADED_UNKNOWN = "uploaded star", "uploaded spectrum"
+UPLOADED, UPLOADED_UNKNOWN, UPLOADED_FLARE = "uploaded star", "uploaded spectrum", "uploaded flare"
 #: Realisations that a visitor may ask for, and with a tail by importance sampling.
 REALISATIONS, SAMPLED = (10_000, 100_000, 1_000_000, 4_000_000), (100_000, 1_000_000)
 
@@ -247,7 +247,7 @@ class Field:
     most : int
         Largest number of characters.
     kind : str
-        Kind of the widget if not that of what is read: "day", "library" or "targets".
+        Kind of the widget if not that of what is read: "day", "file", "library" or "targets".
     suggestions : tuple of str
         Texts that the page offers.
     own_keys : tuple of str
@@ -311,6 +311,8 @@ def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> C
         return Choice(choices)
     if widget.kind == "day":
         return day
+    if widget.kind == "file":
+        return Choice(("", UPLOADED_FLARE), lambda text: text or None)
     if widget.kind == "library":
         return lambda text: spectrum_name(text, own=False) if text.strip() else None
     if field.annotation is bool:
@@ -408,7 +410,7 @@ ADVANCED = {
 #: Fields of the card.
 SOLVED = _group("Limit")
 #: Fields that say how the file of another field is read.
-READ_WITH = {"star": _group("Own spectrum")}
+READ_WITH = {"star": _group("Own spectrum"), "flare_file": _group("Own flare")}
 #: Fields of the form above the tabs of targets.
 CAMPAIGN = _group("Campaign")
 #: Fields that ask for something under one sky only.

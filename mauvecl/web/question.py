@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,16 +11,19 @@ from typing import TYPE_CHECKING, Any
 
 from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
-from mauvecl.web.fields import FIELDS, READ_WITH, UPLOADED, Draws, Field
+from mauvecl.web.fields import FIELDS, READ_WITH, Draws, Field
 
 if TYPE_CHECKING:
+    from mauvecl.host.spectra.conversion import ReadSpectrum
     from mauvecl.host.stars.source import Source
 
 #: Fields whose values only apply together with those of others, and those that an upload was read with.
-CONDITIONAL = ("sky_brightness", "target", "time", "second_area", "hours", *itertools.chain(*READ_WITH.values()))
+CONDITIONAL = (
+    "sky_brightness", "target", "time", "second_area", "hours", "flare_file", *itertools.chain(*READ_WITH.values())
+)  # fmt: skip
 Points = tuple[tuple[float, float], ...]
-#: Name of an uploaded star's file in the folder of its study.
-STAR_FILE = "star.ecsv"
+#: Names of the files of an uploaded star and flare in the folder of their study.
+STAR_FILE, FLARE_FILE = "star.ecsv", "flare.ecsv"
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,26 +57,31 @@ class Question:
         InputError
             For values that cannot be together.
         """
-        if self.uploaded is None:
-            return Study.build(self.data(), "page")
-        if folder is None:
-            raise InputError("no folder for the uploaded star", "a folder", key="folder")
-        return Study.build(self.data(str(write_spectrum(self.uploaded, folder))), "page")
+        files = {}
+        for name, file in (("star", STAR_FILE), ("flare_file", FLARE_FILE)):
+            if name in self.uploads:
+                if folder is None:
+                    raise InputError("no folder for the uploaded spectrum", "a folder", key="folder")
+                files[name] = str(write_spectrum(self.uploads[name], folder, file))
+        return Study.build(self.data(files), "page")
 
-    def data(self, file: str = STAR_FILE) -> dict[str, Any]:
+    def data(self, files: Mapping[str, str] | None = None) -> dict[str, Any]:
         """Return the question as the data of a study.
 
         Parameters
         ----------
-        file : str
-            Where an uploaded spectrum is.
+        files : mapping, optional
+            Where uploaded spectra are, by field; next to the study by default.
         """
+        files = files or {}
         values = self.values
         data: dict[str, Any] = {}
         for name, one in FIELDS.items():
             if one.path and name not in CONDITIONAL and values[name] is not None:
                 self._set(data, one, values[name])
-        data["star"] = [data["star"] | ({"file": file} if self.uploaded else {"library": values["star"]})]
+        data["star"] = [
+            data["star"] | ({"file": files.get("star", STAR_FILE)} if self.uploaded else {"library": values["star"]})
+        ]
         data["sky"] = {
             "brightness": {"surface_brightness": values["sky_brightness"]},
             "target and time": {"target": values["target"], "time": values["time"]},
@@ -82,6 +91,10 @@ class Question:
             self._set(data, FIELDS["second_area"], values["second_area"])
         if values["lines"]:
             data["flare"].setdefault("spectrum", {})["lines"] = dict(values["lines"])
+        if "flare_file" in self.uploads:
+            self._set(data, FIELDS["flare_file"], files.get("flare_file", FLARE_FILE))
+            if values["continue_at_k"] is not None:
+                self._set(data, FIELDS["continue_at_k"], values["continue_at_k"])
         points = self.uploads.get("own_unknown", values["own_unknown"])
         own = {"own": {"points": points}} if points else {}
         data["nuisances"] = {"usual": values["unknown"] == "the usual", "own": own}
@@ -107,15 +120,16 @@ class Question:
         data[key] = [value] if key == "amplitudes" else value
 
 
-def write_spectrum(source: Source, folder: Path) -> Path:
-    """Write an uploaded spectrum to a file without loss, once per spectrum, and return its path."""
+def write_spectrum(source: Source | ReadSpectrum, folder: Path, name: str) -> Path:
+    """Write an uploaded spectrum to a file of this name without loss, once per spectrum, and return its path."""
     from astropy.table import Table
 
-    path = folder / source.digest / STAR_FILE
+    digest = hashlib.sha256(source.wavelength_nm.tobytes() + source.flux_flam.tobytes()).hexdigest()
+    path = folder / digest / name
     if not path.exists():
         table = Table({"wavelength": source.wavelength_nm, "flux": source.flux_flam})
         table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
-        table.meta |= {"name": UPLOADED, "told": list(source.messages)}
+        table.meta |= {"name": source.name, "told": list(source.messages)}
         path.parent.mkdir(exist_ok=True)
         table.write(path, format="ascii.ecsv")
     return path

@@ -11,9 +11,11 @@ import tempfile
 import threading
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
+from mauvecl.host.stars.flare_spectra import ObservedFlare
 from mauvecl.host.stars.source import Source
 from mauvecl.schema.errors import InputError
 
@@ -27,13 +29,17 @@ CONTENT_MIB = 64
 TOGETHER = 2
 #: Exit codes of the reading process.
 _REFUSED, _NO_ROOM = 2, 3
-#: Attributes of a source other than its numbers.
-WORDS = ("name", "origin", "notes", "messages", "measured_nm", "unscaled")
+#: What files are read as, with the attributes other than its arrays.
+KINDS: dict[type[Source | ObservedFlare], tuple[str, ...]] = {
+    Source: ("name", "origin", "notes", "messages", "measured_nm", "unscaled"),
+    ObservedFlare: ("name", "messages", "measured_nm"),
+}
+Spectrum = TypeVar("Spectrum", Source, ObservedFlare)
 _turns = threading.BoundedSemaphore(TOGETHER)
 
 
-def read_limited(content: bytes, options: Mapping[str, str | None] | None = None) -> Source:
-    """Read a spectrum from the bytes of a file, like `Source.read`, in a process with limited memory and time.
+def read_limited(content: bytes, kind: type[Spectrum], options: Mapping[str, Any] | None = None) -> Spectrum:
+    """Read a spectrum from the bytes of a file, like its `read`, in a process with limited memory and time.
 
     Blocks for about a second, most of it for the start of Python: call it from a thread.
 
@@ -41,8 +47,10 @@ def read_limited(content: bytes, options: Mapping[str, str | None] | None = None
     ----------
     content : bytes
         What it is shows in itself: a name says nothing.
+    kind : type
+        `Source` or `ObservedFlare`.
     options : mapping, optional
-        Further arguments of `Source.read`.
+        Further arguments of its `read`.
 
     Raises
     ------
@@ -52,25 +60,19 @@ def read_limited(content: bytes, options: Mapping[str, str | None] | None = None
     if not _turns.acquire(timeout=SECONDS):
         raise InputError("too many uploads are read at the same time", "yours again in a minute", key="upload")
     try:
-        answer = _read_apart(content, dict(options or {}))
+        answer = _read_apart(content, kind.__name__, dict(options or {}))
     finally:
         _turns.release()
     with np.load(io.BytesIO(answer), allow_pickle=False) as read:
         words = json.loads(str(read["words"]))
-        measured = words["measured_nm"]
-        return Source(
-            read["wavelength"],
-            read["flux"],
-            words["name"],
-            words["origin"],
-            tuple(words["notes"]),
-            messages=tuple(words["messages"]),
-            measured_nm=None if measured is None else (measured[0], measured[1]),
-            unscaled=words["unscaled"],
-        )
+        # JSON has no tuples.
+        plain: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in words.items()
+        }
+        return kind(read["wavelength"], read["flux"], **plain)
 
 
-def _read_apart(content: bytes, options: dict[str, str | None]) -> bytes:
+def _read_apart(content: bytes, kind: str, options: dict[str, Any]) -> bytes:
     """Run the reading process and return its output."""
     environment = os.environ | {
         # One thread of a numerical library needs no stacks of many.
@@ -80,7 +82,15 @@ def _read_apart(content: bytes, options: dict[str, str | None]) -> bytes:
         "PYTHONPATH": os.pathsep.join(filter(None, (_here(), os.environ.get("PYTHONPATH")))),
     }
     # A fresh interpreter, as spawn makes one: OpenCL does not survive a fork.
-    command = [sys.executable, "-m", "mauvecl.web.sandboxed_reader", str(MEMORY_MIB), str(SECONDS), json.dumps(options)]
+    command = [
+        sys.executable,
+        "-m",
+        "mauvecl.web.sandboxed_reader",
+        str(MEMORY_MIB),
+        str(SECONDS),
+        kind,
+        json.dumps(options),
+    ]
     with tempfile.TemporaryDirectory(prefix="mauvecl-upload-") as folder:
         try:
             done = subprocess.run(
@@ -135,18 +145,19 @@ def _limit(memory_mib: int, seconds: int) -> None:
 
 def _main() -> int:
     """Run the reading process: file on standard input, arrays on standard output, errors on standard error."""
-    memory_mib, seconds, options = sys.argv[1:]
+    memory_mib, seconds, asked, options = sys.argv[1:]
     _limit(int(memory_mib), int(seconds))
     try:
         file = Path("upload")
         file.write_bytes(sys.stdin.buffer.read())
-        source = Source.read(file, **json.loads(options))
+        (kind,) = (one for one in KINDS if one.__name__ == asked)
+        source = kind.read(file, **json.loads(options))
         out = io.BytesIO()
         np.savez(
             out,
             wavelength=source.wavelength_nm,
             flux=source.flux_flam,
-            words=np.array(json.dumps({key: getattr(source, key) for key in WORDS})),
+            words=np.array(json.dumps({key: getattr(source, key) for key in KINDS[kind]})),
         )
     except InputError as error:
         print(error, file=sys.stderr)

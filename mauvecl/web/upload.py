@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 
 from mauvecl.host.files.columns import columns
+from mauvecl.host.spectra.conversion import ReadSpectrum
+from mauvecl.host.stars.flare_spectra import ObservedFlare
 from mauvecl.host.stars.source import Source
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
-from mauvecl.web.fields import READ_WITH, UPLOADED, UPLOADED_UNKNOWN
+from mauvecl.web.fields import READ_WITH, UPLOADED, UPLOADED_FLARE, UPLOADED_UNKNOWN
 from mauvecl.web.question import Points
-from mauvecl.web.sandboxed_reader import read_limited
+from mauvecl.web.sandboxed_reader import Spectrum, read_limited
 
 #: Bytes of an upload, and points of its spectrum, at most.
 MOST_UPLOADED, MOST_POINTS = 4 * 2**20, 200_000
@@ -42,13 +44,30 @@ def read_upload(name: str, content: bytes, **options: str | None) -> Source:
         If it is too large or holds no usable spectrum. Called on a thread of its own; any other
         exception is reported to the visitor too.
     """
+    return replace(_spectrum(content, Source, options), name=UPLOADED, origin="upload")
+
+
+def read_flare(name: str, content: bytes, **options: Any) -> ReadSpectrum:
+    """Read an untrusted spectrum of a flare, like `read_upload`, with the options of `ObservedFlare.read`.
+
+    It holds what was measured: the study that reads it continues it.
+    """
+    of_read = {key.removeprefix("flare_"): value for key, value in options.items()}
+    flare = _spectrum(content, ObservedFlare, of_read)
+    low, high = flare.measured_nm
+    inside = (flare.wavelength_nm >= low) & (flare.wavelength_nm <= high)
+    own = tuple(text for text in flare.messages if text.startswith(f"{flare.name}: "))
+    return ReadSpectrum(flare.wavelength_nm[inside], flare.flux_flam[inside], UPLOADED_FLARE, "upload", messages=own)
+
+
+def _spectrum(content: bytes, kind: type[Spectrum], options: Mapping[str, Any]) -> Spectrum:
     if len(content) > MOST_UPLOADED:
         size, most = len(content) / 2**20, MOST_UPLOADED / 2**20
         raise InputError(f"upload of {size:.1f} MiB", f"at most {most:g} MiB", key="upload", value=len(content))
-    source = read_limited(content, options)
-    if source.wavelength_nm.size > MOST_POINTS:
-        raise InputError.of("points", source.wavelength_nm.size, f"at most {MOST_POINTS}")
-    return replace(source, name=UPLOADED, origin="upload")
+    spectrum = read_limited(content, kind, options)
+    if spectrum.wavelength_nm.size > MOST_POINTS:
+        raise InputError.of("points", spectrum.wavelength_nm.size, f"at most {MOST_POINTS}")
+    return spectrum
 
 
 def read_pairs(name: str, content: bytes) -> Points:
@@ -105,5 +124,6 @@ class Upload:
 #: Files by the field that takes them.
 UPLOADS: Mapping[str, Upload] = {
     "star": Upload(read_upload, UPLOADED, READ_WITH["star"]),
+    "flare_file": Upload(read_flare, UPLOADED_FLARE, READ_WITH["flare_file"]),
     "own_unknown": Upload(read_pairs, UPLOADED_UNKNOWN),
 }

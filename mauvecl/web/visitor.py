@@ -338,7 +338,9 @@ class Visitor(WebSocketHandler):
             try:
                 self._uploads[field] = future.result()
             except InputError as error:
-                self.send(n=n, field=field, lacks=sentence(error), remedies=remedies(error))
+                # Keys of the flare's files are those of the star's.
+                proposed = [(one if one in upload.options else f"flare_{one}", text) for one, text in remedies(error)]
+                self.send(n=n, field=field, lacks=sentence(error), remedies=proposed)
             except Exception as error:
                 log.exception("an upload failed")
                 self.send(

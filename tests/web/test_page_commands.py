@@ -23,7 +23,9 @@ from mauvecl.answers.verbs import VERBS
 from mauvecl.cli import session
 from mauvecl.cli.app import app
 from mauvecl.schema.errors import InputError
+from mauvecl.study.cases import cases
 from mauvecl.study.study import Study
+from mauvecl.web.closed_forms import ClosedForms
 from mauvecl.web.commands import differing, keys_used
 from mauvecl.web.downloads import study_file, taken_along
 from mauvecl.web.fields import UPLOADED
@@ -31,7 +33,7 @@ from mauvecl.web.simulations import asked
 from mauvecl.web.state import State
 from mauvecl.web.static_pages import BIBTEX
 from mauvecl.web.tabs import TABS
-from mauvecl.web.upload import read_upload
+from mauvecl.web.upload import read_flare, read_upload
 
 ROOT = Path(__file__).parents[2]
 #: Links with fields that the random ones do not reach.
@@ -122,6 +124,34 @@ def test_own_star_is_in_the_study_that_the_command_names(tmp_path: Path, monkeyp
             with zipfile.ZipFile(io.BytesIO(content)) as archive:
                 archive.extractall(tmp_path)
             assert _study_of(one["command"], monkeypatch).star[0].file == Path("star.ecsv")
+
+
+def test_own_flare_answers_as_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In Angstrom, continued by a blackbody: as the command line reads it itself, and as the study of the page."""
+    monkeypatch.chdir(tmp_path)
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    nm = np.linspace(300.0, 690.0, 800)
+    text = "\n".join(f"{10 * x:.4f} {np.exp(-(((x - 350) / 60) ** 2)):.9e}" for x in nm)
+    (tmp_path / "own.txt").write_text(text)
+    options = {"flare_wavelength_unit": "Angstrom", "flare_flux_unit": None, "continue_at_k": 9000.0}
+    state = State({"flare_file": read_flare("own.txt", text.encode(), **options)})
+    state.follow("?flare_file=uploaded+flare&flare_wavelength_unit=Angstrom&continue_at_k=9000")
+    question = state.question()
+    page = ClosedForms.of(question, kept)
+    taken = {one["question"]: one for one in taken_along(TABS["detection"], question, kept)}
+    assert taken["detection"]["command"] == "mauvecl detect study.toml"
+    _, content = study_file(page.study, "study")
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        archive.extractall(tmp_path)
+    direct = "mauvecl detect --star G2V --magnitude 8.5 --amplitude 0.02 --temperature 21 --flare-file own.txt"
+    direct += " --flare-wavelength-unit Angstrom --continue-at 9000"
+    for command in (taken["detection"]["command"], direct):
+        (case,) = cases(_study_of(command, monkeypatch))
+        np.testing.assert_allclose(case.flares[0].source_electrons, page.flare.source_electrons, rtol=1e-9)
+    # The flare is another one than without the file.
+    other = ClosedForms.of(State().question(), kept)
+    assert abs(page.chance - other.chance) > 0.01
 
 
 @pytest.mark.long

@@ -38,8 +38,8 @@ OTHER = {
     "ebv": "0.1", "skipped_nm": "200:250", "snr_per_bin": "20", "joint_fit": "yes", "changes": "Mg II",
     "shortest_d": "2", "longest_d": "20",
 }  # fmt: skip
-#: Fields that say how an upload is read, and change nothing without one.
-READS = set().union(*READ_WITH.values())
+#: A file, and fields that say how an upload is read, which change nothing without one.
+READS = set().union(*READ_WITH.values()) | {"flare_file"}
 #: What must be entered first for a field to apply.
 SKY = {"sky": "target and time", "target": "eps Eri", "time": "2027-01-15"}
 BEFORE = {"target": SKY, "time": SKY, "second_area": {"second_temperature_k": "20000"},

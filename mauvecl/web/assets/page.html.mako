@@ -48,6 +48,10 @@ ${upload("star", "Use your own spectrum", "Your own spectrum", "text, ECSV, VOTa
 % elif name == "own_unknown":
 <input id="f-own_unknown" name="own_unknown" type="text" autocomplete="off" spellcheck="false" placeholder="200 1, 450 3, 700 1" aria-describedby="w-own_unknown">
 ${upload("own_unknown", "Use a file of nm and DN", "File of the unknown spectrum", "")}
+% elif field.kind == "file":
+<input id="f-${name}" name="${name}" type="text" aria-label="${field.label}" hidden>
+${upload(name, "Use a file", field.label, "text, ECSV, VOTable or FITS; or drop it here")}
+<button type="button" class="plain" data-remove="${name}" hidden>Remove it</button>
 % elif field.kind == "targets":
 <textarea id="f-targets" name="targets" hidden></textarea>
 <div class="wide"><table id="targets"><caption class="quiet">Targets</caption><thead><tr></tr></thead><tbody></tbody></table></div>

@@ -183,6 +183,7 @@ export class Uploads {
       name.textContent = this.holds(field) ? this.files[field].name : ""
       name.title = name.textContent && "Kept in this tab of your browser, also over a reload."
     }
+    for (const button of every("[data-remove]")) button.hidden = !this.holds(button.dataset.remove)
     this.fields.filed = new Set(uploads.filter(field => this.holds(field)))
     this.fields.hide()
     byId("link-lacks").hidden = !uploads.some(field => this.stands(field))
