@@ -6,9 +6,7 @@ import re
 from functools import cache
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, found
-from mauvecl.schema.section import fields_of
-from mauvecl.study.study import Study
+from mauvecl.study.keys import keys_with_flags
 from mauvecl.web.fields import FIELDS
 
 #: A remedy in a message, such as `magnitude=7.4`.
@@ -33,14 +31,8 @@ def _fields() -> dict[str, str]:
 @cache
 def _flags() -> dict[str, str]:
     """Return the field of each flag whose key has one."""
-    paths = {field.path: name for name, field in FIELDS.items() if field.path}
-    return {
-        flag: paths[path]
-        for path, field in fields_of(Study)
-        if path in paths
-        for one in found(field, Flag)
-        for flag in one.names
-    }
+    names = {".".join(field.path): name for name, field in FIELDS.items() if field.path}
+    return {flag: names[key] for key, _, one in keys_with_flags() if key in names for flag in one.names}
 
 
 def field_of(key: str | None) -> str | None:
