@@ -155,8 +155,9 @@ class Analysis:
             )
         red = next((one for one in self.scatter if one.red), None)
         if red is not None:
+            of = "single frames" if red.frames == 1 else f"means of {red.frames} frames"
             lines.append(
-                f"Quiescent frames are correlated: means of {red.frames} frames scatter {red.measured / red.white:.2f} "
+                f"Quiescent frames are correlated: {of} scatter {red.measured / red.white:.2f} "
                 "times as much as independent frames."
             )
         if self.wanted < self.measured.smallest:

@@ -44,8 +44,8 @@ class FrameModel:
         Flares in one frame in the instrument's pixels.
     bins : ndarray, shape (n_value, n_pixel)
         Weights of the instrument's pixels in each value of a frame: 0 or 1.
-    per_dn : float
-        Unit of the frames per DN of an exposure.
+    per_dn : ndarray, shape (n_value,)
+        Values of the frames per DN of an exposure: of flux densities, those of a flat spectrum.
     raw : bool
         True if the frames include bias and dark current.
     """
@@ -53,23 +53,37 @@ class FrameModel:
     quiet: Expectation
     flare: FlareModel
     bins: Float
-    per_dn: float
+    per_dn: Float
     raw: bool
 
     @classmethod
-    def of(cls, frames: Frames, quiet: Expectation, flare: FlareModel) -> Self:
+    def of(cls, frames: Frames, quiet: Expectation, flare: FlareModel, flux_per_dn: Float) -> Self:
         """Match frames with the pixels or resolution elements of an instrument.
 
-        Raises InputError if their wavelengths or unit differ from the instrument's.
+        Parameters
+        ----------
+        frames : Frames
+        quiet : Expectation
+        flare : FlareModel
+        flux_per_dn : ndarray, shape (n_pixel,)
+            Flux density, erg s-1 cm-2 nm-1, for one DN of the exposure in each pixel of the instrument.
+
+        Raises
+        ------
+        InputError
+            If wavelengths differ from the instrument's, or the unit is neither counts nor a flux density.
         """
         unit = _plain(frames.unit)
-        if unit not in {_plain(each) for each in (*COUNT_UNITS, *RATE_UNITS)}:
-            raise InputError.of("unit", frames.unit, f"one of {', '.join((*COUNT_UNITS, *RATE_UNITS))}")
+        counts = unit in {_plain(each) for each in (*COUNT_UNITS, *RATE_UNITS)}
+        assert frames.wavelength_nm is not None
+        flux = None if counts else _per_flam(frames.unit, frames.wavelength_nm)
+        if not counts and flux is None:
+            accepted = f"one of {', '.join((*COUNT_UNITS, *RATE_UNITS))}, or a flux density"
+            raise InputError.of("unit", frames.unit, accepted)
         exposure = float(np.median(frames.exposure_s))
         if np.ptp(frames.exposure_s) > SAME_EXPOSURE * exposure:
             raise InputError.of("exposure_s", f"{frames.exposure_s.min():g} to {frames.exposure_s.max():g} s",
                                 "one exposure time for all frames of spectra")  # fmt: skip
-        assert frames.wavelength_nm is not None
         pixels = _matched(frames.wavelength_nm, quiet.wavelength_nm)
         elements = _matched(frames.wavelength_nm, quiet.element_wavelength_nm)
         if pixels is not None:
@@ -82,9 +96,14 @@ class FrameModel:
                 f"the {quiet.wavelength_nm.size} pixels or {quiet.element_wavelength_nm.size} resolution elements of "
                 f"{quiet.instrument}",
             )  # fmt: skip
+        if flux is not None:
+            # A flux density is that of a flat spectrum with as many DN in all pixels of the value.
+            per_flux = np.divide(1.0, flux_per_dn, out=np.zeros_like(flux_per_dn), where=flux_per_dn > 0)
+            return cls(quiet, flare, bins, flux / (bins @ per_flux), False)
+        ones = np.ones(len(bins))
         if unit not in {_plain(each) for each in COUNT_UNITS}:
-            return cls(quiet, flare, bins, 1.0 / exposure, False)
-        raw = cls(quiet, flare, bins, 1.0, True)
+            return cls(quiet, flare, bins, ones / exposure, False)
+        raw = cls(quiet, flare, bins, ones, True)
         # Light is added to bias and dark current: where a pixel has far less than these, they were subtracted.
         included = np.nanmedian(frames.flux, axis=0) >= LEAST_OF_OFFSET * raw.offset
         return raw if included.all() else replace(raw, raw=False)
@@ -103,7 +122,7 @@ class FrameModel:
     @cached_property
     def ceiling(self) -> float:
         """Value at which a pixel saturates; infinite for sums of pixels."""
-        return self.quiet.n_frames * self.quiet.ceiling_dn * self.per_dn if self.raw else np.inf
+        return self.quiet.n_frames * self.quiet.ceiling_dn if self.raw else np.inf
 
     def flares(self, temperatures_k: tuple[float, ...]) -> Float:
         """Return the light of flares of unit amplitude, shape (n_temperature, n_value)."""
@@ -164,7 +183,18 @@ class FrameModel:
 
     def part(self, kept: NDArray[np.bool_]) -> FrameModel:
         """Return the model of some of the values."""
-        return replace(self, bins=self.bins[kept])
+        return replace(self, bins=self.bins[kept], per_dn=self.per_dn[kept])
+
+
+def _per_flam(unit: str, wavelength_nm: Float) -> Float | None:
+    """Return a flux density of 1 erg s-1 cm-2 nm-1 in a unit, shape (n_value,); None if it is no flux density."""
+    import astropy.units as u
+
+    one = np.ones(wavelength_nm.size) * u.Unit("erg / (s cm2 nm)")
+    try:
+        return np.asarray(one.to_value(u.Unit(unit), u.spectral_density(wavelength_nm * u.nm)))
+    except (ValueError, TypeError):
+        return None
 
 
 def _plain(unit: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
+import astropy.units as u
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -86,11 +87,43 @@ def rare() -> float:
 def test_frames_of_other_wavelengths_or_units_are_searched_in_white_light() -> None:
     frames = drawn(np.random.default_rng(2))
     with refused("unit"):
-        FrameModel.of(Frames.of(TIME, frames.flux, exposure_s=5.0, wavelength_nm=frames.wavelength_nm, unit="Jy"),
-                      model().quiet, model().flare)  # fmt: skip
+        FrameModel.of(Frames.of(TIME, frames.flux, exposure_s=5.0, wavelength_nm=frames.wavelength_nm, unit="K"),
+                      model().quiet, model().flare, np.ones(1))  # fmt: skip
     with refused("wavelength_nm"):
         FrameModel.of(Frames.of(TIME, frames.flux, exposure_s=5.0, wavelength_nm=frames.wavelength_nm + 7, unit="adu"),
-                      model().quiet, model().flare)  # fmt: skip
+                      model().quiet, model().flare, np.ones(1))  # fmt: skip
+
+
+@pytest.mark.parametrize("unit", ["erg / (s cm2 Angstrom)", "W / (m2 um)", "Jy"])
+def test_flux_densities_are_searched_by_their_spectrum_as_counts_are(unit: str) -> None:
+    """Calibrated by a hot standard star: counts over its counts, times its flux.
+
+    The same draws have the same S/N to 2 %, since only the templates differ; temperatures agree to their errors.
+    """
+    counts = drawn(np.random.default_rng(4), flare(1800.0, 60.0, 0.5))
+    nm = counts.wavelength_nm
+    assert nm is not None
+    standard = Study(star=[{"library": "B2IV", "magnitude": 9.0}])
+    there = frame_model(standard, counts)
+    assert isinstance(there, FrameModel)
+    source = standard.star[0].source()
+    edges = np.column_stack([nm - 5.25, nm + 5.25])
+    mean = [np.interp(np.linspace(*edge, 200), source.wavelength_nm, source.flux_flam).mean() for edge in edges]
+    values = (np.array(mean) * u.Unit("erg / (s cm2 Angstrom)")).to_value(u.Unit(unit), u.spectral_density(nm * u.nm))
+    electrons = there.quiet.n_frames * there.quiet.source_electrons
+    factor = values / (there.bins @ (electrons * there.quiet.gain_dn_per_electron) * there.per_dn)
+    assert counts.error is not None
+    how: Any = {"exposure_s": FRAME_S, "wavelength_nm": nm, "name": "M3V"}
+    fluxes = Frames.of(TIME, counts.flux * factor, counts.error * factor, unit=unit, **how)
+    one, other = (analyse(STUDY, frames=frames) for frames in (counts, fluxes))
+    assert other.analysis.spectra is not None, other.messages
+    (row,), (same,) = ([row for row in answer.rows if row.verdict == "detected"] for answer in (one, other))
+    assert same.event.value == pytest.approx(row.event.value, rel=0.02)
+    assert abs(same.event.brightest - row.event.brightest) <= 1
+    for name in ("temperature", "energy bolometric"):
+        estimate, low, high = row.quantity(name)
+        assert low < same.quantity(name)[0] < high, name
+        assert estimate > 0
 
 
 def test_noise_per_pixel_lies_within_its_range_and_departures_are_used() -> None:

@@ -16,6 +16,7 @@ from mauvecl.host.orbit.targets import Target
 from mauvecl.host.stars.source import Source
 from mauvecl.observations.analysis import Analysis, analyse_frames
 from mauvecl.observations.barycentre import barycentric
+from mauvecl.observations.changes.indices import flux_per_dn
 from mauvecl.observations.event_spectrum import EventSpectrum
 from mauvecl.observations.events import ObservedEvent
 from mauvecl.observations.frame_model import FrameModel
@@ -546,6 +547,6 @@ def frame_model(study: Study, frames: Frames) -> FrameModel | str:
             distance_pc=star.distance_pc if named else None, radius_rsun=star.radius_rsun if named else None,
             order=study.observation.order,
         )  # fmt: skip
-        return FrameModel.of(frames, quiet, flare)
+        return FrameModel.of(frames, quiet, flare, flux_per_dn(quiet, case.instrument))
     except InputError as error:
         return f"Spectra are searched as their sum over wavelength: {error}."
