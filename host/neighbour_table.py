@@ -37,6 +37,9 @@ TYPES = ("spectral_type", "sptype", "sp_type", "type")
 FILES = ("file", "spectrum", "spectrum_file")
 TEMPERATURES = ("teff_gspphot", "teff", "teff_val", "temperature", "temperature_k")
 COLOURS = ("bp_rp", "bp-rp", "bprp")
+#: All names of columns that are read, with that of a magnitude's band.
+KNOWN = (*NAMES, *SEPARATIONS, *RIGHT_ASCENSIONS, *DECLINATIONS, *MAGNITUDES, "band", *TYPES, *FILES, *TEMPERATURES,
+         *COLOURS)  # fmt: skip
 #: Units of separations without a stated unit: ADQL's DISTANCE is in degrees.
 UNSTATED = {"dist": "deg", "target_separation (deg)": "deg"}
 #: Largest number of rows; a fibre holds far fewer stars.

@@ -324,6 +324,7 @@ VERBS: dict[str, Verb] = {
                 "run.seed",
             ),
             without="observation.exposure_s",
+            tab=True,
         ),
         Verb(
             "change",

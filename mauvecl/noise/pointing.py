@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from mauvecl.schema.calls import validated
-from mauvecl.schema.fields import Help, Range, Unit
+from mauvecl.schema.fields import Help, Range, Unit, Widget
 from mauvecl.schema.physical import Duration
 from mauvecl.schema.section import Section
 
@@ -43,13 +43,45 @@ class PointingDrifts(Section):
     source: ClassVar[str] = "assumption: rate, depth and duration of drifts are not published"
 
     rate_per_h: Annotated[
-        float, Unit("1 / h"), Range(0, 3600, open_low=True), Help("Drifts per hour of good pointing", "an assumption")
+        float,
+        Unit("1 / h"),
+        Range(0, 3600, open_low=True),
+        Help("Drifts per hour of good pointing", "an assumption"),
+        Widget(
+            label="Pointing losses",
+            hint="Drifts of the star out of the fibre, each ended by a new acquisition, per hour of good pointing. "
+            "Nothing: none. How often they happen is not published.",
+            group="Pointing",
+            name="pointing_rate",
+            first="",
+            unit="per hour",
+            most=60.0,
+        ),
     ] = 0.5
-    duration_s: Annotated[Duration, Help("Mean duration of a drift", "exponential; an assumption")] = 300.0
+    duration_s: Annotated[
+        Duration,
+        Help("Mean duration of a drift", "exponential; an assumption"),
+        Widget(
+            label="Duration of a loss",
+            hint="Mean time from the start of a drift to the new acquisition; an assumption.",
+            group="Pointing",
+            place=1,
+            name="pointing_duration",
+        ),
+    ] = 300.0
     depth: Annotated[
         float,
         Range(0, 1, open_low=True),
         Help("Largest share of the light lost at the end of a drift", "uniform from 0; an assumption"),
+        Widget(
+            label="Depth of a loss",
+            hint="Largest share of the light that is lost at the end of a drift; an assumption.",
+            group="Pointing",
+            place=2,
+            name="pointing_depth",
+            unit="%",
+            scale=100.0,
+        ),
     ] = 0.5
 
     def drifts(self, numbers: NDArray[np.uint64], end_s: float, seed: int) -> tuple[Float, Float, Float]:

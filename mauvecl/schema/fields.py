@@ -261,8 +261,8 @@ class Widget:
     most : float, optional
         Largest value that a server computes for a visitor; that of the key by default.
     kind : str
-        "day" for a calendar, "library" for a name of the library, "file" for a file; by default a field of text, or a
-        choice of words.
+        "day" for a calendar, "library" for a name of the library, "table" for a text of several lines, "file" for a
+        spectrum, "upload" for a file as it is; by default a field of text, or a choice of words.
     slider : Slider, optional
     suggestions : tuple of str
         Texts that the page offers for a field of text.

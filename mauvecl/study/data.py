@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from mauvecl.schema.fields import Flag, Help
+from mauvecl.schema.fields import Flag, Help, Widget
 from mauvecl.schema.section import Section
 
 
@@ -13,11 +13,31 @@ class DataChoice(Section):
     """Observed frames that `analyse` reads."""
 
     file: Annotated[
-        Path | None, Help("Observed frames: FITS, ECSV or CSV; the verb's argument stands for it"), Flag("--data")
+        Path | None,
+        Help("Observed frames: FITS, ECSV or CSV; the verb's argument stands for it"),
+        Flag("--data"),
+        Widget(
+            label="Frames",
+            hint="A light curve or a sequence of spectra: FITS, ECSV or CSV of at most 16 MiB; the command line reads "
+            "larger ones. Files of mauvecl, TESS, Kepler and lightkurve need no mapping.",
+            group="Frames",
+            name="frames",
+            kind="upload",
+        ),
     ] = None
-    mapping: Annotated[Path | None, Help("Where time, flux and error are in that file (TOML)"), Flag("--mapping")] = (
-        None
-    )
+    mapping: Annotated[
+        Path | None,
+        Help("Where time, flux and error are in that file (TOML)"),
+        Flag("--mapping"),
+        Widget(
+            label="Mapping",
+            hint="Other files need a short TOML file that names the columns of time, flux and error, such as "
+            "time = 'TIME', flux = 'RATE'; the documentation has one for each layout.",
+            group="Frames",
+            place=1,
+            kind="upload",
+        ),
+    ] = None
     report: Annotated[Literal["pdf", "html"], Help("Form of the report"), Flag("--report")] = "html"
 
     barycentric: Annotated[

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from mauvecl.lightcurve.defaults import HALF_WIDTHS_S, RANK, WINDOW_S, Per, check_shape, per_day
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Help, Range, Unit
+from mauvecl.schema.fields import Flag, Help, Range, Unit, Widget
 from mauvecl.schema.physical import Duration, Positive
 from mauvecl.study.nuisances import Spread
 from mauvecl.study.sections import Section
@@ -45,9 +45,26 @@ class SearchChoice(Section):
         Help("Standard deviations of nuisance parameters of each frame, in addition to the stare's jitters"),
     ] = Field(default_factory=dict)
     false_alarms: Annotated[
-        Positive, Help("False alarms of the search per star-day, star-month or star-year"), Flag("--false-alarms")
+        Positive,
+        Help("False alarms of the search per star-day, star-month or star-year"),
+        Flag("--false-alarms"),
+        Widget(
+            label="False alarms",
+            hint="How many detections that are only noise the search may report in the time of the next field.",
+            group="Search",
+        ),
     ] = 1.0
-    per: Annotated[Per, Help("Star-time of frames for the false alarms"), Flag("--alarms-per")] = "month"
+    per: Annotated[
+        Per,
+        Help("Star-time of frames for the false alarms"),
+        Flag("--alarms-per"),
+        Widget(
+            label="False alarms per",
+            hint="Time on one star in which so many false alarms are expected.",
+            group="Search",
+            place=1,
+        ),
+    ] = "month"
     null: Annotated[
         Literal["sampled", "counted"],
         Help("Threshold from importance sampling of normal noise, or counted in simulated stares"),

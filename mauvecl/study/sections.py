@@ -142,7 +142,17 @@ class Star(Section):
     bin_nm: Annotated[BinWidth | None, Help("Width of bins over which the spectrum is averaged"), Flag("--bin-nm")] = (
         None
     )
-    distance_pc: Annotated[Distance | None, Help("Distance of the star", "for energies"), Flag("--distance")] = None
+    distance_pc: Annotated[
+        Distance | None,
+        Help("Distance of the star", "for energies"),
+        Flag("--distance"),
+        Widget(
+            label="Distance",
+            hint="With it, measured flares have luminosities and energies. Nothing: fluxes at the telescope alone.",
+            group="Measurement",
+            place=-1,
+        ),
+    ] = None
     radius_rsun: Annotated[Radius | None, Help("Radius of the star", "for energies"), Flag("--radius")] = None
     effective_temperature_k: Annotated[
         Temperature | None, Help("Effective temperature of the star", "for energies"), Flag("--star-temperature")
@@ -151,16 +161,37 @@ class Star(Section):
         Path | None,
         Help("Table of other stars near the star", "with separation, magnitude and spectral type, or of a Gaia query"),
         Flag("--neighbours"),
+        Widget(
+            label="Neighbours",
+            hint="Other stars near the star, as CSV: name, separation (arcsec), magnitude and spectral_type, or the "
+            "columns of a Gaia query. The light of those within 47 arcsec enters.",
+            group="Neighbours",
+            kind="table",
+        ),
     ] = None
     neighbours_of: Annotated[
         str | None,
         Help("The star's own row in that table, by name, or its coordinates"),
         Flag("--neighbours-of"),
+        Widget(
+            label="The star itself",
+            hint="Its own row in that table, by name, or its coordinates, such as 290.68 +11.12; needed if the table "
+            "has positions but no separations.",
+            group="Neighbours",
+            place=1,
+        ),
     ] = None
     neighbour_share: Annotated[
         Share,
         Help("Share of the light of neighbours within the fibre's radius that enters it", "an assumption"),
         Flag("--neighbour-share"),
+        Widget(
+            label="Share that enters",
+            hint="Share of the light of neighbours within 47 arcsec that enters the fibre; an assumption, since it is "
+            "not published.",
+            group="Neighbours",
+            place=2,
+        ),
     ] = 1.0
 
     @model_validator(mode="after")

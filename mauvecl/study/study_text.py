@@ -47,7 +47,7 @@ def with_paths(data: Any, kind: Any, change: Callable[[Path], Path]) -> Any:
 
 
 def with_file_digests(text: str) -> str:
-    """Replace the paths of spectra and neighbours in a study's text by names and digests, not by paths."""
+    """Replace the paths of files in a study's text by names and digests, not by paths."""
     import tomli_w
 
     data = tomllib.loads(text)
@@ -64,11 +64,11 @@ def with_file_digests(text: str) -> str:
 
 
 def _named_files(data: dict[str, Any]) -> list[tuple[dict[str, Any], str]]:
-    """List the sections of stars and flare that name a file, with the key."""
+    """List the sections of stars, flare and observed frames that name a file, with the key."""
     stars, flare = data.get("star"), data.get("flare")
     sections = [(star, key) for star in (stars if isinstance(stars, list) else []) for key in ("file", "neighbours")]
     light = flare.get("spectrum") if isinstance(flare, dict) else None
-    sections += [(light, "file"), (light, "quiescent")]
+    sections += [(light, "file"), (light, "quiescent"), (data.get("data"), "file"), (data.get("data"), "mapping")]
     return [(one, key) for one, key in sections if isinstance(one, dict) and isinstance(one.get(key), str)]
 
 

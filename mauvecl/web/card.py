@@ -27,7 +27,8 @@ def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     dict
         ``numbers``, one for each choice of what is unknown; ``chosen``, ``shown`` and ``interval`` of the question's
         choice, and ``words``; ``facts``, pairs of names and values; ``notes``, pairs of sentences and kinds;
-        ``simulated``, names of what is simulated; ``files``, names of tables that can be taken along.
+        ``simulated``, names of what is simulated; ``files``, tabs and names of what can be taken
+        along.
     """
     q, x = closed.question, closed.quiet
     cut, both = closed.odds.threshold, chances(closed, answers)
@@ -83,7 +84,10 @@ def _simulated(answers: Answers) -> list[str]:
 
 
 def _files(answers: Answers) -> list[str]:
-    return [name for tab in TABS.values() for name in tab.files if tab.offers(name, answers)]
+    tables = [f"{tab.name} {name}" for tab in TABS.values() for name in tab.files if tab.offers(name, answers)]
+    return tables + [
+        f"{tab.name} {name}" for tab in TABS.values() for name, of in tab.documents.items() if of in answers
+    ]
 
 
 def _with_kinds(messages: list[str]) -> list[tuple[str, str]]:

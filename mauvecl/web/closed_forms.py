@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,9 +36,13 @@ class ClosedForms:
 
     question: Question
     case: Case
+    #: What was read of the visitor's files, as arguments of the verb by name.
+    given: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, question: Question, folder: Path, *, headline: bool = True) -> ClosedForms:
+    def of(
+        cls, question: Question, folder: Path, *, headline: bool = True, given: Mapping[str, Any] | None = None
+    ) -> ClosedForms:
         """Answer a question.
 
         Parameters
@@ -47,6 +52,8 @@ class ClosedForms:
             Folder to which an uploaded spectrum is written for the study.
         headline : bool
             Whether the chance of detection is asked, without which a star may be too bright for it.
+        given : mapping, optional
+            What was read of the visitor's files.
 
         Raises
         ------
@@ -56,7 +63,7 @@ class ClosedForms:
         uploaded = question.uploaded
         # An uploaded spectrum is not read from its file at every change.
         scaled = None if uploaded is None else lambda star: star.applied(uploaded)
-        closed = cls(question, Case(question.study(folder), loader=Loader(scaled)))
+        closed = cls(question, Case(question.study(folder), loader=Loader(scaled)), given or {})
         if headline:
             _ = closed.odds
         return closed

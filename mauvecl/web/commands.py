@@ -90,7 +90,9 @@ def as_command(verb: str, study: Study) -> str:
     base = Study().with_settings([f"{key}={value}" for key, value in (one.defaults or {}).items()])
     words = ["mauvecl", verb]
     for name, value in keys_used(one, study, base):
-        if name == "star":
+        if name == "data.file":
+            words.insert(2, value)
+        elif name == "star":
             words += [word for star in value for word in _star_words(star)]
         elif name == "sky":
             words += _sky_words(value)

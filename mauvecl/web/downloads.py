@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import io
 import tempfile
+import threading
 import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mauvecl.schema.errors import InputError
 from mauvecl.web.commands import as_command, as_program
-from mauvecl.web.question import FLARE_FILE, STAR_FILE
 from mauvecl.web.simulations import asked
 from mauvecl.web.tabs import TABS
 
@@ -21,20 +21,32 @@ if TYPE_CHECKING:
     from mauvecl.web.tabs.tab import Answers, Tab
 
 
+#: Held while matplotlib draws.
+_drawing = threading.Lock()
+
+
 def study_file(study: Study, name: str) -> tuple[str, bytes]:
-    """Return name and content of the study file, in a zip archive with uploaded spectra."""
-    files = [file for file in (study.star[0].file, study.flare.spectrum.file) if file is not None]
-    text = study.toml()
+    """Return name and content of the study file, in a zip archive with the visitor's files if there are any."""
+    files, text = list(visitor_files(study).values()), study.toml()
     if not files:
         return f"{name}.toml", text.encode()
     out = io.BytesIO()
-    with zipfile.ZipFile(out, "w") as archive:
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         for file in files:
             archive.write(file, file.name)
-            # Path relative to the study, instead of that on the server.
+            # Paths relative to the study, instead of those on the server.
             text = text.replace(str(file.resolve()), file.name)
         archive.writestr("study.toml", text)
     return f"{name}.zip", out.getvalue()
+
+
+def visitor_files(study: Study) -> dict[tuple[str, ...], Path]:
+    """Return the files of the visitor's that a study names, by the path of sections and key."""
+    star, data = study.star[0], study.data
+    every = {("star", "file"): star.file, ("star", "neighbours"): star.neighbours,
+             ("flare", "spectrum", "file"): study.flare.spectrum.file, ("data", "file"): data.file,
+             ("data", "mapping"): data.mapping}  # fmt: skip
+    return {place: file for place, file in every.items() if file is not None}
 
 
 def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answers) -> tuple[str, bytes]:
@@ -46,6 +58,7 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
     name : str
         One of the tab's `files`.
     ending : {"ecsv", "fits", "study"}
+        Empty for a document.
     closed : ClosedForms
     answers : mapping
         Answers that are simulated, by name.
@@ -57,6 +70,10 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
     """
     from mauvecl.answers.files import write_table
 
+    if name in tab.documents and tab.documents[name] in answers:
+        # Matplotlib's settings are those of the process.
+        with _drawing:
+            return name, answers[tab.documents[name]].documents[name]()
     if name not in tab.files or ending not in ("ecsv", "fits", "study"):
         raise InputError(
             f"{tab.title} has no file {name[:40]!r}.{ending[:10]}", "one of its own", key="name", value=name
@@ -79,16 +96,14 @@ def taken_along(tab: Tab, question: Question, folder: Path) -> list[dict[str, st
     tab : Tab
     question : Question
     folder : Path
-        Where an uploaded spectrum is written for the study.
+        Where the visitor's files are.
     """
     found = []
     for name in tab.questions:
         verb, study = asked(name, question.study(folder))
-        if question.uploaded is not None:
+        for place, file in visitor_files(study).items():
             # Relative to the study, instead of that on the server.
-            study = study.with_value(("star", "file"), Path(STAR_FILE))
-        if "flare_file" in question.uploads:
-            study = study.with_value(("flare", "spectrum", "file"), Path(FLARE_FILE))
+            study = study.with_value(place, Path(file.name))
         found.append({"question": name, "command": as_command(verb, study), "python": as_program(verb, study)})
     return found
 

@@ -23,6 +23,8 @@ from mauvecl.study.keys import study_keys
 from mauvecl.web.simulations import SIMULATIONS
 
 UPLOADED, UPLOADED_UNKNOWN, UPLOADED_FLARE = "uploaded star", "uploaded spectrum", "uploaded flare"
+#: Text of a field whose file is kept as it is.
+UPLOADED_FILE = "uploaded file"
 #: Realisations that a visitor may ask for, and with a tail by importance sampling.
 REALISATIONS, SAMPLED = (10_000, 100_000, 1_000_000, 4_000_000), (100_000, 1_000_000)
 
@@ -33,6 +35,8 @@ SKIES = ("brightness", "target and time", "none")
 MOST_CHARACTERS = 200
 #: Targets whose visibility and plan a visitor may ask for.
 MOST_TARGETS = 30
+#: Characters of a table of neighbours, which links hold.
+MOST_TABLE = 3000
 
 
 @dataclass(frozen=True)
@@ -208,6 +212,24 @@ def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
     return tuple(rows)
 
 
+def neighbours(text: str) -> str | None:
+    """Check that a text is a CSV table of neighbours without names of files, and return it; None for nothing."""
+    from mauvecl.host.files.text_table import text_table
+    from mauvecl.host.neighbour_table import FILES
+
+    if not text.strip():
+        return None
+    if text.startswith("# %ECSV"):
+        raise InputError("the table of neighbours is ECSV", "CSV, or the command line", key="neighbours")
+    names = {name.strip().lower() for name in text_table(text, "the table of neighbours", commas=True).colnames}
+    if files := names & {*FILES}:
+        raise InputError(
+            f"the table of neighbours has a column {min(files)}",
+            "spectral_type; the command line reads files of spectra", key="neighbours",
+        )  # fmt: skip
+    return text
+
+
 def star_words(name: str) -> str:
     """Describe a star of the library by its type and the star of its spectrum."""
     entry = embedded(name)
@@ -247,7 +269,7 @@ class Field:
     most : int
         Largest number of characters.
     kind : str
-        Kind of the widget if not that of what is read: "day", "file", "library" or "targets".
+        Kind of the widget if not that of what is read: "day", "file", "library", "targets", "table" or "upload".
     suggestions : tuple of str
         Texts that the page offers.
     own_keys : tuple of str
@@ -287,12 +309,12 @@ def _text(value: Any) -> str:
 def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
     """Return the field of a key from its metadata."""
     default = field.get_default()
-    text = _text(default)
+    text = _text(default * widget.scale if isinstance(default, float) else default)
     unit = first(field, Unit) or Unit("")
     return Field(
         widget.label,
         text if widget.first is None else widget.first,
-        _reader(field, widget, unit.name, optional=default is None and widget.first is None),
+        _reader(field, widget, unit.name, optional=text == "" if widget.first is None else not widget.first),
         widget.hint,
         unit.written if widget.unit is None else widget.unit,
         widget.slider,
@@ -300,6 +322,7 @@ def _field(path: tuple[str, ...], field: FieldInfo, widget: Widget) -> Field:
         widget.place,
         path,
         widget.scale,
+        most=MOST_TABLE if widget.kind == "table" else MOST_CHARACTERS,
         kind=widget.kind,
         suggestions=widget.suggestions,
     )
@@ -315,6 +338,10 @@ def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> C
         return Choice(("", UPLOADED_FLARE), lambda text: text or None)
     if widget.kind == "library":
         return lambda text: spectrum_name(text, own=False) if text.strip() else None
+    if widget.kind == "table":
+        return neighbours
+    if widget.kind == "upload":
+        return Choice(("", UPLOADED_FILE))
     if field.annotation is bool:
         return Choice(("no", "yes"), lambda text: text == "yes")
     flag = first(field, Flag)
@@ -405,14 +432,17 @@ ADVANCED = {
         "Sky",
         "Unknown",
         "Change",
+        "Search",
+        "Neighbours",
+        "Pointing",
     )
 }
 #: Fields of the card.
 SOLVED = _group("Limit")
 #: Fields that say how the file of another field is read.
 READ_WITH = {"star": _group("Own spectrum"), "flare_file": _group("Own flare")}
-#: Fields of the form above the tabs of targets.
-CAMPAIGN = _group("Campaign")
+#: Fields of forms of their own, which stand in the panels of the tabs that read them.
+FORMS = {"campaign": _group("Campaign"), "frames": _group("Frames")}
 #: Fields that ask for something under one sky only.
 ASKED_UNDER = {"sky_brightness": "brightness", "target": "target and time", "time": "target and time"}
 #: Questions to begin with; the amplitudes of the first two are the paper's smallest, the others are examples (assumed).

@@ -180,6 +180,14 @@ class Canvas:
         )  # fmt: skip
         return self._described(made, called, "own", "dot", "")
 
+    def strips(self, name: str, called: str, colour: str) -> None:
+        """Add strips over the whole height, of columns x0 and x1."""
+        made = self.plot.vstrip(
+            "x0", "x1", source=self.source(name, "x0", "x1"), fill_color=self.ink[colour], fill_alpha=0.3,
+            line_color=None,
+        )  # fmt: skip
+        self._described(made, called, colour, "band", "")
+
     def rule(self, name: str, called: str, along: str, colour: str = "threshold", dash: str = "dashed") -> Any:
         """Add a straight line whose position is set later."""
         dimension: Literal["height", "width"] = "height" if along == "x" else "width"

@@ -19,11 +19,12 @@ if TYPE_CHECKING:
 
 #: Fields whose values only apply together with those of others, and those that an upload was read with.
 CONDITIONAL = (
-    "sky_brightness", "target", "time", "second_area", "hours", "flare_file", *itertools.chain(*READ_WITH.values())
+    "sky_brightness", "target", "time", "second_area", "hours", "flare_file", "pointing_rate", "pointing_duration",
+    "pointing_depth", *itertools.chain(*READ_WITH.values()),
 )  # fmt: skip
 Points = tuple[tuple[float, float], ...]
-#: Names of the files of an uploaded star and flare in the folder of their study.
-STAR_FILE, FLARE_FILE = "star.ecsv", "flare.ecsv"
+#: Names of the files of an uploaded star and flare, and of a table of neighbours, in the folder of their study.
+STAR_FILE, FLARE_FILE, NEIGHBOURS_FILE = "star.ecsv", "flare.ecsv", "neighbours.csv"
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,38 +51,36 @@ class Question:
         Parameters
         ----------
         folder : Path, optional
-            Where an uploaded spectrum is written for the study to find.
+            Where an uploaded spectrum and a table of neighbours are written for the study to find.
 
         Raises
         ------
         InputError
             For values that cannot be together.
         """
-        files = {}
-        for name, file in (("star", STAR_FILE), ("flare_file", FLARE_FILE)):
-            if name in self.uploads:
-                if folder is None:
-                    raise InputError("no folder for the uploaded spectrum", "a folder", key="folder")
-                files[name] = str(write_spectrum(self.uploads[name], folder, file))
-        return Study.build(self.data(files), "page")
+        if folder is None and (self.uploads.keys() - {"own_unknown"} or self.neighbours is not None):
+            raise InputError("no folder for the visitor's files", "a folder", key="folder")
+        return Study.build(self._data(folder), "page")
 
-    def data(self, files: Mapping[str, str] | None = None) -> dict[str, Any]:
-        """Return the question as the data of a study.
-
-        Parameters
-        ----------
-        files : mapping, optional
-            Where uploaded spectra are, by field; next to the study by default.
-        """
-        files = files or {}
+    def _data(self, folder: Path | None) -> dict[str, Any]:
+        """Return the question as the data of a study, whose files are written to a folder."""
         values = self.values
         data: dict[str, Any] = {}
         for name, one in FIELDS.items():
-            if one.path and name not in CONDITIONAL and values[name] is not None:
+            if not one.path or name in CONDITIONAL or values[name] is None:
+                continue
+            if one.kind != "upload":
                 self._set(data, one, values[name])
-        data["star"] = [
-            data["star"] | ({"file": files.get("star", STAR_FILE)} if self.uploaded else {"library": values["star"]})
-        ]
+            elif folder is not None and name in self.uploads:
+                self._set(data, one, str(self.uploads[name].written(folder)))
+        star = data["star"]
+        if folder is not None and self.neighbours is not None:
+            star["neighbours"] = str(write_table(self.neighbours, folder))
+        if folder is not None and self.uploaded is not None:
+            star["file"] = str(write_spectrum(self.uploaded, folder, STAR_FILE))
+        else:
+            star["library"] = values["star"]
+        data["star"] = [star]
         data["sky"] = {
             "brightness": {"surface_brightness": values["sky_brightness"]},
             "target and time": {"target": values["target"], "time": values["time"]},
@@ -89,10 +88,14 @@ class Question:
         }[values["sky"]]
         if values["second_temperature_k"] is not None:
             self._set(data, FIELDS["second_area"], values["second_area"])
+        if values["pointing_rate"] is not None:
+            for name in ("pointing_rate", "pointing_duration", "pointing_depth"):
+                self._set(data, FIELDS[name], values[name])
         if values["lines"]:
             data["flare"].setdefault("spectrum", {})["lines"] = dict(values["lines"])
-        if "flare_file" in self.uploads:
-            self._set(data, FIELDS["flare_file"], files.get("flare_file", FLARE_FILE))
+        if folder is not None and "flare_file" in self.uploads:
+            file = write_spectrum(self.uploads["flare_file"], folder, FLARE_FILE)
+            self._set(data, FIELDS["flare_file"], str(file))
             if values["continue_at_k"] is not None:
                 self._set(data, FIELDS["continue_at_k"], values["continue_at_k"])
         points = self.uploads.get("own_unknown", values["own_unknown"])
@@ -118,6 +121,15 @@ class Question:
             value = value / one.scale
         # A single flare.
         data[key] = [value] if key == "amplitudes" else value
+
+
+def write_table(text: str, folder: Path) -> Path:
+    """Write a table of neighbours to a file, once per text, and return its path."""
+    path = folder / hashlib.sha256(text.encode()).hexdigest() / NEIGHBOURS_FILE
+    if not path.exists():
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    return path
 
 
 def write_spectrum(source: Source | ReadSpectrum, folder: Path, name: str) -> Path:

@@ -1,4 +1,4 @@
-"""Reader of visitors' spectra in a child process with limits, which protects the server."""
+"""Reader of visitors' files in a child process with limits, which protects the server."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ import sys
 import tempfile
 import threading
 from collections.abc import Mapping
+from dataclasses import fields
+from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,6 +20,7 @@ import numpy as np
 
 from mauvecl.host.stars.flare_spectra import ObservedFlare
 from mauvecl.host.stars.source import Source
+from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError
 
 #: Memory of the reading process, MiB: Python with astropy and synphot maps some 400, a spectrum of 4 MiB as text 300.
@@ -29,10 +33,17 @@ CONTENT_MIB = 64
 TOGETHER = 2
 #: Exit codes of the reading process.
 _REFUSED, _NO_ROOM = 2, 3
-#: What files are read as, with the attributes other than its arrays.
-KINDS: dict[type[Source | ObservedFlare], tuple[str, ...]] = {
-    Source: ("name", "origin", "notes", "messages", "measured_nm", "unscaled"),
-    ObservedFlare: ("name", "messages", "measured_nm"),
+#: Functions that read files, by module: of a path, and of options by name.
+READERS = {
+    "spectrum": ("mauvecl.host.stars.source", "Source.read"),
+    "flare": ("mauvecl.host.stars.flare_spectra", "ObservedFlare.read"),
+    "frames": ("mauvecl.observations.reading", "read_frames"),
+}
+#: What an upload is expected to be, by the function that reads it.
+EXPECTED = {
+    "spectrum": ("a spectrum of some thousand points", "a spectrum as text, ECSV, VOTable or FITS"),
+    "flare": ("a spectrum of some thousand points", "a spectrum as text, ECSV, VOTable or FITS"),
+    "frames": ("fewer frames", "frames as FITS, ECSV or CSV"),
 }
 Spectrum = TypeVar("Spectrum", Source, ObservedFlare)
 _turns = threading.BoundedSemaphore(TOGETHER)
@@ -57,22 +68,38 @@ def read_limited(content: bytes, kind: type[Spectrum], options: Mapping[str, Any
     InputError
         If it holds no usable spectrum, or reading it takes more memory or time than allowed.
     """
+    return kind(**_read("spectrum" if kind is Source else "flare", {"upload": content}, options or {}))
+
+
+def read_frames_limited(files: Mapping[str, bytes], mapping: str | None = None) -> Frames:
+    """Read frames like `read_frames`, in a process with limited memory and time.
+
+    Parameters
+    ----------
+    files : mapping
+        Contents by name: the file of frames first, and files that the mapping or the frames need.
+    mapping : str, optional
+        Name of the file that is the mapping.
+    """
+    return Frames(**_read("frames", files, {"mapping": mapping}))
+
+
+def _read(reader: str, files: Mapping[str, bytes], options: Mapping[str, Any]) -> dict[str, Any]:
+    """Run a reading process, and return the attributes of what it has read."""
     if not _turns.acquire(timeout=SECONDS):
         raise InputError("too many uploads are read at the same time", "yours again in a minute", key="upload")
     try:
-        answer = _read_apart(content, kind.__name__, dict(options or {}))
+        answer = _read_apart(reader, files, options)
     finally:
         _turns.release()
     with np.load(io.BytesIO(answer), allow_pickle=False) as read:
         words = json.loads(str(read["words"]))
-        # JSON has no tuples.
-        plain: dict[str, Any] = {
-            key: tuple(value) if isinstance(value, list) else value for key, value in words.items()
+        return {name: tuple(value) if isinstance(value, list) else value for name, value in words.items()} | {
+            name: read[name] for name in read.files if name != "words"
         }
-        return kind(read["wavelength"], read["flux"], **plain)
 
 
-def _read_apart(content: bytes, kind: str, options: dict[str, Any]) -> bytes:
+def _read_apart(reader: str, files: Mapping[str, bytes], options: Mapping[str, Any]) -> bytes:
     """Run the reading process and return its output."""
     environment = os.environ | {
         # One thread of a numerical library needs no stacks of many.
@@ -81,25 +108,19 @@ def _read_apart(content: bytes, kind: str, options: dict[str, Any]) -> bytes:
         "PYTHONIOENCODING": "utf-8",
         "PYTHONPATH": os.pathsep.join(filter(None, (_here(), os.environ.get("PYTHONPATH")))),
     }
+    words = json.dumps({"reader": reader, "file": next(iter(files)), "options": dict(options)})
     # A fresh interpreter, as spawn makes one: OpenCL does not survive a fork.
-    command = [
-        sys.executable,
-        "-m",
-        "mauvecl.web.sandboxed_reader",
-        str(MEMORY_MIB),
-        str(SECONDS),
-        kind,
-        json.dumps(options),
-    ]
+    command = [sys.executable, "-m", "mauvecl.web.sandboxed_reader", str(MEMORY_MIB), str(SECONDS), words]
+    smaller, other = EXPECTED[reader]
     with tempfile.TemporaryDirectory(prefix="mauvecl-upload-") as folder:
+        for name, content in files.items():
+            (Path(folder) / name).write_bytes(content)
         try:
             done = subprocess.run(
-                command, input=content, capture_output=True, timeout=SECONDS, cwd=folder, env=environment, check=False
+                command, capture_output=True, timeout=SECONDS, cwd=folder, env=environment, check=False
             )
         except subprocess.TimeoutExpired as error:
-            raise InputError(
-                f"the upload takes more than {SECONDS} s to read", "a spectrum of some thousand points", key="upload"
-            ) from error
+            raise InputError(f"the upload takes more than {SECONDS} s to read", smaller, key="upload") from error
         except OSError as error:
             raise InputError(
                 f"the upload cannot be read now ({error.strerror})",
@@ -114,12 +135,8 @@ def _read_apart(content: bytes, kind: str, options: dict[str, Any]) -> bytes:
         fault, _, expected = done.stderr.decode("utf-8", "replace").strip().partition(", expected ")
         raise InputError(fault, expected or None, key="upload")
     if done.returncode == _NO_ROOM:
-        raise InputError(
-            f"the upload takes more than {MEMORY_MIB} MiB of memory to read",
-            "a spectrum of some thousand points",
-            key="upload",
-        )
-    raise InputError("the upload ends its reader", "a spectrum as text, ECSV, VOTable or FITS", key="upload")
+        raise InputError(f"the upload takes more than {MEMORY_MIB} MiB of memory to read", smaller, key="upload")
+    raise InputError("the upload ends its reader", other, key="upload")
 
 
 def _here() -> str:
@@ -144,21 +161,20 @@ def _limit(memory_mib: int, seconds: int) -> None:
 
 
 def _main() -> int:
-    """Run the reading process: file on standard input, arrays on standard output, errors on standard error."""
-    memory_mib, seconds, asked, options = sys.argv[1:]
+    """Run the reading process: files in its folder, arrays on standard output, errors on standard error."""
+    memory_mib, seconds, words = sys.argv[1:]
+    asked = json.loads(words)
     _limit(int(memory_mib), int(seconds))
     try:
-        file = Path("upload")
-        file.write_bytes(sys.stdin.buffer.read())
-        (kind,) = (one for one in KINDS if one.__name__ == asked)
-        source = kind.read(file, **json.loads(options))
+        module, names = READERS[asked["reader"]]
+        read: Any = attrgetter(names)(import_module(module))
+        found = read(Path(asked["file"]), **asked["options"])
+        values = {field.name: getattr(found, field.name) for field in fields(found)}
+        arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+        rest = json.dumps({name: value for name, value in values.items() if name not in arrays})
         out = io.BytesIO()
-        np.savez(
-            out,
-            wavelength=source.wavelength_nm,
-            flux=source.flux_flam,
-            words=np.array(json.dumps({key: getattr(source, key) for key in KINDS[kind]})),
-        )
+        save: Any = np.savez
+        save(out, words=np.array(rest), **arrays)
     except InputError as error:
         print(error, file=sys.stderr)
         return _REFUSED

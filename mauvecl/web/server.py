@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 #: Largest size in bytes of a message, an upload with a margin, and of a request's body, of which the page has none.
-MESSAGE, BODY = 8 * 2**20, 2**16
+MESSAGE, BODY = 17 * 2**20, 2**16
 #: Seconds that a connection may take for the headers and the body of each request.
 REQUEST_S = 20.0
 #: Largest number of open connections, beyond which the oldest without a page is closed; browsers open up to six.

@@ -85,15 +85,35 @@ class Simulation:
         Adds to the answers what the page reads repeatedly.
     others : dict
         Further answers of the main verb by name, with what makes their study; a refused one is left out.
+    needs : str
+        Field without which it cannot start.
     """
 
     verbs: Mapping[str, str]
     asked: Callable[[Study], Study] = lambda study: study
     completed: Callable[[Answers], Answers] = lambda answers: answers
     others: Mapping[str, Callable[[Study], Study]] = field(default_factory=dict)
+    needs: str = ""
 
-    def __call__(self, study: Study, pool: Pool, progress: Callable[[int, int], None] | None = None) -> Answers:
-        """Return the answers by name; `progress` is called with numbers of what the main verb counts."""
+    def __call__(
+        self,
+        study: Study,
+        pool: Pool,
+        progress: Callable[[int, int], None] | None = None,
+        *,
+        given: Mapping[str, Any] | None = None,
+    ) -> Answers:
+        """Return the answers by name.
+
+        Parameters
+        ----------
+        study : Study
+        pool : Pool
+        progress : callable, optional
+            Called with numbers of what the main verb counts.
+        given : mapping, optional
+            What was read of the visitor's files, as arguments of the main verb.
+        """
         asked = self.asked(study)
         main = next(iter(self.verbs.values()))
         wanted = [(name, verb, asked) for name, verb in self.verbs.items()]
@@ -104,7 +124,7 @@ class Simulation:
         answers: Answers = {}
         for name, verb, one in wanted:
             try:
-                answers[name] = VERBS[verb].ask(one, pool, progress)
+                answers[name] = VERBS[verb].ask(one, pool, progress, **(given or {} if verb == main else {}))
             except InputError:
                 if name not in self.others:
                     raise
@@ -122,8 +142,9 @@ _OWN = {
     "map": Simulation({"map": "map"}, map_around),
     "measure": Simulation({"measure": "measure"}, fits),
     "completeness": Simulation({"completeness": "inject"}, completeness),
-    "visible": Simulation({"visible": "visible"}, completed=_tabulated),
-    "plan": Simulation({"plan": "plan"}, campaign_plan),
+    "visible": Simulation({"visible": "visible"}, completed=_tabulated, needs="targets"),
+    "plan": Simulation({"plan": "plan"}, campaign_plan, needs="targets"),
+    "analyse": Simulation({"analyse": "analyse"}, needs="frames"),
     "periods": Simulation({"periods": "change"}, periods),
 }
 #: All simulations by name: those above, and the verbs that have a tab.

@@ -68,6 +68,7 @@ def front() -> bytes:
     """Return the page."""
     from mako.lookup import TemplateLookup
 
+    from mauvecl.host.neighbour_table import KNOWN
     from mauvecl.host.stars import catalogue, well_known
     from mauvecl.host.stars.star_names import all_names
     from mauvecl.web import fields
@@ -76,7 +77,7 @@ def front() -> bytes:
     from mauvecl.web.simulations import SIMULATIONS
     from mauvecl.web.state import SEEN
     from mauvecl.web.tabs import TABS, reads_of
-    from mauvecl.web.upload import MOST_UPLOADED, UPLOADS
+    from mauvecl.web.upload import UPLOADS
     from mauvecl.web.visitor import UNUSED
 
     words = {
@@ -90,7 +91,12 @@ def front() -> bytes:
         "stars": all_names(),
         "example": "AU Mic\nYZ CMi\neps Eri",
         "asks": {name: sorted(reads_of(name)) for name in SIMULATIONS},
-        "uploads": {name: {"entered": one.entered, "options": list(one.options)} for name, one in UPLOADS.items()},
+        "uploads": {
+            name: {"entered": one.entered, "options": list(one.options), "most": one.most}
+            for name, one in UPLOADS.items()
+        },
+        "columns": sorted({*KNOWN}),
+        "needs": {name: one.needs for name, one in SIMULATIONS.items() if one.needs},
         "under": fields.ASKED_UNDER,
         "presets": fields.PRESETS,
         "seen": {name: field.first for name, field in SEEN.items()},
@@ -106,7 +112,6 @@ def front() -> bytes:
             for tab in TABS.values()
         },
         "pins": {theme: list(zip(ink.pins, DASHES, strict=True)) for theme, ink in INKS.items()},
-        "most_uploaded": MOST_UPLOADED,
         "unused": UNUSED,
     }
     lookup = TemplateLookup([str(_FOLDER)], default_filters=["h"], strict_undefined=True)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,15 +15,17 @@ from mauvecl.host.files.columns import columns
 from mauvecl.host.spectra.conversion import ReadSpectrum
 from mauvecl.host.stars.flare_spectra import ObservedFlare
 from mauvecl.host.stars.source import Source
+from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
-from mauvecl.web.fields import READ_WITH, UPLOADED, UPLOADED_FLARE, UPLOADED_UNKNOWN
+from mauvecl.web.fields import FIELDS, READ_WITH, UPLOADED, UPLOADED_FILE, UPLOADED_FLARE, UPLOADED_UNKNOWN
 from mauvecl.web.question import Points
-from mauvecl.web.sandboxed_reader import Spectrum, read_limited
+from mauvecl.web.sandboxed_reader import Spectrum, read_frames_limited, read_limited
 
 #: Bytes of an upload, and points of its spectrum, at most.
 MOST_UPLOADED, MOST_POINTS = 4 * 2**20, 200_000
-
+#: Bytes of a file that is kept as it is, such as frames: those of a day have some 8 MiB in resolution elements.
+MOST_KEPT_BYTES = 16 * 2**20
 
 #: Bytes and rows of what is unknown: it goes into every table's study.
 MOST_PAIRS_BYTES, MOST_PAIRS = 2**18, 4000
@@ -61,13 +66,18 @@ def read_flare(name: str, content: bytes, **options: Any) -> ReadSpectrum:
 
 
 def _spectrum(content: bytes, kind: type[Spectrum], options: Mapping[str, Any]) -> Spectrum:
-    if len(content) > MOST_UPLOADED:
-        size, most = len(content) / 2**20, MOST_UPLOADED / 2**20
-        raise InputError(f"upload of {size:.1f} MiB", f"at most {most:g} MiB", key="upload", value=len(content))
+    check_size(content, MOST_UPLOADED)
     spectrum = read_limited(content, kind, options)
     if spectrum.wavelength_nm.size > MOST_POINTS:
         raise InputError.of("points", spectrum.wavelength_nm.size, f"at most {MOST_POINTS}")
     return spectrum
+
+
+def check_size(content: bytes, most: int) -> None:
+    """Raise InputError for a file with more bytes than are read."""
+    if len(content) > most:
+        size = len(content) / 2**20
+        raise InputError(f"upload of {size:.1f} MiB", f"at most {most / 2**20:g} MiB", key="upload", value=len(content))
 
 
 def read_pairs(name: str, content: bytes) -> Points:
@@ -103,6 +113,36 @@ def read_pairs(name: str, content: bytes) -> Points:
 
 
 @dataclass(frozen=True)
+class VisitorFile:
+    """File of a visitor as it came, until an answer needs it.
+
+    Attributes
+    ----------
+    name : str
+        Name on the visitor's computer, without folders and odd characters.
+    content : bytes
+    """
+
+    name: str
+    content: bytes
+
+    @classmethod
+    def of(cls, name: str, content: bytes) -> VisitorFile:
+        """Keep a file that is not too large."""
+        check_size(content, MOST_KEPT_BYTES)
+        plain = re.sub(r"[^A-Za-z0-9_.+-]", "_", re.split(r"[/\\]", name)[-1])[-80:].strip(".-")
+        return cls(plain or "file", content)
+
+    def written(self, folder: Path) -> Path:
+        """Write the file below a folder, once, and return its path."""
+        path = folder / hashlib.sha256(self.content).hexdigest() / self.name
+        if not path.exists():
+            path.parent.mkdir(exist_ok=True)
+            path.write_bytes(self.content)
+        return path
+
+
+@dataclass(frozen=True)
 class Upload:
     """Kind of file that a field takes.
 
@@ -114,16 +154,42 @@ class Upload:
         Text of the field that stands for the file.
     options : tuple of str
         Fields that say how the file is read.
+    most : int
+        Largest number of bytes.
     """
 
     read: Callable[..., Any]
     entered: str
     options: tuple[str, ...] = ()
+    most: int = MOST_UPLOADED
 
 
 #: Files by the field that takes them.
 UPLOADS: Mapping[str, Upload] = {
     "star": Upload(read_upload, UPLOADED, READ_WITH["star"]),
     "flare_file": Upload(read_flare, UPLOADED_FLARE, READ_WITH["flare_file"]),
-    "own_unknown": Upload(read_pairs, UPLOADED_UNKNOWN),
+    "own_unknown": Upload(read_pairs, UPLOADED_UNKNOWN, most=MOST_PAIRS_BYTES),
+    **{
+        name: Upload(VisitorFile.of, UPLOADED_FILE, most=MOST_KEPT_BYTES)
+        for name, field in FIELDS.items()
+        if field.kind == "upload"
+    },
 }
+
+
+def read_frames_of(file: VisitorFile, mapping: VisitorFile | None, key: str) -> Frames:
+    """Read the frames of a visitor's file, through a mapping if there is one.
+
+    Raises InputError with the name of the field if it holds no frames.
+    """
+    files = {file.name: file.content}
+    how = None
+    if mapping is not None:
+        how = mapping.name if mapping.name != file.name else f"mapping-{mapping.name}"
+        files[how] = mapping.content
+    try:
+        return read_frames_limited(files, how)
+    except InputError as error:
+        found = InputError(str(error), key=key, value=file.name)
+        found.expected = error.expected
+        raise found from error

@@ -77,6 +77,7 @@ class Visitor(WebSocketHandler):
         self._coming: dict[str, Any] | None = None
         self._uploads: dict[str, Any] = {}
         self._digests: dict[str, str] = {}
+        self._given: tuple[tuple[Any, ...], dict[str, Any]] | None = None
         self._closed: tuple[tuple[Any, ...], ClosedForms] | None = None
         self._answers: OrderedDict[tuple[str, tuple[Any, ...]], dict[str, Any]] = OrderedDict()
         self._files: OrderedDict[tuple[Any, ...], tuple[str, bytes]] = OrderedDict()
@@ -175,8 +176,16 @@ class Visitor(WebSocketHandler):
         key = self._key(state, tab.reads), tab.headline
         if self._closed is None or self._closed[0] != key:
             question = state.question(tab.reads)
-            self._closed = key, ClosedForms.of(question, Path(self._folder.name), headline=tab.headline)
+            given = self.given(state, tab)
+            self._closed = key, ClosedForms.of(question, Path(self._folder.name), headline=tab.headline, given=given)
         return self._closed[1]
+
+    def given(self, state: State, tab: Tab) -> dict[str, Any]:
+        """Return what was read of the files that a tab reads; the last ones are cached."""
+        key = tab.name, self._key(state, tab.reads & UPLOADS.keys())
+        if self._given is None or self._given[0] != key:
+            self._given = key, tab.given(state.question(tab.reads))
+        return self._given[1]
 
     def answers(self, state: State) -> dict[str, Any]:
         """Return the simulated answers that hold for a question, by name."""
@@ -284,14 +293,17 @@ class Visitor(WebSocketHandler):
 
     async def _simulate(self, n: int, kind: str, state: State) -> None:
         key = kind, self._key(state, reads_of(kind))
-        question, headline = state.question(reads_of(kind)), asking(kind).headline
-        closed = await self._in_thread(partial(ClosedForms.of, question, Path(self._folder.name), headline=headline))
+        question, tab = state.question(reads_of(kind)), asking(kind)
+        given = await self._in_thread(partial(self.given, state, tab))
+        made = partial(ClosedForms.of, question, Path(self._folder.name), headline=tab.headline, given=given)
+        closed = await self._in_thread(made)
         if self.job is not None:
             raise InputError("there is a simulation already", "its end first", key="simulate", value=kind)
         # Several verbs count the realisations of all in the pool.
         verbs = verbs_of(kind)
         unit = VERBS[verbs[0]].counts if len(verbs) == 1 else ""
-        job = self.job = Job(partial(SIMULATIONS[kind], closed.study), kind in DRAWING, unit)
+        work = partial(SIMULATIONS[kind], closed.study, given=closed.given)
+        job = self.job = Job(work, kind in DRAWING, unit)
         done = asyncio.wrap_future(job.future)
         try:
             while not (await asyncio.wait([done], timeout=LOOK_S))[0]:
@@ -345,7 +357,7 @@ class Visitor(WebSocketHandler):
                 log.exception("an upload failed")
                 self.send(
                     n=n, field=field,
-                    lacks=f"upload {shortened(name)} cannot be read ({type(error).__name__}), expected a spectrum",
+                    lacks=f"upload {shortened(name)} cannot be read ({type(error).__name__}), expected another",
                 )  # fmt: skip
             else:
                 self.send(n=n, field=field, entered=upload.entered)

@@ -16,17 +16,22 @@ pytest.importorskip("bokeh")
 from mauvecl.answers.verbs import VERBS
 from mauvecl.web.card import card
 from mauvecl.web.closed_forms import ClosedForms
-from mauvecl.web.fields import FIELDS, READ_WITH
+from mauvecl.web.fields import FIELDS, READ_WITH, UPLOADED_FILE
 from mauvecl.web.simulations import SIMULATIONS, asked, verbs_of
 from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS, reads_of
 from mauvecl.web.tabs.tab import Tab
+from mauvecl.web.upload import VisitorFile
 from mauvecl.web.visitor import shown
 
 pytestmark = pytest.mark.long
 
+#: Files of the visitor's.
+FILES = {"frames": VisitorFile("a.csv", b"1"), "mapping": VisitorFile("a.toml", b"2")}
 Given = tuple[tuple[str, str], ...]
 
+#: A table of neighbours, and the same with positions from which separations are measured.
+NEAR, PLACES = "name,separation,magnitude,spectral_type\nB,8,9,G2V", "name,ra,dec,V,spectral_type\nB,0,0.002,9,G2V"
 #: Another valid text for every field.
 OTHER = {
     "star": "K5V", "magnitude": "9", "band": "B", "amplitude_percent": "3", "exposure_s": "100", "fap": "0.01",
@@ -36,13 +41,17 @@ OTHER = {
     "own_unknown": "200 1, 700 2", "targets": "AU Mic", "start": "2027-06-01", "days": "100", "hours": "50",
     "seed": "7", "signal": "paper", "instrument": "mauve-electrons", "visits": "5", "of": "magnitude", "power": "0.5",
     "ebv": "0.1", "skipped_nm": "200:250", "snr_per_bin": "20", "joint_fit": "yes", "changes": "Mg II",
-    "shortest_d": "2", "longest_d": "20",
+    "shortest_d": "2", "longest_d": "20", "distance_pc": "7", "false_alarms": "2",
+    "per": "day", "neighbours": NEAR, "neighbours_of": "0 0", "neighbour_share": "0.5", "pointing_rate": "2",
+    "pointing_duration": "100", "pointing_depth": "10", "frames": UPLOADED_FILE, "mapping": UPLOADED_FILE,
 }  # fmt: skip
 #: A file, and fields that say how an upload is read, which change nothing without one.
 READS = set().union(*READ_WITH.values()) | {"flare_file"}
 #: What must be entered first for a field to apply.
 SKY = {"sky": "target and time", "target": "eps Eri", "time": "2027-01-15"}
 BEFORE = {"target": SKY, "time": SKY, "second_area": {"second_temperature_k": "20000"},
+          "neighbours_of": {"neighbours": PLACES, "neighbours_of": "0 0.001"}, "neighbour_share": {"neighbours": NEAR},
+          "pointing_duration": {"pointing_rate": "1"}, "pointing_depth": {"pointing_rate": "1"},
           **{name: {"targets": "eps Eri"} for name in ("start", "days", "hours")}}  # fmt: skip
 #: Fields of the headline that the tabs of pictures show with it.
 HEADLINE = TABS["detection"].reads
@@ -56,7 +65,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @cache
 def forms(tab: str, given: Given, folder: Path, *, everything: bool = False) -> ClosedForms:
-    state = State()
+    state = State(FILES)
     state.enter(dict(given))
     question = state.question() if everything else state.question(TABS[tab].reads)
     return ClosedForms.of(question, folder, headline=TABS[tab].headline)

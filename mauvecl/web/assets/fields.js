@@ -4,7 +4,7 @@
 import {STEPS, byId, every} from "./dom.js"
 import {Scale} from "./scale.js"
 import {Stars} from "./stars.js"
-import {Targets} from "./targets.js"
+import {Targets, knownColumns} from "./targets.js"
 
 /** @typedef {import("./protocol.js").Entered} Entered */
 /** @typedef {import("./protocol.js").Faults} Faults */
@@ -52,6 +52,25 @@ export class Fields {
         // The same file may be chosen again; its name is not shown for another star.
         file.value = ""
         if (one) chosen(button.dataset.choose, one)
+      })
+    }
+    for (const button of every("[data-open-text]")) {
+      const [file] = every(`[data-text="${button.dataset.openText}"]`), field = byId(`f-${button.dataset.openText}`)
+      const put = (/** @type {string} */ text) => {
+        field.value = knownColumns(text, words.columns)
+        this.take(field.name, true)
+      }
+      button.addEventListener("click", () => file.click())
+      file.addEventListener("change", async () => {
+        const [one] = file.files
+        file.value = ""
+        if (one) put(await one.text())
+      })
+      field.addEventListener("paste", (/** @type {ClipboardEvent} */ event) => {
+        const text = event.clipboardData?.getData("text") ?? ""
+        if (field.value || !text.includes("\n")) return
+        event.preventDefault()
+        put(text)
       })
     }
     this.show()

@@ -7,8 +7,9 @@ import {byId, every} from "./dom.js"
  * @param {import("./protocol.js").Answer | null} answer
  * @param {boolean} busy
  * @param {import("./protocol.js").Entered} entered
+ * @param {Record<string, string>} needs fields without which simulations cannot start
  */
-export function offer(answer, busy, entered) {
+export function offer(answer, busy, entered, needs) {
   const ready = answer !== null
   const simulated = new Set(answer?.simulated ?? [])
   byId("simulate").disabled = !ready || busy
@@ -16,10 +17,14 @@ export function offer(answer, busy, entered) {
   byId("pin").disabled = !ready
   byId("study").disabled = !ready
   for (const button of every("[data-simulate]")) {
-    const lacks = ["visible", "plan"].includes(button.dataset.simulate) && !entered.targets.trim()
+    const need = needs[button.dataset.simulate]
+    const lacks = need !== undefined && !entered[need].trim()
     button.disabled = !ready || busy || lacks
   }
-  for (const button of every("[data-file]")) button.disabled = !answer?.files.includes(button.dataset.file)
+  for (const button of every("[data-file]")) {
+    const tab = button.closest("[role=tabpanel]").id.replace("panel-", "")
+    button.disabled = !answer?.files.includes(`${tab} ${button.dataset.file}`)
+  }
   for (const hint of every("[data-needs]")) {
     const lacking = hint.dataset.needs.split(" ").filter((/** @type {string} */ kind) => !simulated.has(kind))
     const buttons = lacking.map((/** @type {string} */ kind) => document.querySelector(`[data-simulate="${kind}"]`) ?? byId("simulate"))

@@ -59,6 +59,14 @@ ${upload(name, "Use a file", field.label, "text, ECSV, VOTable or FITS; or drop 
 <button type="button" class="plain" id="targets-open">Open a CSV table</button><input type="file" id="targets-file" accept=".csv,.ecsv,.txt" aria-label="CSV table of targets" tabindex="-1" hidden>
 <button type="button" class="plain" id="targets-clear" hidden>Remove all</button>
 <p class="wrong" id="w-targets" hidden></p><span class="hint">Type names or paste a list or table; what is known of a star stands in grey and can be overwritten.</span></div>
+% elif field.kind == "table":
+<textarea id="f-${name}" name="${name}" rows="3" spellcheck="false" placeholder="name,separation,magnitude,spectral_type" aria-describedby="w-${name}"></textarea>
+<div class="file"><button type="button" class="plain" data-open-text="${name}">Open a CSV table</button><input type="file" data-text="${name}" accept=".csv,.txt" aria-label="CSV table: ${field.label}" tabindex="-1" hidden></div>
+% elif field.kind == "upload":
+<input id="f-${name}" name="${name}" type="hidden" value="">
+<div class="file"><button type="button" data-choose="${name}" aria-describedby="w-${name}">Choose a file</button>
+<input type="file" data-upload="${name}" aria-label="${field.label}" tabindex="-1" hidden><span class="hint">or drop it here, at most ${uploads[name].most // 2**20} MiB</span>
+<span data-uploaded="${name}"></span> <span data-remedies="${name}"></span> <button type="button" class="plain" data-remove="${name}" hidden>Remove</button></div>
 % elif field.kind == "day":
 <input id="f-${name}" name="${name}" type="date" value="${field.first}" aria-describedby="w-${name}">
 % elif hasattr(field.read, "options"):
@@ -213,11 +221,13 @@ ${control(name)}
 <option value="${name}"></option>
 % endfor
 </datalist>
-<div id="campaign" hidden>
-% for name in fields.CAMPAIGN:
+% for form, names in fields.FORMS.items():
+<div class="form" id="${form}" data-form="${names[0]}" hidden>
+% for name in names:
 ${control(name)}
 % endfor
 </div>
+% endfor
 <div class="tabs">
 <div role="tablist" aria-label="Pictures of the answer">
 % for k, tab in enumerate(tabs.values()):
@@ -227,7 +237,8 @@ ${control(name)}
 % for k, tab in enumerate(tabs.values()):
 <div role="tabpanel" id="panel-${tab.name}" aria-labelledby="tab-${tab.name}"${"" if k == 0 else " hidden"}>
 <p class="about">${tab.about}</p>
-% if "targets" in tab.reads:
+<% has_form = any(names[0] in tab.reads for names in fields.FORMS.values()) %>
+% if has_form:
 ${actions(tab)}
 % endif
 % if any(p.pins for p in tab.pictures):
@@ -268,7 +279,7 @@ ${actions(tab)}
 <ol id="history" reversed></ol>
 <p id="no-history">Nothing is simulated yet.</p>
 % else:
-% if "targets" not in tab.reads:
+% if not has_form:
 ${actions(tab)}
 % endif
 % if tab.pictures:
@@ -283,6 +294,9 @@ ${actions(tab)}
 % if name in tab.simulations and name != "detection":
 <button type="button" data-file="${name}" data-ending="study" disabled>${name} (study)</button>
 % endif
+% endfor
+% for name in tab.documents:
+<button type="button" data-file="${name}" data-ending="" disabled>${name}</button>
 % endfor
 % if any(tab.files.values()):
 <span class="hint" data-needs="${" ".join(dict.fromkeys(filter(None, tab.files.values())))}"></span>

@@ -90,9 +90,10 @@ class Page {
     const {reads, headline} = this.tab
     this.fields.front(reads)
     byId("card").hidden = !headline
-    const campaign = byId("campaign")
-    campaign.hidden = !reads.includes("targets")
-    if (!campaign.hidden) byId(`panel-${this.routing.seen.tab}`).querySelector(".about").after(campaign)
+    for (const form of every("[data-form]")) {
+      form.hidden = !reads.includes(form.dataset.form)
+      if (!form.hidden) byId(`panel-${this.routing.seen.tab}`).querySelector(".about").after(form)
+    }
     if (this.simulations.running === null) this.simulations.place()
   }
 
@@ -268,7 +269,7 @@ class Page {
   // Actions that are available now.
   offer() {
     this.uploads.mention()
-    offer(this.answer, this.simulations.running !== null, this.fields.entered)
+    offer(this.answer, this.simulations.running !== null, this.fields.entered, words.needs)
   }
 
   // The answer again, now with what was simulated.

@@ -46,6 +46,20 @@ export function rowsOf(text) {
   return lines.flatMap(line => line.split(/[\t;]|,(?!\s*[+-]?\d)/)).map(name => ({name: name.trim().replace(/^"(.*)"$/, "$1")})).filter(row => row.name)
 }
 
+/** The columns of a CSV table that are known, with their separator: tables of archives have many more.
+ * @param {string} text
+ * @param {string[]} known in lower case */
+export function knownColumns(text, known) {
+  const lines = text.split(/\r?\n/).filter(line => line.trim() && !line.startsWith("#"))
+  // Units stand in the comments of ECSV: such a table goes to the server as it is, which says what it takes.
+  if (!lines.length || text.startsWith("# %ECSV")) return text.trim()
+  const separator = ["\t", ";", ","].find(mark => lines[0].includes(mark)) ?? ","
+  const kept = cells(lines[0], separator).flatMap((name, k) => known.includes(name.toLowerCase()) ? [k] : [])
+  if (!kept.length) return text.trim()
+  const quoted = (/** @type {string} */ cell) => cell.includes(separator) ? `"${cell}"` : cell
+  return lines.map(line => { const row = cells(line, separator); return kept.map(k => quoted(row[k] ?? "")).join(separator) }).join("\n")
+}
+
 /** The text of rows: names alone if there is nothing else.
  * @param {Row[]} rows */
 export function textOf(rows) {

@@ -38,6 +38,14 @@ export class Uploads {
     this.read = {}
     /** @type {Record<string, number>} */
     this.serials = {}
+    for (const button of every("[data-remove]")) {
+      button.onclick = () => {
+        const field = button.dataset.remove
+        this.forget([field])
+        this.fields.put({[field]: ""})
+        this.then.changed(true)
+      }
+    }
     this.before = kept().then(files => { this.files = {...files, ...this.files} })
   }
 
@@ -73,8 +81,9 @@ export class Uploads {
     this.propose(field, [])
     this.then.changed(false)
     this.then.none()
-    if (file.size > this.words.most_uploaded) {
-      this.lack(field, `upload of ${(file.size / MIB).toFixed(1)} MiB, expected at most ${this.words.most_uploaded / MIB} MiB`)
+    const {most} = this.words.uploads[field]
+    if (file.size > most) {
+      this.lack(field, `upload of ${(file.size / MIB).toFixed(1)} MiB, expected at most ${most / MIB} MiB`)
       return
     }
     const chosen = this.files[field] = {at: Date.now(), name: file.name, content: await file.arrayBuffer()}
@@ -181,6 +190,7 @@ export class Uploads {
     for (const name of every("[data-uploaded]")) {
       const field = name.dataset.uploaded
       name.textContent = this.holds(field) ? this.files[field].name : ""
+      for (const button of every(`[data-remove="${field}"]`)) button.hidden = !this.holds(field)
       name.title = name.textContent && "Kept in this tab of your browser, also over a reload."
     }
     for (const button of every("[data-remove]")) button.hidden = !this.holds(button.dataset.remove)

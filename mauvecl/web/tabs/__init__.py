@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from mauvecl.answers.verbs import VERBS
+from mauvecl.web.tabs.analyse import Analyse
 from mauvecl.web.tabs.change import Change
 from mauvecl.web.tabs.compare import Compare
 from mauvecl.web.tabs.completeness import Completeness
@@ -32,6 +33,7 @@ DRAWN: dict[str, Tab] = {
         Change(),
         Periods(),
         Completeness(),
+        Analyse(),
         Visibility(),
         Plan(),
     )

@@ -47,7 +47,7 @@ class Shares(Picture):
         if "completeness" not in answers:
             text = (
                 "Nothing is injected yet: Inject flares puts flares of several lengths and sizes into a stare of one "
-                "orbit, and searches it at one false alarm a month."
+                "orbit, and searches it."
             )
             return PictureData(text, sources, own)
         table, parts = answers["completeness"].completeness, []
@@ -70,7 +70,7 @@ class Completeness(Tab):
     name, title = "completeness", "Stare"
     about = (
         "One exposure sees a flare at its peak; a stare sees it rise and fade. What a search of a stare of one orbit "
-        "finds, at one false alarm a month."
+        "finds at so many false alarms, also where the star drifts out of the fibre."
     )
     pictures = (Shares(),)
     headline = False

@@ -179,6 +179,8 @@ class Measurement(Tab):
     """Measurement of the flare's spectrum."""
 
     verb = "measure"
+    # Fits along a flare have no pointing losses.
+    never = ("pointing_rate", "pointing_duration", "pointing_depth")
     about = (
         "What is measured of the flare once it is detected: its temperature, size and light, with errors in closed "
         "form; simulated fits count how often their intervals hold the truth."

@@ -110,6 +110,8 @@ class Plan(Tab):
         "each target's type; completeness is in closed form, and assumptions have a table."
     )
     headline = False
+    # The page has no star-time of a campaign's false alarms: one a month.
+    never = ("false_alarms",)
     pictures = (Recovered(), Expected())
     files = dict.fromkeys(("plan", "stars", "energies", "assumptions"), "plan")
 

@@ -128,6 +128,8 @@ class Tab(ABC):
     never: ClassVar[tuple[str, ...]] = ()
     #: Tables that can be taken along, with the simulation that each needs, or none.
     files: ClassVar[Mapping[str, str | None]] = {}
+    #: Documents of answers that can be taken along, by file name, with the simulation that each needs.
+    documents: ClassVar[Mapping[str, str]] = {}
 
     def __init_subclass__(cls, **words: Any) -> None:
         super().__init_subclass__(**words)
@@ -159,6 +161,13 @@ class Tab(ABC):
             name for name, field in FIELDS.items() if any(verb.accepts(key) for verb in verbs for key in field.keys)
         }
         return frozenset(taken | set(self.also)) - set(self.never)
+
+    def given(self, question: Question) -> dict[str, Any]:
+        """Read the visitor's files, and return them as arguments of the verb: by default none.
+
+        Raises InputError with the name of the field whose file cannot be read. Called on a thread of its own.
+        """
+        return {}
 
     def words(self, question: Question) -> str:
         """Return what a tab without a headline is asked, in words."""
