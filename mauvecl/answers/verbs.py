@@ -353,6 +353,7 @@ VERBS: dict[str, Verb] = {
     """,
             ("observation.instrument", "sky", "calibrate"),
             observation=(),
+            tab=True,
         ),
         Verb(
             "visible",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Self
 from pydantic import model_validator
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Help, Range
+from mauvecl.schema.fields import Flag, Help, Range, Widget
 from mauvecl.schema.physical import DetectorTemperature, Magnitude
 from mauvecl.schema.section import Section
 from mauvecl.study.sections import Star
@@ -46,19 +46,51 @@ class CalibrationObservation(Section):
         return Star(library=self.library, file=self.spectrum, magnitude=self.magnitude, band=self.band).source()
 
 
+#: Keys of an observation that hold paths.
+PATHS = tuple(
+    name for name, field in CalibrationObservation.model_fields.items() if field.annotation in (Path, Path | None)
+)
+
+
 class CalibrateQuestion(Section):
     """Observations from which `calibrate` fits an instrument."""
 
     observations: Annotated[
-        tuple[CalibrationObservation, ...], Help("Observations of standard stars and of no light")
+        tuple[CalibrationObservation, ...],
+        Help("Observations of standard stars and of no light"),
+        Widget(
+            label="Observations",
+            hint="A zip archive: a TOML file with [[calibrate.observations]], as for the command line, and the frames, "
+            "mappings and spectra that it names.",
+            group="Standards",
+            kind="upload",
+        ),
     ] = ()
     knots: Annotated[int, Range(4, 200), Help("Intervals of the spline of the throughput"), Flag("--knots")] = 100
     light_error: Annotated[
-        float, Range(0, 1), Help("Relative error of the light of an observation, by pointing"), Flag("--light-error")
+        float,
+        Range(0, 1),
+        Help("Relative error of the light of an observation, by pointing"),
+        Flag("--light-error"),
+        Widget(
+            label="Error of the light",
+            hint="By how much the light of an observation differs, by pointing.",
+            group="Standards",
+            unit="%",
+            scale=100.0,
+        ),
     ] = 0.0
     spectrum_error: Annotated[
         Annotated[float, Range(0, 1)] | None,
         Help("Relative error of the spectra of the stars, at each of 12 wavelengths",
              default="0.1 for one star, fitted for several if they disagree"),
         Flag("--spectrum-error"),
+        Widget(
+            label="Error of the spectra",
+            hint="Of the spectra of stars, at each of 12 wavelengths. Empty: 10 % for one star, fitted if several "
+            "disagree.",
+            group="Standards",
+            unit="%",
+            scale=100.0,
+        ),
     ] = None  # fmt: skip

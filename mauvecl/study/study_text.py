@@ -18,6 +18,7 @@ from mauvecl.host.files.size_limits import read_bytes
 from mauvecl.host.spectra.formats import without_columns
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
+from mauvecl.study.calibrations import PATHS
 
 
 def read_embedded_study(path: Path) -> str:
@@ -64,11 +65,15 @@ def with_file_digests(text: str) -> str:
 
 
 def _named_files(data: dict[str, Any]) -> list[tuple[dict[str, Any], str]]:
-    """List the sections of stars, flare and observed frames that name a file, with the key."""
+    """List the sections of stars, flare, observations and changes that name a file, with the key."""
     stars, flare = data.get("star"), data.get("flare")
     sections = [(star, key) for star in (stars if isinstance(stars, list) else []) for key in ("file", "neighbours")]
     light = flare.get("spectrum") if isinstance(flare, dict) else None
     sections += [(light, "file"), (light, "quiescent"), (data.get("data"), "file"), (data.get("data"), "mapping")]
+    asked = data.get("calibrate")
+    rows = asked.get("observations") if isinstance(asked, dict) else None
+    sections += [(row, key) for row in (rows if isinstance(rows, list) else []) for key in PATHS]
+    sections += [(data.get("change"), "file")]
     return [(one, key) for one, key in sections if isinstance(one, dict) and isinstance(one.get(key), str)]
 
 

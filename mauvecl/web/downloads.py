@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mauvecl.schema.errors import InputError
+from mauvecl.study.calibrations import PATHS
 from mauvecl.web.commands import as_command, as_program
 from mauvecl.web.simulations import asked
+from mauvecl.web.standards import placed
 from mauvecl.web.tabs import TABS
 
 if TYPE_CHECKING:
@@ -27,7 +29,7 @@ _drawing = threading.Lock()
 
 def study_file(study: Study, name: str) -> tuple[str, bytes]:
     """Return name and content of the study file, in a zip archive with the visitor's files if there are any."""
-    files, text = list(visitor_files(study).values()), study.toml()
+    files, text = [*visitor_files(study).values(), *observation_files(study)], study.toml()
     if not files:
         return f"{name}.toml", text.encode()
     out = io.BytesIO()
@@ -47,6 +49,13 @@ def visitor_files(study: Study) -> dict[tuple[str, ...], Path]:
              ("flare", "spectrum", "file"): study.flare.spectrum.file, ("data", "file"): data.file,
              ("data", "mapping"): data.mapping}  # fmt: skip
     return {place: file for place, file in every.items() if file is not None}
+
+
+def observation_files(study: Study) -> list[Path]:
+    """Return the files of the visitor's that the observations of a calibration name, each once."""
+    rows = study.calibrate.observations
+    every = (getattr(one, key) for one in rows for key in PATHS)
+    return list(dict.fromkeys(file for file in every if file is not None))
 
 
 def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answers) -> tuple[str, bytes]:
@@ -104,6 +113,8 @@ def taken_along(tab: Tab, question: Question, folder: Path) -> list[dict[str, st
         for place, file in visitor_files(study).items():
             # Relative to the study, instead of that on the server.
             study = study.with_value(place, Path(file.name))
+        if rows := placed(study.calibrate.observations, lambda file: file.name):
+            study = study.with_changes({"calibrate": {"observations": rows}}, None, "page")
         found.append({"question": name, "command": as_command(verb, study), "python": as_program(verb, study)})
     return found
 

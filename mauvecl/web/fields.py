@@ -442,7 +442,7 @@ SOLVED = _group("Limit")
 #: Fields that say how the file of another field is read.
 READ_WITH = {"star": _group("Own spectrum"), "flare_file": _group("Own flare")}
 #: Fields of forms of their own, which stand in the panels of the tabs that read them.
-FORMS = {"campaign": _group("Campaign"), "frames": _group("Frames")}
+FORMS = {"campaign": _group("Campaign"), "frames": _group("Frames"), "standards": _group("Standards")}
 #: Fields that ask for something under one sky only.
 ASKED_UNDER = {"sky_brightness": "brightness", "target": "target and time", "time": "target and time"}
 #: Questions to begin with; the amplitudes of the first two are the paper's smallest, the others are examples (assumed).

@@ -72,7 +72,8 @@ class Question:
             if one.kind != "upload":
                 self._set(data, one, values[name])
             elif folder is not None and name in self.uploads:
-                self._set(data, one, str(self.uploads[name].written(folder)))
+                written = self.uploads[name].written(folder)
+                self._set(data, one, str(written) if isinstance(written, Path) else written)
         star = data["star"]
         if folder is not None and self.neighbours is not None:
             star["neighbours"] = str(write_table(self.neighbours, folder))

@@ -145,7 +145,8 @@ _OWN = {
     "visible": Simulation({"visible": "visible"}, completed=_tabulated, needs="targets"),
     "plan": Simulation({"plan": "plan"}, campaign_plan, needs="targets"),
     "analyse": Simulation({"analyse": "analyse"}, needs="frames"),
-    "periods": Simulation({"periods": "change"}, periods),
+    "calibrate": Simulation({"calibrate": "calibrate"}, needs="observations"),
+    "periods": Simulation({"periods": "change"}, periods, needs="targets"),
 }
 #: All simulations by name: those above, and the verbs that have a tab.
 SIMULATIONS = {name: Simulation({name: name}) for name, verb in VERBS.items() if verb.tab} | _OWN

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,11 +22,14 @@ from mauvecl.schema.text import shortened
 from mauvecl.web.fields import FIELDS, READ_WITH, UPLOADED, UPLOADED_FILE, UPLOADED_FLARE, UPLOADED_UNKNOWN
 from mauvecl.web.question import Points
 from mauvecl.web.sandboxed_reader import Spectrum, read_frames_limited, read_limited
+from mauvecl.web.standards import Observations
 
 #: Bytes of an upload, and points of its spectrum, at most.
 MOST_UPLOADED, MOST_POINTS = 4 * 2**20, 200_000
 #: Bytes of a file that is kept as it is, such as frames: those of a day have some 8 MiB in resolution elements.
 MOST_KEPT_BYTES = 16 * 2**20
+#: Values of frames that are read for an answer, at most: the spectra of a day.
+MOST_VALUES = 2**24
 
 #: Bytes and rows of what is unknown: it goes into every table's study.
 MOST_PAIRS_BYTES, MOST_PAIRS = 2**18, 4000
@@ -174,6 +178,7 @@ UPLOADS: Mapping[str, Upload] = {
         for name, field in FIELDS.items()
         if field.kind == "upload"
     },
+    "observations": Upload(Observations.of, UPLOADED_FILE, most=MOST_KEPT_BYTES),
 }
 
 
@@ -187,9 +192,16 @@ def read_frames_of(file: VisitorFile, mapping: VisitorFile | None, key: str) -> 
     if mapping is not None:
         how = mapping.name if mapping.name != file.name else f"mapping-{mapping.name}"
         files[how] = mapping.content
-    try:
+    with reported_for(key, file.name):
         return read_frames_limited(files, how)
+
+
+@contextmanager
+def reported_for(key: str, name: str) -> Iterator[None]:
+    """Raise the errors of a reader as those of a field, with the name of the file."""
+    try:
+        yield
     except InputError as error:
-        found = InputError(str(error), key=key, value=file.name)
+        found = InputError(str(error), key=key, value=name)
         found.expected = error.expected
         raise found from error

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import zipfile
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,6 +20,7 @@ from mauvecl.web.card import card
 from mauvecl.web.closed_forms import ClosedForms
 from mauvecl.web.fields import FIELDS, READ_WITH, UPLOADED_FILE
 from mauvecl.web.simulations import SIMULATIONS, asked, verbs_of
+from mauvecl.web.standards import Observations
 from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS, reads_of
 from mauvecl.web.tabs.tab import Tab
@@ -27,7 +30,18 @@ from mauvecl.web.visitor import shown
 pytestmark = pytest.mark.long
 
 #: Files of the visitor's.
-FILES = {"frames": VisitorFile("a.csv", b"1"), "mapping": VisitorFile("a.toml", b"2")}
+
+
+def archive() -> Observations:
+    """Return an archive with a study and a file that it names."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as files:
+        files.writestr("standards.toml", '[[calibrate.observations]]\nframes = "a.csv"\nlibrary = "G2V"\n')
+        files.writestr("a.csv", "1")
+    return Observations.of("standards.zip", out.getvalue())
+
+
+FILES = {"frames": VisitorFile("a.csv", b"1"), "mapping": VisitorFile("a.toml", b"2"), "observations": archive()}
 Given = tuple[tuple[str, str], ...]
 
 #: A table of neighbours, and the same with positions from which separations are measured.
@@ -44,6 +58,8 @@ OTHER = {
     "shortest_d": "2", "longest_d": "20", "distance_pc": "7", "false_alarms": "2",
     "per": "day", "neighbours": NEAR, "neighbours_of": "0 0", "neighbour_share": "0.5", "pointing_rate": "2",
     "pointing_duration": "100", "pointing_depth": "10", "frames": UPLOADED_FILE, "mapping": UPLOADED_FILE,
+
+    "observations": UPLOADED_FILE, "light_error": "1", "spectrum_error": "2",
 }  # fmt: skip
 #: A file, and fields that say how an upload is read, which change nothing without one.
 READS = set().union(*READ_WITH.values()) | {"flare_file"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from mauvecl.answers.verbs import VERBS
 from mauvecl.web.tabs.analyse import Analyse
+from mauvecl.web.tabs.calibrate import Calibrate
 from mauvecl.web.tabs.change import Change
 from mauvecl.web.tabs.compare import Compare
 from mauvecl.web.tabs.completeness import Completeness
@@ -34,6 +35,7 @@ DRAWN: dict[str, Tab] = {
         Periods(),
         Completeness(),
         Analyse(),
+        Calibrate(),
         Visibility(),
         Plan(),
     )

@@ -12,7 +12,7 @@ from mauvecl.schema.tables import View
 from mauvecl.web.closed_forms import short
 from mauvecl.web.figures import Canvas
 from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
-from mauvecl.web.upload import read_frames_of
+from mauvecl.web.upload import MOST_VALUES, read_frames_of
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -26,8 +26,6 @@ Float = NDArray[np.float64]
 
 #: Largest numbers of points of a light curve, and of columns and rows of a dynamic spectrum.
 MOST_POINTS, MOST_COLUMNS, MOST_ROWS = 8000, 600, 300
-#: Largest number of values of frames: the spectra of a day.
-MOST_VALUES = 2**24
 #: Verdicts on events, with their colours.
 VERDICTS = {"detected": "star", "candidate": "drawn", "rejected": "own"}
 NO_FILE = "Choose a file of frames: a light curve or a sequence of spectra."
