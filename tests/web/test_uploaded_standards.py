@@ -7,6 +7,7 @@ import struct
 import tracemalloc
 import zipfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -25,6 +26,10 @@ from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS
 from mauvecl.web.visitor import shown
 from tests.observations.test_calibration import frames_of, star, truth
+from tests.web.visits import Server, fresh
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
 
 TAB = TABS["calibrate"]
 #: The star of the file is half a magnitude fainter in it than it was observed.
@@ -137,6 +142,23 @@ def test_pictures_show_the_fit(contents: dict[str, bytes], tmp_path: Path) -> No
     assert TAB.rows(page, answers)[1][0] == "dark current"
     (one,) = taken_along(TAB, page.question, tmp_path)
     assert str(tmp_path) not in one["command"] + one["python"]
+
+
+@pytest.mark.long
+def test_visitor_calibrates_after_a_refused_archive(
+    browser: Browser, server: Server, contents: dict[str, bytes]
+) -> None:
+    page = fresh(browser, f"{server.address}?tab=calibrate")
+    chosen = page.locator('[data-upload="observations"]')
+    chosen.set_input_files(
+        {"name": "standards.zip", "mimeType": "application/zip", "buffer": zipped({"../a.csv": b"1"})}
+    )
+    page.locator("#panel-calibrate").get_by_text("the archive holds a file named '../a.csv'").wait_for()
+    chosen.set_input_files({"name": "standards.zip", "mimeType": "application/zip", "buffer": zipped(contents)})
+    page.locator('[data-simulate="calibrate"]').click()
+    # Seen, although the refusal hid the notes.
+    page.get_by_text("notes on this answer").wait_for()
+    assert page.locator('[data-file="instrument.zip"]').is_enabled()
 
 
 @pytest.mark.parametrize(

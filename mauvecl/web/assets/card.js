@@ -52,6 +52,8 @@ export class Card {
    * @param {Answer} answer */
   tell(answer) {
     if (!answer.headline) {
+      // The notes that an earlier refusal hid are shown again.
+      this.box.classList.remove("none")
       this.busy(false)
       return
     }
