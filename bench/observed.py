@@ -40,15 +40,12 @@ class Outcome:
         True if the flare that was put in is detected.
     inside : dict of str to bool
         Measured quantities, and if their 95 % intervals hold the truth.
-    free : bool
-        True if the analysis left out the light of single frames.
     """
 
     days: float
     false: int
     found: bool
     inside: dict[str, bool]
-    free: bool
 
 
 def outcome(
@@ -88,8 +85,7 @@ def outcome(
                                       ("energy bolometric", truth.bolometric_erg, 1 / 0.9)):  # fmt: skip
                 k = row.measured.column(name)
                 held[name] = bool(row.measured.low[1, 0, k] < value < row.measured.high[1, 0, k] * more)
-    free = one.spectra is not None and np.isinf(one.spectra.series.jitters.get("light", 0.0))
-    return Outcome(one.days, len(far), bool(near), held, bool(free))
+    return Outcome(one.days, len(far), bool(near), held)
 
 
 def main(star: str, magnitude: float, number: int, first: int, amplitude: float) -> None:
@@ -100,8 +96,7 @@ def main(star: str, magnitude: float, number: int, first: int, amplitude: float)
         print(seed, found[-1], flush=True)
     days = sum(one.days for one in found)
     print(f"{star} V={magnitude:g}: {days:.2f} star-days, {sum(one.false for one in found)} false alarms, expected "
-          f"{FALSE_ALARMS * days:.1f}; {sum(one.found for one in found)} of {number} flares; light left out in "
-          f"{sum(one.free for one in found)}")  # fmt: skip
+          f"{FALSE_ALARMS * days:.1f}; {sum(one.found for one in found)} of {number} flares")  # fmt: skip
     for name in ("temperature", "energy bolometric"):
         held = [one.inside[name] for one in found if name in one.inside]
         print(f"{name}: the 95 % intervals hold {sum(held)} of {len(held)}")

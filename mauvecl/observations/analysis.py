@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from mauvecl.lightcurve.defaults import RANK, Per, per_day
@@ -15,7 +14,7 @@ from mauvecl.lightcurve.flares.shapes import shape_of
 from mauvecl.lightcurve.search.importance_sampling import SampledRate
 from mauvecl.observations.colour import Colour, event_colour
 from mauvecl.observations.completeness import Completeness, inject
-from mauvecl.observations.event_spectrum import FLARE_SNR, EventSpectrum, event_spectrum, measure_flare
+from mauvecl.observations.event_spectrum import EventSpectrum, event_spectrum, measure_flare
 from mauvecl.observations.events import ObservedEvent, detect_events, measure_events
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames
@@ -31,8 +30,6 @@ Float = NDArray[np.float64]
 
 #: False alarms per star-day above which events are candidates.
 CANDIDATES = 1.0
-#: Probability of a number of chance events below which they are taken for changes of the throughput.
-IMPROBABLE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,10 +106,7 @@ class Analysis:
     def light_misleads(self) -> bool:
         """True if the light that all pixels share changes suddenly and the search does not leave it out."""
         series = None if self.spectra is None else self.spectra.series
-        if series is None or "light" in free_of(series.jitters):
-            return False
-        found = () if self.spectra is None else self.spectra.found
-        return bool(series.changes) or misled(self.events, found, chance_events(self.survey, self.wanted))
+        return series is not None and bool(series.changes) and bool(np.isfinite(series.jitters["light"]))
 
     def false_alarms(self, event: ObservedEvent) -> tuple[float, float]:
         """Return the false alarms per star-day at an event's statistic: in normal noise, and in noise as measured."""
@@ -151,7 +145,7 @@ class Analysis:
         if self.light_misleads:
             lines.append(
                 "The throughput changes, as by pointing losses; short changes may resemble flares: "
-                'search.frame.light = "free" searches without the light that all pixels share, with a smaller S/N.'
+                'search.frame.light = "free", the default, searches without the light that all pixels share.'
             )
         red = next((one for one in self.scatter if one.red), None)
         if red is not None:
@@ -198,11 +192,11 @@ def analyse_frames(
         Largest number of weighted sums of a spectrum.
     jitters : mapping of str to float, optional
         Standard deviations of light, dark current and sky from frame to frame, infinite for those that the search
-        leaves out. By default as measured, and infinite for the light where it changes suddenly.
+        leaves out. Where they do not state it, that of the light is infinite and that of the dark current as measured.
     temperature_k : float
         Temperature of injected flares in spectra.
     """
-    wanted, given = per_day(false_alarms, per), frames
+    wanted = per_day(false_alarms, per)
     cleaned = None if model is None else clean_spectra(frames, model)
     frames = frames if cleaned is None else cleaned.frames
     flux, error = frames.white_light
@@ -225,14 +219,6 @@ def analyse_frames(
     seen = None if series is None else [event_spectrum(survey, series, taken, one) for one in detected]
     causes = None if seen is None else [one.cause for one in seen]
     events = measure_events(survey, taken, candidates, detected, causes)
-    chance = chance_events(survey, wanted)
-    free = free_of({} if series is None else series.jitters)
-    if series is not None and jitters is None and "light" not in free and misled(events, seen, chance):
-        # Changes that are too small to stand out by themselves, but not for the search.
-        return analyse_frames(
-            given, false_alarms=false_alarms, per=per, shape=shape, seed=seed, model=model, rank=rank,
-            jitters={**series.jitters, "light": np.inf}, temperature_k=temperature_k,
-        )  # fmt: skip
     spectra = None
     if cleaned is not None and series is not None and seen is not None:
         measured_flares = [
@@ -247,26 +233,6 @@ def analyse_frames(
         inject(survey, ~taken, threshold, seed, temperature_k),
         binned_scatter(survey.stare.numbers[quiet], residual[quiet]), spectra,
     )  # fmt: skip
-
-
-def free_of(jitters: Mapping[str, float]) -> list[str]:
-    """Return the names of the unknowns of single frames that are projected out."""
-    return [name for name, sd in jitters.items() if np.isinf(sd)]
-
-
-def chance_events(survey: SeriesSurvey, wanted: float) -> float:
-    """Return the expected number of events above the threshold of candidates in noise alone."""
-    return max(wanted, CANDIDATES) * survey.stare.observed_s / DAY_S
-
-
-def misled(events: Sequence[ObservedEvent], spectra: Sequence[EventSpectrum] | None, expected: float) -> bool:
-    """Return whether events are changes of the throughput, or more of them resemble such changes than chance explains.
-
-    Some of the expected number of events in noise alone resemble changes of the throughput rather than flares.
-    """
-    resemble = sum(one.chi2["throughput"] < one.chi2["flare"] and one.snr < FLARE_SNR for one in spectra or ())
-    clear = any(one.kind in ("step", "throughput") for one in events)
-    return clear or bool(scipy.stats.poisson.sf(resemble - 1, expected) < IMPROBABLE)
 
 
 def _spectral_messages(spectra: SpectralAnalysis) -> list[str]:
@@ -293,15 +259,17 @@ def _spectral_messages(spectra: SpectralAnalysis) -> list[str]:
             "by pointing losses and re-acquisitions; the table of throughput states when."
         )
     for name, sd in spectra.series.jitters.items():
-        if np.isinf(sd):
+        if np.isfinite(sd):
+            size = f"{sd:.2g} deg C" if name == "dark" else f"{100 * sd:.2g} %"
+            lines.append(f"The {name} of single frames changes: {size}, which the search marginalises over.")
+        elif name == "light":
             left = f"{100 * spectra.series.kept:.2g} %"
             lines.append(
-                f"The search leaves out all changes of the {name} of single frames: flares keep {left} of their S/N. "
-                "search.frame states another treatment."
+                "The level of each frame is free in the search, because pointing losses change it: flares keep "
+                f"{left} of their S/N; search.frame.light states its standard deviation instead (1e-6: steady)."
             )
-            continue
-        size = f"{sd:.2g} deg C" if name == "dark" else f"{100 * sd:.2g} %"
-        lines.append(f"The {name} of single frames changes: {size}, which the search marginalises over.")
+        else:
+            lines.append(f"The search leaves out all changes of the {name} of single frames.")
     return lines
 
 

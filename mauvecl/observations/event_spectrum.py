@@ -29,6 +29,8 @@ FLARE_SNR = 4.0
 RAY_SHARE = 0.5
 #: Smallest number of means of quiescent frames from which drifts are measured.
 MIN_PARTS = 8
+#: Share of the frames of such a part that must be quiescent.
+QUIET_SHARE = 0.5
 #: Probability of a worse fit below which no spectrum that is known explains an event.
 NO_FIT = 1e-6
 
@@ -172,17 +174,20 @@ def drifts(survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_
     covariance = np.linalg.inv(white @ white.T)
     amplitudes = series.excess @ (covariance @ white / series.noise.used).T
     found = dict.fromkeys(names, np.inf)
-    size, means = n_frames, list[Float]()
+    size, means, counts = n_frames, list[Float](), np.zeros(0, np.intp)
     while size > 0 and len(means) < MIN_PARTS:
         part = survey.stare.numbers // size
-        whole = np.bincount(part[~taken], minlength=int(part[-1]) + 1) == size
-        means = [amplitudes[(part == k) & ~taken].mean(axis=0) for k in np.flatnonzero(whole)]
+        counts = np.bincount(part[~taken], minlength=int(part[-1]) + 1)
+        # A part without the frames of a short event still shows the drift.
+        enough = np.flatnonzero(counts > QUIET_SHARE * size)
+        means, counts = [amplitudes[(part == k) & ~taken].mean(axis=0) for k in enough], counts[enough]
         size = size if len(means) >= MIN_PARTS else size // 2
     if len(means) >= MIN_PARTS:
         bends = np.diff(np.array(means), 2, axis=0) / 2
         for k, name in enumerate(names):
-            # A mean less that of its neighbours has 3/2 of the variance of a mean.
-            expected = 1.5 * float(covariance[k, k]) / size
+            share = 1.0 / counts
+            # A mean less that of its neighbours has 3/2 of the variance of a mean, where all are of as many frames.
+            expected = float(covariance[k, k]) * float((share[:-2] / 4 + share[1:-1] + share[2:] / 4).mean())
             beyond = max(float(np.mean(bends[:, k] ** 2)) - expected, 0.0)
             found[name] = n_frames / size * float(np.sqrt(beyond + 2 * expected * np.sqrt(2 / len(bends))))
     if "sky" in unknown and isinstance(NUISANCES["sky"].prior, Amplitude):

@@ -1,7 +1,7 @@
 """Spectra of observed frames: single bad pixels, noise of each pixel as measured, and sums weighted for flares.
 
 The weights are those of the marginalised matched filter (METHODS section 7) for flares of 6000 to 30 000 K, with the
-noise of each pixel, where light and dark current jitter from frame to frame with the scatter that the frames show.
+noise of each pixel. The level of each frame is free: pointing losses change it, and a faint star does not show them.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ class SpectralSeries:
     changes : list of LightChange
         Sudden changes of the light that all pixels share.
     kept : float
-        Share of the S/N of flares that is left because of these unknowns.
+        S/N of flares over that with a steady level of the frames.
     """
 
     excess: Float
@@ -251,8 +251,8 @@ def survey_spectra(
     rank : int
         Largest number of sums of a frame.
     jitters : mapping of str to float, optional
-        Standard deviations of unknowns of each frame, infinite for those that are projected out. By default as
-        measured, and infinite for the light if it changes suddenly.
+        Standard deviations of unknowns of each frame, infinite for those that are projected out. Where they do not
+        state it, that of the light is infinite and that of the dark current as measured.
 
     Returns
     -------
@@ -268,25 +268,24 @@ def survey_spectra(
     neighbours = np.diff(frames.numbers) == 1
     pairs = np.flatnonzero(level.quiet[:-1] & level.quiet[1:] & neighbours)
     assert frames.wavelength_nm is not None
-    shared = {name: unknown[name] for name in ("light", "dark")}
-    noise = measure_noise(excess, pairs, cleaned.stated, np.array(list(shared.values())), frames.wavelength_nm)
+    shared = np.array([unknown["light"], unknown["dark"]])
+    noise = measure_noise(excess, pairs, cleaned.stated, shared, frames.wavelength_nm)
     flares = model.flares(TEMPERATURES_K)
     compared = np.flatnonzero((level.reasons & ~Reason.BELOW) == 0)
     others = np.vstack([flares, *(spectrum for name, spectrum in unknown.items() if name != "light")])
     changes = light_changes(excess, compared, frames.numbers, light, others, noise.used)
-    known = _jitters(excess, pairs, noise.used, shared) if jitters is None else dict(jitters)
-    if jitters is None and changes:
-        known["light"] = np.inf
+    known = {"light": np.inf} | _dark_jitter(excess, pairs, noise.used, shared) | dict(jitters or {})
     names = tuple(name for name in known if name in unknown)
     nuisances = Nuisances(names, np.array([unknown[name] for name in names]).reshape(len(names), light.size),
                           np.array([known[name] for name in names]))  # fmt: skip
     typical = abs(float(np.median(level.level[level.used])))
     # Flares that once more add the light of the star, in the sum over wavelength.
     flares *= typical / flares.sum(axis=1, keepdims=True)
-    templates = Templates.of_spectra(
-        noise.used**2, flares, model.gain, TEMPERATURES_K, nuisances=nuisances or None, rank=rank
+    templates, steady = (
+        Templates.of_spectra(noise.used**2, flares, model.gain, TEMPERATURES_K, nuisances=some, rank=rank)
+        for some in (nuisances, nuisances.without(["light"]))
     )
-    kept = float(np.median(templates.best / np.linalg.norm(flares / noise.used, axis=1)))
+    kept = float(np.median(templates.best / steady.best))
     sums = np.concatenate([excess[i : i + BLOCK] @ templates.weights.T for i in range(0, len(excess), BLOCK)])
     used = level.used
     width = max(3, round(MEDIAN_S / frames.cadence_s))
@@ -312,29 +311,17 @@ def survey_spectra(
     return survey, SpectralSeries(excess[used], light, noise, model, known, changes, kept), level
 
 
-def _jitters(excess: Float, pairs: NDArray[np.intp], sd: Float, shared: Mapping[str, Float]) -> dict[str, float]:
-    """Measure the scatter of unknowns from frame to frame beyond that of noise, the most significant one first.
+def _dark_jitter(excess: Float, pairs: NDArray[np.intp], sd: Float, shared: Float) -> dict[str, float]:
+    """Measure the scatter of the dark current from frame to frame beyond that of noise; empty if insignificant.
 
-    Each is fitted together with those that were found before, and the search ends where none is significant.
+    It is fitted together with the light, in the order of the rows of `shared`: light, dark.
     """
-    found: dict[str, float] = {}
-    while len(found) < len(shared):
-        best: tuple[float, dict[str, float]] = (DEPARTS, {})
-        for name in [each for each in shared if each not in found]:
-            names = (*found, name)
-            white = np.array([shared[each] for each in names]) / sd
-            covariance = np.linalg.inv(white @ white.T)
-            weights = (covariance @ white / sd).T
-            amplitudes = np.concatenate([excess[i : i + BLOCK] @ weights for i in range(0, len(excess), BLOCK)])
-            beyond = np.mean((amplitudes[pairs + 1] - amplitudes[pairs]) ** 2, axis=0) / 2 / np.diag(covariance) - 1
-            significance = float(beyond[-1]) / (2 * relative_error(pairs.size))
-            if significance > best[0]:
-                spread = np.sqrt(np.maximum(beyond, 0.0) * np.diag(covariance))
-                best = significance, dict(zip(names, spread.tolist(), strict=True))
-        if not best[1]:
-            break
-        found = best[1]
-    return {name: value for name, value in found.items() if value > 0}
+    white = shared / sd
+    covariance = np.linalg.inv(white @ white.T)
+    amplitude = excess @ (covariance[1] @ white / sd)
+    beyond = float(np.mean((amplitude[pairs + 1] - amplitude[pairs]) ** 2)) / 2 - covariance[1, 1]
+    significant = beyond > DEPARTS * 2 * relative_error(pairs.size) * covariance[1, 1]
+    return {"dark": float(np.sqrt(beyond))} if significant else {}
 
 
 def _whitening(sums: Float, pairs: NDArray[np.intp]) -> Float | None:

@@ -61,10 +61,13 @@ def answer() -> AnalyseAnswer:
 @pytest.mark.long
 def test_temperatures_and_luminosities_are_those_of_the_spectra(answer: AnalyseAnswer) -> None:
     """Statistical errors are 4 % at 912 s and 13 % at 1497 s; a blackbody adds some 7 % to the ultraviolet at 912 s."""
-    rows = [row for row in answer.rows if row.significant]
+    survey, significant = answer.analysis.survey, [row for row in answer.rows if row.significant]
+    rows = [max(significant, key=lambda row: -abs(survey.time_s[row.event.brightest] - PEAKS_S[one])) for one in FILES]
     assert [row.event.kind for row in rows] == ["flare", "flare"]
+    # A quarter of a false alarm is promised; more than two happen once in 460 draws.
+    assert len(significant) <= 2 + 2
     for row, seconds in zip(rows, FILES, strict=True):
-        survey, found = answer.analysis.survey, row.measured
+        found = row.measured
         assert not isinstance(found, str), found
         assert abs(survey.time_s[row.event.brightest] - PEAKS_S[seconds]) < 30
         inside = np.isin(TIME, survey.time_s[row.event.first : row.event.last + 1])

@@ -74,11 +74,12 @@ def test_completeness_equals_that_of_inject(pointing: dict[str, Any], stares: St
     answer = analyse(quiet, frames=read_frames(tmp_path / NAME))
     completeness, spectra = answer.analysis.completeness, answer.analysis.spectra
     assert spectra is not None
-    assert np.isinf(spectra.series.jitters.get("light", 0.0)) == bool(pointing)
     width = float(completeness.half_widths_s[1])
     injections = {"of": "duration", "half_width_low_s": width, "half_width_high_s": width, "widths": 1, "sizes": 12,
                   "count": 200, "positions": 20, "fitted": 0}  # fmt: skip
-    expected = inject(Study(**sections, injections=injections), stares)
+    # The level of each frame is free in analyses; inject assumes that by itself only of stares with pointing losses.
+    free = {"search": SECTIONS["search"] | {"frame": {"light": "free"}}}
+    expected = inject(Study(**sections | free, injections=injections), stares)
     # Sizes of inject are relative to the star in the flare's band, those of analyse to all light of the frames.
     series = spectra.series
     relative = float(series.model.flares((10_000.0,))[0].sum() / series.light.sum())
@@ -89,15 +90,21 @@ def test_completeness_equals_that_of_inject(pointing: dict[str, Any], stares: St
 
 
 @pytest.mark.long
-def test_blind_analysis_of_stares_with_pointing_losses_finds_the_flares_and_no_others(stares: Stares) -> None:
+@pytest.mark.parametrize(
+    ("star", "first"), [(("M3V", 9.0, 0.3), 2940), (("M5V", 11.0, 1.0), 3108)], ids=["bright", "faint"]
+)
+def test_blind_analysis_of_stares_with_pointing_losses_finds_the_flares_and_no_others(
+    star: tuple[str, float, float], first: int, stares: Stares
+) -> None:
     """Eight stares with unknowns, rays, three drifts an hour and a flare each, at 10 false alarms per star-day.
+
+    The faint star hides its losses of light in the noise of the dark current.
 
     The bound on false alarms fails by chance once in a thousand times, those of the 95 % intervals once in 2700 times;
     a flare of these has an S/N of 30 or more. `bench/observed.py` counts more of them.
     """
-    found = [bench().outcome(stares, "M3V", 9.0, 0.3, seed) for seed in range(2940, 2948)]
+    found = [bench().outcome(stares, *star, seed) for seed in range(first, first + 8)]
     assert all(one.found for one in found)
-    assert sum(one.free for one in found) >= 4
     assert sum(one.false for one in found) <= stats.poisson.ppf(0.999, 10.0 * sum(one.days for one in found))
     for name in ("temperature", "energy bolometric"):
         # P(less than 5 of 8) = 3.7e-4 for 95 %.
