@@ -116,7 +116,8 @@ def _landing(instrument: Instrument, order: Order) -> csr_array:
     return scaled
 
 
-@lru_cache(maxsize=8)
+# An answer asks for those of each mode of a fitted instrument, some 16 of 7 MB each, several times.
+@lru_cache(maxsize=24)
 def _line_landing(line: LineSpread, knots: tuple[float, ...]) -> csr_array:
     """Return the fraction of the light at each panel node that falls on each pixel, shape (n_pixel, n_panel_node)."""
     nodes = _panel_nodes(line.panel_edges(np.array(knots)))
