@@ -54,6 +54,8 @@ TEXTS: dict[str, tuple[str, ...]] = {
     "band": ("V", "Kepler", "GALEX NUV"),
     "magnitude": ("5.5", "7.25", "9", "10.1"),
     "amplitude_percent": ("0.7", "2", "13"),
+    # Each fits a window of a target.
+    "exposure_s": ("7.5", "50", "333.3", "1800"),
     "seed": ("1", "7", "123456789"),
     "joint_fit": ("no",),
     "flare_file": ("",),

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from mauvecl.schema.fields import Range, checked, checked_number
 from mauvecl.schema.physical import Temperature
 
-Float = NDArray[np.float64]
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 #: Names by which they are offered.
 EXAMPLES = ("blackbody 9000 K", "power law -2")
@@ -59,8 +59,10 @@ class ModelStar:
         """Formula of the spectrum."""
         return "Planck's law" if self.index is None else f"flux per wavelength proportional to its power {self.index:g}"
 
-    def spectrum(self) -> tuple[Float, Float]:
+    def spectrum(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return wavelengths, nm, and fluxes, erg s-1 cm-2 A-1, of an arbitrary level."""
+        import numpy as np
+
         nm = np.geomspace(*GRID)
         if self.index is not None:
             return nm, (nm / PIVOT_NM) ** self.index

@@ -20,7 +20,7 @@ from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import FirstRealisation, Realisations
 from mauvecl.schema.tables import Column
-from mauvecl.store.description import without_later_attributes
+from mauvecl.store.description import without_later_attributes, without_version
 from mauvecl.store.export import Selection, export
 from mauvecl.store.layout import CRC_BYTES, Chunk, Store, crc, digest
 from mauvecl.store.stored_scenes import StoredScene
@@ -396,7 +396,7 @@ def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
         try:
             data = there.read_bytes()
             if name.endswith("zarr.json"):
-                found, made = json.loads(data), json.loads(content)
+                found, made = (without_version(json.loads(one)) for one in (data, content))
                 same, seen = found in (made, without_later_attributes(made)), "foreign"
             else:
                 same, seen = data == content, "damaged"

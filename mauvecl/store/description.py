@@ -46,6 +46,12 @@ def without_later_attributes(described: dict[str, Any]) -> dict[str, Any]:
     return described | {"attributes": {k: v for k, v in attributes.items() if k not in LATER_ATTRIBUTES}}
 
 
+def without_version(described: dict[str, Any]) -> dict[str, Any]:
+    """Return the description of a group without the version that wrote it, which may be any."""
+    attributes = described.get("attributes", {})
+    return described | {"attributes": {k: v for k, v in attributes.items() if k != "mauvecl"}}
+
+
 def describe(study: Study, scenes: Sequence[StoredScene], folder: Path) -> None:
     """Write groups, descriptions of arrays and calibration of a store to a folder."""
     import zarr

@@ -15,6 +15,7 @@ from astropy.io import fits
 from astropy.table import QTable
 from commands import run, started
 
+from mauvecl import __version__
 from mauvecl.answers.detection.detect import detect
 from mauvecl.answers.signal.simulate import simulate
 from mauvecl.device.engine import Engine
@@ -369,7 +370,7 @@ def test_library_and_devices_are_listed(tmp_path: Path) -> None:
     assert "HD 40307" in run("library", folder=tmp_path).stdout
     assert len(json.loads(run("library", "--json", folder=tmp_path).stdout)) >= 25
     assert json.loads(run("devices", "--no-rate", "--json", folder=tmp_path).stdout)[0]["default"]
-    assert "mauvecl 0" in run("--version", folder=tmp_path).stdout
+    assert run("--version", folder=tmp_path).stdout == f"mauvecl {__version__}\n"
 
 
 def test_saturation_is_the_first_message(tmp_path: Path) -> None:

@@ -380,7 +380,7 @@ def test_excess_equals_that_of_the_matched_statistic(closed: ClosedForms) -> Non
 def test_trade_reports_no_value_beyond_its_axis(closed: ClosedForms, tmp_path: Path) -> None:
     """Where more than half are detected at the least false-alarm probability shown, half of them are below it."""
     trade = next(picture for picture in TABS["detection"].pictures if picture.name == "roc")
-    half = float(re.findall(r"half of them at (\S+)\. A", trade.drawn(closed, {}).text)[0])
+    half = float(re.findall(r"half of them at (\S+)\.$", trade.drawn(closed, {}).text)[0])
     assert closed.seen.sf(closed.null.isf(np.array([half])))[0] == pytest.approx(0.5, abs=0.02)
     bright = State()
     bright.enter({"magnitude": "7.4"})
