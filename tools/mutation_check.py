@@ -276,7 +276,7 @@ MUTATIONS = {
         "tests/results/test_detection.py::test_null_follows_its_closed_form",
     ),
     "closed forms that follow a temperature by their means alone": Mutation(
-        (("mauvecl/statistics/statistic.py", "+ amounts @ (variances", "+ 0.0 * amounts @ (variances"),),
+        (("mauvecl/statistics/statistic.py", ", seen.variance + each @ variances)", ", seen.variance)"),),
         "tests/device/test_marginal.py::test_closed_forms_integrate_over_drawn_unknowns[half a degree]",
     ),
     "moved scores that count like others": Mutation(

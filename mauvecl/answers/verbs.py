@@ -380,6 +380,7 @@ VERBS: dict[str, Verb] = {
             (
                 "plan",
                 "search.false_alarms",
+                "search.per",
                 "observation.instrument",
                 "observation.temperature_c",
                 "flare.temperature_k",

@@ -264,6 +264,8 @@ class Pool:
 
         Concurrent calls use several workers.
         """
+        if self._stopping:
+            raise Stopped
         request = RealiseRequest.of(expectation, count, **how)
         task = Task(request, uuid.uuid4().hex, Shard(0, request.start, request.realisations), out=out)
         rows: NDArray[Any] = self.workers.submit(task).result()["rows"]

@@ -160,7 +160,7 @@ def test_fields_are_shown_where_they_matter() -> None:
     assert TABS["visibility"].reads == {"targets", "start", "days"}
     spectrum = {"flare_temperature_k", "balmer_jump", "lines", "second_temperature_k", "second_area", "flare_file"}
     spectrum |= set(READ_WITH["flare_file"])
-    assert TABS["plan"].reads == {"targets", "start", "days", "hours", "instrument", "temperature_c"} | spectrum
+    assert TABS["plan"].reads == {"targets", "start", "days", "hours", "instrument", "temperature_c", "per"} | spectrum
     assert "visits" in TABS["change"].reads
     assert "visits" not in HEADLINE
     for name in SIMULATIONS:

@@ -42,8 +42,8 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Number of exposures drawn and fitted at once, which limits the memory.
-BATCH = 4096
+#: Number of exposures drawn and fitted at once, which limits the memory and the time until a fit can be cancelled.
+BATCH = 256
 #: S/N below which the coverage of intervals differs from the nominal one (bench/coverage.py).
 WILKS_SNR = 10.0
 #: p-value below which a fit is rejected.
