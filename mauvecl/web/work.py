@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mauvecl.device.engine import Engine
-from mauvecl.runs.pool import LocalWorkers, Pool
+from mauvecl.runs.pool import LocalWorkers, Pool, Stopped
 
 #: Simulations that a server computes at the same time; others wait.
 TOGETHER = 2
@@ -32,10 +32,10 @@ class Cancelled(Exception):  # noqa: N818
     """Cancellation by the visitor."""
 
 
-def _strike(thread: int | None, with_what: type[BaseException] | None) -> None:
+def _strike(thread: int, with_what: type[BaseException] | None) -> None:
     """Raise an exception in a thread at its next bytecode, or withdraw it."""
     given = None if with_what is None else ctypes.py_object(with_what)
-    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread or 0), given)
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), given)
 
 
 def _engine(progress: Callable[[int, int], None]) -> Engine:
@@ -91,16 +91,18 @@ class Job:
             release_memory()
 
     def _run_cancellable(self) -> Any:
-        if self.drawing:
-            return self._asked()
-        with self._lock:
-            self._thread = threading.get_ident()
+        if not self.drawing:
+            with self._lock:
+                self._thread = threading.get_ident()
         try:
             return self._asked()
+        except Stopped as error:
+            raise Cancelled from error
         finally:
             # A strike that has not come yet would meet whatever this thread does next.
             with self._lock:
-                _strike(self._thread, None)
+                if self._thread is not None:
+                    _strike(self._thread, None)
                 self._thread = None
 
     def _asked(self) -> Any:
@@ -126,6 +128,9 @@ class Job:
             self._cancelled.set()
             if self._thread is not None and not again:
                 _strike(self._thread, Cancelled)
+        # What waits for fits in other threads is not struck: they end between two of their draws.
+        if self._pool is not None:
+            self._pool.stop()
         self.future.cancel()
 
     @property
