@@ -86,11 +86,13 @@ def changes_of(x: Expectation) -> tuple[Float, Float]:
     """Return what factors add to an exposure's means (DN) and variances (DN^2), each shape (3, n_pixel).
 
     Rows are for all light, which includes the sky's, for the sky's alone, and for the dark current, each for an amount
-    of one.
+    of one. A pixel that saturates records a change only in those frames that are not clipped, and its variance changes
+    by the same fraction as without saturation, so that no factor makes it negative.
     """
-    means = np.array([x.recorded_light_dn, x.sky_dn, x.n_frames * x.dark_dn])
-    dark = x.n_frames * x.dark_variance_dn2
-    return means, np.array([*(x.gain_dn_per_electron * means[:2]), dark])
+    light, dark = np.array([x.light_dn, x.sky_dn]), x.n_frames * x.dark_dn
+    variances = np.array([*(x.gain_dn_per_electron * light), x.n_frames * x.dark_variance_dn2])
+    means = np.array([*light, dark]) * (1 - x.cut_share)
+    return means, variances * (x.variance_dn2 / x.unsaturated_variance_dn2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,9 +147,8 @@ class FactorDistributions:
         rows : ndarray, shape (k, n_pixel)
             Spectra of factors treated as normal amplitudes, DN per standard deviation.
         """
-        gain, light, sky = x.gain_dn_per_electron, x.recorded_light_dn, x.sky_dn
-        dark, dark_variance = x.n_frames * x.dark_dn, x.n_frames * x.dark_variance_dn2
-        moved = {"dark": (dark, dark_variance), "light": (light, gain * light), "sky": (sky, gain * sky)}
+        light, sky, dark = zip(*changes_of(x), strict=True)
+        moved = {"dark": dark, "light": light, "sky": sky}
         grids, rows = [], []
         every, few = 1 if weighted else COARSE, np.polynomial.hermite_e.hermegauss(FEW)
         score, weight = SCORE[::every], WEIGHTS[::every] / WEIGHTS[::every].sum()
@@ -165,7 +166,7 @@ class FactorDistributions:
         for chosen in product(*grids):
             weights, (warm, lit, grey), scores = zip(*chosen, strict=True)
             nodes.append(Node(math.prod(weights), warm, lit, grey, dict(zip(moved, scores, strict=True))))
-        return nodes, np.array(rows).reshape(len(rows), light.size)
+        return nodes, np.array(rows).reshape(len(rows), x.variance_dn2.size)
 
 
 def _normal(mean: float, sd: float) -> FactorDistribution:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scenes import instrument, star
 
-from mauvecl.noise.factor_distributions import FactorDistributions
+from mauvecl.noise.factor_distributions import FactorDistributions, changes_of
 from mauvecl.noise.processes import Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
 from mauvecl.statistics.distributions import Gaussian, Mixture, QuadraticForm
@@ -64,6 +66,24 @@ def test_nodes_sum_to_one_and_have_mean_of_factors(weighted: bool) -> None:
     # The sky alone is faint enough to be an amplitude.
     assert rows.shape == (1, quiet.wavelength_nm.size)
     assert rows[0] == pytest.approx(found.spreads["sky"].sd * quiet.sky_dn)
+
+
+@pytest.mark.parametrize("magnitude", [-2.0, -1.2, -1.0, 2.0])
+def test_changes_are_slopes_of_recorded_moments(magnitude: float) -> None:
+    """Compare with a star whose light, or dark, is larger by 1e-5, where no, some and most pixels saturate."""
+    quiet, *_ = star("K3V", magnitude, payload=instrument(part=True))
+    means, variances = changes_of(quiet)
+    step = 1e-5
+    light = ("source_electrons", "sky_electrons", "neighbour_electrons")
+    for row, names in ((0, light), (1, light[1:2]), (2, ("dark_dn",))):
+        moved = replace(quiet, **{name: getattr(quiet, name) * (1 + step) for name in names})
+        slope, unclipped = (moved.recorded_dn - quiet.recorded_dn) / step, (moved.mean_raw_dn - quiet.mean_raw_dn) / step
+        # The width of the distribution changes too, by much less than its mean.
+        assert slope / quiet.n_frames == pytest.approx(means[row] / quiet.n_frames, abs=5e-3 * unclipped.max())
+    # Dark and light together are all of what factors change: without them the variance is not negative.
+    assert (quiet.variance_dn2 - variances[0] - variances[2] >= 0).all()
+    assert (means >= 0).all()
+    assert (quiet.cut_share.max() > 0.1) == (magnitude < 0)
 
 
 def test_mixture_follows_simulation() -> None:
