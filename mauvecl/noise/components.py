@@ -18,8 +18,12 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.host.expectation import Expectation
+    from mauvecl.noise.scene import Scene
 
 Float = NDArray[np.float64]
+
+#: Frames that are drawn together.
+FRAMES_AT_ONCE = 256
 
 
 def components(
@@ -54,65 +58,15 @@ def components(
     the dark counts is Poisson times Gaussian. Only in this decomposition, Poisson photons are treated as Gaussian.
     """
     scene = prepare([x], **drawing)
-    index = np.array([realisation], np.uint64)
-    n = scene.n_pixel
-    each = x.n_frames // scene.n_draws  # frames in one draw
-    gain = x.gain_dn_per_electron
-    parts = {
-        name: np.zeros(n)
-        for name in ("source", "sky", "neighbours", "photon_noise", "dark", "read_noise", *scene.additive)
-    }
-    raw = np.zeros(n)
-    for frame in range(scene.n_draws):
-        factors = reference.factors(scene, index, frame, seed)
-        light, warm, glow = ((1.0 + float(f[0])) * middle for f, middle in zip(factors, scene.medians, strict=True))
-        dark_dn, photon_dn, analogue, dn = np.zeros((4, len(scene.pixels)))
-        added = {name: np.zeros(len(scene.pixels)) for name in scene.additive}
-        u_dark, z_split = np.zeros((2, len(scene.pixels)))
-        for group in range(len(scene.pixels) // 4):
-            drawn = reference.draws(scene, index, frame, group, seed)
-            chance = reference.words_at(index, frame, "split_dark", group, seed)
-            apart = random_numbers.four_normals(reference.words_at(index, frame, "split", group, seed))
-            for i, p in enumerate(range(4 * group, 4 * group + 4)):
-                v = reference.analogue(scene, drawn, i, p, 0, *factors)
-                analogue[p] = v[0]
-                dn[p] = reference.digitise(v, scene.edges[0, p], clip=scene.clip)[0]
-                z_split[p] = apart[i][0]
-                u_dark[p] = (float(chance[i][0]) + 0.5) / 2**32
-                for name, electrons in drawn.added.items():
-                    added[name][p] = scene.pixels[p]["electron_gain"] * electrons[i][0]
-                if not scene.joint:
-                    dark_dn[p] = scene.dark_counts[p]["gain"] * drawn.dark[i][0]
-                if drawn.photon is not None:
-                    pairs = random_numbers.four_normals(drawn.photon)
-                    source = scene.photon_counts[0, p]
-                    electrons = reference.poisson_draw(drawn.photon, i, source, scene.tables, pairs)[0]
-                    photon_dn[p] = source["gain"] * electrons
-        source, sky = each * light * gain * x.source_electrons, each * light * glow * gain * x.sky_electrons
-        neighbours = each * light * gain * x.neighbour_electrons
-        photon_variance = gain * (source + sky + neighbours)
-        read_variance = each * x.read_noise_dn**2 + (each - 1) / 12
-        mean_dark = each * warm * x.dark_dn
-        # All random parts of this draw: photon noise + read noise + dark counts, DN.
-        total = scene.base_dn[0] + analogue[:n]
-        for charge in added.values():
-            total = total - charge[:n]
-        total = total - source - sky - neighbours - each * x.bias_dn
-        if scene.joint:
-            dark = _dark_given_total(total, mean_dark, x.dark_step_dn, photon_variance + read_variance, u_dark[:n])
-        else:
-            dark = x.dark_step_dn * np.rint(mean_dark / x.dark_step_dn) + dark_dn[:n]
-        rest = total - dark
-        if scene.photons:
-            photon = gain * np.rint(each * x.light_electrons) + photon_dn[:n] - source - sky - neighbours
-        else:
-            both = photon_variance + read_variance
-            share = np.divide(photon_variance, both, out=np.zeros(n), where=both > 0)
-            photon = rest * share + np.sqrt(read_variance * share) * z_split[:n]
-        charges = (charge[:n] for charge in added.values())
-        for name, part in zip(parts, (source, sky, neighbours, photon, dark, rest - photon, *charges), strict=True):
-            parts[name] += part
-        raw += scene.base_dn[0] + dn[:n]
+    names = ["source", "sky", "neighbours", "photon_noise", "dark", "read_noise", *scene.additive]
+    parts = {name: np.zeros(scene.n_pixel) for name in names}
+    raw = np.zeros(scene.n_pixel)
+    for start in range(0, scene.n_draws, FRAMES_AT_ONCE):
+        frames = np.arange(start, min(start + FRAMES_AT_ONCE, scene.n_draws))
+        one = _Parts(x, scene, realisation, frames, seed)
+        for name, part in zip(names, one.all(), strict=True):
+            parts[name] += part.sum(axis=1)
+        raw += frames.size * scene.base_dn[0] + one.recorded.sum(axis=1)
     parts["bias"] = np.asarray(x.n_frames * x.bias_dn)
     values = {"wavelength": x.wavelength_nm, "raw": raw} | parts
     values["digitisation"] = raw - sum(parts.values())
@@ -124,21 +78,90 @@ def components(
     return table_of(columns, [values], **about)
 
 
+class _Parts:
+    """Draws of several frames, or of the sum of all frames, in DN; arrays have the shape (n_pixel, n_draw)."""
+
+    def __init__(self, x: Expectation, scene: Scene, realisation: int, frames: NDArray[np.int64], seed: int) -> None:
+        self.x, self.scene = x, scene
+        self.each = x.n_frames // scene.n_draws  # frames in one draw
+        index = np.full(frames.size, realisation, np.uint64)
+        each_frame = [reference.factors(scene, index[:1], frame, seed) for frame in frames.tolist()]
+        changes = [np.concatenate(factor) for factor in zip(*each_frame, strict=True)]
+        self.light, self.warm, self.glow = (
+            (1.0 + change.astype(np.float64)) * middle for change, middle in zip(changes, scene.medians, strict=True)
+        )
+        shape = len(scene.pixels), frames.size
+        analogue, self.recorded, dark, photon, self.score, self.chance = np.zeros((6, *shape))
+        added = {name: np.zeros(shape) for name in scene.additive}
+        for group in range(len(scene.pixels) // 4):
+            drawn = reference.draws(scene, index, frames, group, seed)
+            chance = reference.words_at(index, frames, "split_dark", group, seed)
+            scores = random_numbers.four_normals(reference.words_at(index, frames, "split", group, seed))
+            for i, p in enumerate(range(4 * group, 4 * group + 4)):
+                v = reference.analogue(scene, drawn, i, p, 0, *changes)
+                analogue[p], self.recorded[p] = v, reference.digitise(v, scene.edges[0, p], clip=scene.clip)
+                self.score[p], self.chance[p] = scores[i], (chance[i].astype(np.float64) + 0.5) / 2**32
+                for name, charge in drawn.added.items():
+                    added[name][p] = scene.pixels[p]["electron_gain"] * charge[i]
+                if not scene.joint:
+                    dark[p] = scene.dark_counts[p]["gain"] * drawn.dark[i]
+                if drawn.photon is not None:
+                    source = scene.photon_counts[0, p]
+                    normals = random_numbers.four_normals(drawn.photon)
+                    electrons = reference.poisson_draw(drawn.photon, i, source, scene.tables, normals)
+                    photon[p] = source["gain"] * electrons
+        n = scene.n_pixel
+        self.recorded, self.score, self.chance = self.recorded[:n], self.score[:n], self.chance[:n]
+        self.added = {name: charge[:n] for name, charge in added.items()}
+        self.counted_dark, self.counted_photons = dark[:n], photon[:n]
+        self.level = scene.base_dn[0][:, None] + analogue[:n]
+
+    def all(self) -> list[Float]:
+        """Return source, sky, neighbours, photon noise, dark, read noise and the charges of additive processes."""
+        x, scene, each = self.x, self.scene, self.each
+        gain, step = x.gain_dn_per_electron[:, None], x.dark_step_dn[:, None]
+        source = each * self.light * gain * x.source_electrons[:, None]
+        sky = each * self.light * self.glow * gain * x.sky_electrons[:, None]
+        neighbours = each * self.light * gain * x.neighbour_electrons[:, None]
+        photon_variance = gain * (source + sky + neighbours)
+        read_variance = each * x.read_noise_dn[:, None] ** 2 + (each - 1) / 12
+        mean_dark = each * self.warm * x.dark_dn[:, None]
+        # All random parts: photon noise + read noise + dark counts.
+        total = self.level - sum(self.added.values())
+        total = total - source - sky - neighbours - each * x.bias_dn[:, None]
+        if scene.joint:
+            dark = _dark_given_total(total, mean_dark, x.dark_step_dn, photon_variance + read_variance, self.chance)
+        else:
+            dark = step * np.rint(mean_dark / step) + self.counted_dark
+        rest = total - dark
+        if scene.photons:
+            mean = gain * np.rint(each * x.light_electrons[:, None])
+            photon = mean + self.counted_photons - source - sky - neighbours
+        else:
+            both = photon_variance + read_variance
+            share = np.divide(photon_variance, both, out=np.zeros_like(both), where=both > 0)
+            photon = rest * share + np.sqrt(read_variance * share) * self.score
+        return [source, sky, neighbours, photon, dark, rest - photon, *self.added.values()]
+
+
 def _dark_given_total(total: Float, mean: Float, step: Float, variance: Float, chance: Float) -> Float:
-    """Draw dark counts, DN, given their sum with a Gaussian of this variance, by inversion at `chance`."""
-    dark = np.zeros(total.size)
-    for p in np.flatnonzero(mean > 0):
-        if variance[p] == 0:
-            dark[p] = total[p]
+    """Draw dark counts, DN, given their sum with a Gaussian of this variance, by inversion at `chance`.
+
+    All arrays have the shape (n_pixel, n_draw) but `step`, which has the shape (n_pixel,).
+    """
+    dark = np.where((mean > 0) & (variance == 0), total, 0.0)
+    for p in np.flatnonzero(mean.any(axis=1)):
+        drawn = (mean[p] > 0) & (variance[p] > 0)
+        if not drawn.any():
             continue
-        expected = mean[p] / step[p]
+        expected = mean[p, drawn, None] / step[p]
         # This range covers both the prior and the likelihood.
         reach = 9.0 * np.sqrt(expected) + 9.0
-        counts = np.arange(max(int(expected - reach), 0), int(expected + reach) + 1)
+        counts = np.arange(max(int((expected - reach).min()), 0), int((expected + reach).max()) + 1)
         log = special.xlogy(counts, expected) - special.gammaln(counts + 1.0)
-        log -= (total[p] - step[p] * counts) ** 2 / (2.0 * variance[p])
-        below = np.cumsum(np.exp(log - log.max()))
-        dark[p] = step[p] * counts[np.searchsorted(below, chance[p] * below[-1])]
+        log -= (total[p, drawn, None] - step[p] * counts) ** 2 / (2.0 * variance[p, drawn, None])
+        below = np.cumsum(np.exp(log - log.max(axis=1, keepdims=True)), axis=1)
+        dark[p, drawn] = step[p] * counts[(below < chance[p, drawn, None] * below[:, -1:]).sum(axis=1)]
     return dark
 
 

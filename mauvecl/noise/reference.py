@@ -79,11 +79,11 @@ def poisson_draw(words: Words, i: int, source: np.void, tables: NDArray[np.uint3
 
 
 def draws(
-    scene: Scene, realisation: NDArray[np.uint64], frame: int, group: int, seed: int, *, exposure: int = 0
+    scene: Scene, realisation: NDArray[np.uint64], frame: ArrayLike, group: int, seed: int, *, exposure: int = 0
 ) -> Draws:
-    """Draw everything that four pixels of one draw need."""
+    """Draw everything that four pixels of one draw need; `frame` is one number, or one for each realisation."""
     job = scene.job
-    address = (realisation, int(job["first_frame"]) + frame)
+    address = (realisation, int(job["first_frame"]) + np.asarray(frame))
     place = (int(job["first_group"]) + group, seed, exposure)
     z = four_normals(words_at(*address, "noise", *place))
     dark: list[Floats] = []

@@ -228,12 +228,14 @@ def test_simulate_writes_components(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "observation-2.png").exists()
 
 
-def test_simulation_equals_the_realisation_of_the_engine() -> None:
+@pytest.mark.parametrize("at_once", [1, 256])
+def test_simulation_equals_the_realisation_of_the_engine(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
     from scenes import instrument, star
 
     from mauvecl.device.engine import Engine
     from mauvecl.noise.components import components
 
+    monkeypatch.setattr("mauvecl.noise.components.FRAMES_AT_ONCE", at_once)
     for options in ({"exposure": 50.0}, {"exposure": 10.0, "magnitude": -0.3}):
         (x,) = star(payload=instrument(part=True), **options)
         table = components(x, realisation=123, seed=4)
