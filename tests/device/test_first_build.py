@@ -113,11 +113,12 @@ def test_outcome_is_reused_until_driver_or_version_change(plain: tuple[Path, dic
 
 def test_failure_is_reused_for_a_week(tmp_path: Path) -> None:
     fails = misbehaving("os.abort()", "(None,)")
-    count = "processor.names = lambda device: (None,); first_build._try = lambda *a: print('tried', a[0]) or ''; "
+    # No kernel is built here: some processors' own names crash the compiler.
+    count = "processor.names = lambda device: (None,); first_build._try = lambda *a: print('tried', a[0]) or 'failed'; "
     assert "sentence" in run(tmp_path, fails)
     assert run(tmp_path, count).keys() == {"sentence"}
     later = "import time; now = time.time; time.time = lambda: now() + 8 * 86400; "
-    assert "tried" in run(tmp_path, count + later)
+    assert run(tmp_path, count + later).keys() == {"tried", "sentence"}
 
 
 def test_read_only_store_suffices(plain: tuple[Path, dict[str, str]]) -> None:
