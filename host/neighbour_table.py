@@ -49,6 +49,8 @@ MOST_ROWS = 100_000
 def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[Neighbour, ...], tuple[str, ...]]:
     """Read neighbours, nearest first, and return them with statements on how the table was read.
 
+    Raises InputError if the table has no separations and no positions, or a cell is invalid.
+
     Parameters
     ----------
     path : str or Path
@@ -58,11 +60,6 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
     target : str, optional
         Name of the row that is the target itself, which is left out, or coordinates such as "290.68 +11.12". Positions
         are measured from it; it is needed if there are no separations.
-
-    Raises
-    ------
-    InputError
-        If the table has no separations and no positions, or a cell is invalid.
     """
     path = Path(path)
     named = f"table of neighbours {shortened(path.name)}"

@@ -18,7 +18,6 @@ def write_whole(path: Path, *parts: bytes | memoryview, shared: bool = False) ->
 
     Parameters
     ----------
-    path : Path
     parts : bytes or memoryview
         Content of the file.
     shared : bool

@@ -39,7 +39,6 @@ def parse_ecsv(text: str, what: str, expected: str = "an ECSV table") -> Table:
 
     Parameters
     ----------
-    text : str
     what : str
         Description of the origin for messages, including its name.
     expected : str

@@ -38,7 +38,6 @@ def open_regular(path: Path, what: str) -> IO[bytes]:
 
     Parameters
     ----------
-    path : Path
     what : str
         Expected kind of file, for messages: "spectrum file", "study".
 
@@ -100,7 +99,6 @@ def unpacked(content: bytes, what: str) -> bytes:
 
     Parameters
     ----------
-    content : bytes
     what : str
         Description of the content for messages, including its name.
 

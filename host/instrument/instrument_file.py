@@ -28,7 +28,6 @@ def read_values(
 
     Parameters
     ----------
-    path : Path
     files : mapping
         Classes of the values that may be paths, relative to the file.
     seen : tuple of Path

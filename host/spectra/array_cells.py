@@ -49,7 +49,6 @@ def selected_rows(table: FileTable, choice: Choice, cells: list[Any], asked: Seq
 
     Parameters
     ----------
-    table : FileTable
     choice : Choice
         Columns of wavelength and flux.
     cells : list

@@ -39,7 +39,6 @@ def choose(names: Sequence[str], roles: Sequence[Role], asked: Sequence[str] = (
 
     Parameters
     ----------
-    names : sequence of str
     roles : sequence of Role
         Role of each column.
     asked : sequence of str

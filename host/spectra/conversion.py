@@ -50,7 +50,6 @@ def converted(raw: RawSpectrum, wavelength_unit: Any = None, flux_unit: Any = No
 
     Parameters
     ----------
-    raw : RawSpectrum
     wavelength_unit, flux_unit : str or Unit, optional
         Units that override those of the file. A unit of wavelength may end in "air" or "vacuum".
     """

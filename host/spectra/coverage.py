@@ -191,7 +191,6 @@ def continued(
 
     Parameters
     ----------
-    name : str
     wavelength, flux : ndarray, shape (n,)
     needed_nm : tuple of float
         Range of the pixels; the line spread function reaches beyond it as `SPAN_NM` beyond `NEEDED_NM`.
@@ -266,7 +265,6 @@ def extended(
 
     Parameters
     ----------
-    name : str
     wavelength, flux : ndarray, shape (n,)
     extension : str
         Name of the other spectrum.

@@ -21,7 +21,6 @@ def check_values(name: str, wavelength: NDArray[np.float64], flux: NDArray[np.fl
 
     Parameters
     ----------
-    name : str
     wavelength, flux : ndarray, shape (n,)
         nm, finite and increasing, and erg s-1 cm-2 A-1.
     """

@@ -58,7 +58,6 @@ def text_tables(
 
     Parameters
     ----------
-    text, name, origin : str
     asked : sequence of str
         Words given by the user; for columns without names, their numbers.
     wavelength, flux : bool

@@ -98,6 +98,8 @@ def _check_system(system: str) -> None:
 def magnitude(wavelength_nm: Float, flux_flam: Float, name: str = "V", system: System = "catalogue") -> float:
     """Return the synthetic magnitude in a band.
 
+    Raises InputError if the spectrum does not cover the band or has no light in it.
+
     Parameters
     ----------
     wavelength_nm : ndarray, shape (n,)
@@ -107,11 +109,6 @@ def magnitude(wavelength_nm: Float, flux_flam: Float, name: str = "V", system: S
         Name or alias of the band.
     system : {"catalogue", "vega", "ab"}
         The system of catalogues in the band (the band holds its zero point and source), Vega at zero, or AB.
-
-    Raises
-    ------
-    InputError
-        If the spectrum does not cover the band or has no light in it.
     """
     _check_system(system)
     chosen = _covered(wavelength_nm, name)

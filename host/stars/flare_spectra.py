@@ -74,27 +74,14 @@ JOIN_NM, GAP_NM = 20.0, 5.0
 
 @validated
 class FlareSpectrum:
-    """Spectrum of a flare, up to a factor.
+    """Spectrum of a flare, up to a factor."""
 
-    Attributes
-    ----------
-    temperature_k : float, optional
-        Temperature of the hottest blackbody of the flare; None for an observed flare.
-    nodes_nm : ndarray, shape (n,)
-        Wavelengths that a grid must contain so that linear interpolation conserves the flux.
-    surface : bool
-        Whether `flux` is that of the flare's surface, from which an area follows.
-    fixed_lines : bool
-        Whether some lines have a fixed flux at the telescope, independent of the amplitude.
-    messages : tuple of str
-        Assumptions that every answer must report.
-    """
-
-    temperature_k: float | None = None
+    temperature_k: float | None = None  # temperature of the hottest blackbody of the flare; None for an observed flare
+    # Shape (n,); wavelengths that a grid must contain so that linear interpolation conserves the flux.
     nodes_nm: Float = np.empty(0)
-    surface: ClassVar[bool] = True
-    fixed_lines: bool = False
-    messages: tuple[str, ...] = ()
+    surface: ClassVar[bool] = True  # whether `flux` is that of the flare's surface, from which an area follows
+    fixed_lines: bool = False  # whether some lines have a fixed flux at the telescope, independent of the amplitude
+    messages: tuple[str, ...] = ()  # assumptions that every answer must report
 
     def flux(self, wavelength_nm: Float) -> Float:
         """Return the flux, erg s-1 cm-2 A-1, shape (n,), at the flare's surface or as observed."""
@@ -233,10 +220,7 @@ class EmissionLine:
     def named(cls, name: str) -> Self:
         """Return a line or group of lines by name, or a line at a wavelength in nm.
 
-        Raises
-        ------
-        InputError
-            For an unknown name, or a wavelength outside 100 to 1000 nm.
+        Raises InputError for an unknown name, or a wavelength outside 100 to 1000 nm.
         """
         wanted = name.strip().casefold().replace("_", " ")
         for known in (*LINES_NM, *LINE_GROUPS):

@@ -61,18 +61,14 @@ def resolve(text: str, *, own: bool = True) -> NamedStar | None:
 def spectrum_name(text: str, key: str = "star", *, own: bool = True) -> str:
     """Return the name of the spectrum of a star.
 
+    Raises InputError if the star has no spectrum; the message proposes one and, for a well-known star, its magnitude.
+
     Parameters
     ----------
-    text : str
     key : str
         Key of the error.
     own : bool
         Whether to search among the user's own stars.
-
-    Raises
-    ------
-    InputError
-        If the star has no spectrum; the message proposes one and, for a well-known star, its magnitude.
     """
     star = resolve(text, own=own)
     if star is None:
@@ -108,7 +104,6 @@ def near_names(text: str, *, stars_only: bool = False) -> list[str]:
 
     Parameters
     ----------
-    text : str
     stars_only : bool
         Whether names must be of stars with known coordinates.
     """

@@ -54,10 +54,7 @@ def make_folder(path: Path) -> Path:
 def write_table(table: Table, path: Path) -> Path:
     """Write a table as ECSV, or as FITS by the file's ending, atomically.
 
-    Raises
-    ------
-    InputError
-        If it cannot be written; an existing file is then kept.
+    Raises InputError if it cannot be written; an existing file is then kept.
     """
     if path.suffix == ".fits":
         plain, packed = table.copy(), io.BytesIO()
@@ -131,12 +128,10 @@ def write_record(
 
     Parameters
     ----------
-    verb : str
     study : mapping
         The study as JSON can hold it.
     expectations : sequence of Expectation
         Their provenance holds the digests of the inputs.
-    folder : Path
     pool : Pool, optional
         The pool that drew, if any.
     opened : Device, optional

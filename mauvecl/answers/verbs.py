@@ -66,43 +66,22 @@ TARGETS = ("orbit.targets", "plan.targets")
 
 @dataclass(frozen=True)
 class Verb:
-    """One question, answered by the function of the same name: ``verb(study, engine=None, progress=None) -> Answer``.
-
-    Attributes
-    ----------
-    name : str
-    home : str
-        Module of `mauvecl.answers` that holds the function; it is imported when the verb is first used.
-    help : str
-        Help text of the command, with examples.
-    takes : tuple of str
-        Keys and sections of the study whose flags the command takes, in addition to those of `observation`.
-    counts : str
-        What the command line's progress bar counts; empty if a closed form answers at once.
-    older : tuple of str
-        Names that the function had before; they still work.
-    observation : tuple of str
-        Keys of an observation, or of what takes its place.
-    without : str
-        Key of the observation that the command does not take.
-    defaults : mapping, optional
-        Values of keys where neither a study file nor a flag is given, if they differ from the study's.
-    tab : bool
-        Whether the page has a tab with this answer; one without a class in `web.tabs` shows its first view.
-    default : callable, optional
-        Makes the study from the flags where no file is given; the paper's question by default.
-    """
+    """A question, answered by the function of the same name: ``verb(study, engine=None, progress=None) -> Answer``."""
 
     name: str
-    home: str
-    help: str
+    home: str  # module of `mauvecl.answers` that holds the function; it is imported when the verb is first used
+    help: str  # help text of the command, with examples
+    # Keys and sections of the study whose flags the command takes, in addition to those of `observation`.
     takes: tuple[str, ...]
-    counts: str = ""
-    older: tuple[str, ...] = ()
-    observation: tuple[str, ...] = OBSERVATION
-    without: str = ""
+    counts: str = ""  # what the command line's progress bar counts; empty if a closed form answers at once
+    older: tuple[str, ...] = ()  # names that the function had before; they still work
+    observation: tuple[str, ...] = OBSERVATION  # keys of an observation, or of what takes its place
+    without: str = ""  # key of the observation that the command does not take
+    # Values of keys where neither a study file nor a flag is given, if they differ from the study's.
     defaults: Mapping[str, Any] | None = None
+    # Makes the study from the flags where no file is given; the paper's question by default.
     default: DefaultStudy | None = None
+    # Whether the page has a tab with this answer; one without a class in `web.tabs` shows its first view.
     tab: bool = False
 
     def accepts(self, key: str) -> bool:

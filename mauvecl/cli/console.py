@@ -27,13 +27,9 @@ class Meter:
     """Progress with rate and time left, on standard error, for work longer than two seconds.
 
     On a terminal and in a notebook it is a bar; elsewhere a plain line every ten seconds.
-
-    Attributes
-    ----------
-    standing : callable, optional
-        Returns the progress of a pool, with parts from a checkpoint and parts that were counted again.
     """
 
+    # Returns the progress of a pool, with parts from a checkpoint and parts that were counted again.
     standing: Callable[[], PoolProgress] | None = None
 
     def __init__(self, *, quiet: bool = False, unit: str = "realisations") -> None:

@@ -30,7 +30,6 @@ def question_values(study: Study, *, detects: bool) -> None:
 
     Parameters
     ----------
-    study : Study
     detects : bool
         Whether the verb needs flares and thresholds.
     """
@@ -75,7 +74,6 @@ def question_time(study: Study, *, device: str | None, cluster: str | None, insi
 
     Parameters
     ----------
-    study : Study
     device, cluster : str, optional
         Values of these flags.
     insist : bool

@@ -34,44 +34,25 @@ class Terminated(KeyboardInterrupt):
 
 @dataclass(eq=False)
 class Session:
-    """Session of one call of a verb; in its `with` block, only this process writes to the output folder.
-
-    Attributes
-    ----------
-    verb : str
-    study : Study
-    output : Path, optional
-        Folder for everything written.
-    as_json, quiet, pictures : bool
-    device : str, optional
-        Device as for `Engine`; several are separated by commas.
-    cluster : str, optional
-        As for `cluster.DaskWorkers`.
-    resume, restart : bool
-        Whether to continue or discard an unfinished run in the folder.
-    keep_after : float, optional
-        Seconds after which finished parts are written to the disk; the default is that of `Checkpoint`.
-    insist : bool
-        Whether to start runs that would take too long or too much space.
-    opened : Device, optional
-        Device on which something was drawn without a pool, for the run record.
-    """
+    """Session of one call of a verb; in its `with` block, only this process writes to the output folder."""
 
     verb: str
     study: Study
-    output: Path | None = None
+    output: Path | None = None  # folder for everything written
     as_json: bool = False
     quiet: bool = False
     pictures: bool = True
-    device: str | None = None
-    cluster: str | None = None
+    device: str | None = None  # device as for `Engine`; several are separated by commas
+    cluster: str | None = None  # as for `cluster.DaskWorkers`
+    # resume, restart: whether to continue or discard an unfinished run in the folder.
     resume: bool = False
     restart: bool = False
+    # Seconds after which finished parts are written to the disk; the default is that of `Checkpoint`.
     keep_after: float | None = None
-    insist: bool = False
+    insist: bool = False  # whether to start runs that would take too long or too much space
     files: list[Path] = field(default_factory=list)
     started: float = field(default_factory=time.perf_counter)
-    opened: Device | None = None
+    opened: Device | None = None  # device on which something was drawn without a pool, for the run record
     _pool: Pool | None = None
     _checkpoint: Checkpoint | None = None
     _lost: list[InputError] = field(default_factory=list)
@@ -83,10 +64,7 @@ class Session:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Release the output folder.
 
-        Raises
-        ------
-        InputError
-            If a file of the answer could not be written; the answer is printed before.
+        Raises InputError if a file of the answer could not be written; the answer is printed before.
         """
         from mauvecl.schema.errors import InputError
 

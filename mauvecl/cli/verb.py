@@ -169,7 +169,6 @@ def command_of(
 
     Parameters
     ----------
-    name : str
     draws : bool, optional
         Whether a pool draws; by default if the verb counts something.
     resumes : bool

@@ -78,7 +78,6 @@ def choose_processor_level(device: Any, others: Callable[[], Sequence[Any]]) -> 
 
     Parameters
     ----------
-    device : pyopencl.Device
     others : callable
         Function that returns all devices, including `device`, in the order in which another process finds them.
 

@@ -131,7 +131,6 @@ class Launches:
 
         Parameters
         ----------
-        tile : Tile
         out : ndarray of uint16 or int32, shape (tile.wanted, n_pixel)
 
         Returns

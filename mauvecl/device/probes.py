@@ -23,7 +23,6 @@ class Probes:
         Realisations per vector; by default the device's.
     vector_forms : bool, optional
         Whether to use the fast forms for PoCL instead of built-in functions; by default the device's choice.
-    device : Device
     """
 
     def __init__(self, *, width: int | None = None, vector_forms: bool | None = None, device: Device) -> None:

@@ -99,7 +99,6 @@ class StareLaunches(Launches):
 
         Parameters
         ----------
-        tile : Tile
         out : ndarray of float32, shape (n_scenario, n_stare, n_statistic, n_padded_frame)
         row : int
             Index in `out` of the tile's first stare.

@@ -59,7 +59,6 @@ class Tiles:
 
     Parameters
     ----------
-    device : Device
     progress : callable, optional
         Called as ``progress(done, total)`` before and between tiles, in realisations. It may raise to stop the work.
     largest : int, optional

@@ -37,9 +37,6 @@ def components(
 
     Parameters
     ----------
-    x : Expectation
-    realisation : int
-    seed : int
     mode, recipe, processes, first_frame
         See `Drawing`.
 

@@ -138,7 +138,6 @@ def truncation_distance(c: Cumulants, *, fourth_power: bool, varying: bool = Fal
 
     Parameters
     ----------
-    c : Cumulants
     fourth_power : bool
         Whether the polynomial includes z^4.
     varying : bool
@@ -187,7 +186,6 @@ def stack_is_exact(c: Cumulants, x: Expectation) -> NDArray[np.bool_]:
     ----------
     c : Cumulants
         Cumulants of ONE frame.
-    x : Expectation
 
     Notes
     -----

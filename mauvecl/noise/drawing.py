@@ -23,26 +23,16 @@ class DrawingOptions(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Drawing:
-    """Options for the drawing of realisations.
+    """Options for the drawing of realisations."""
 
-    Attributes
-    ----------
-    mode : {"auto", "frames", "stacked"}
-        Whether to draw each frame, or their sum at once. "auto" draws frames only near zero or saturation, and if a
-        frame has too little noise to treat its rounding as noise.
-    recipe : {"auto", "joint", "apart"}
-        Whether to draw all noise of a pixel from one normal, or Poisson counts separately. "auto" draws separately only
-        if the joint draw is not exact.
-    processes : Processes
-        Optional noise processes.
-    first_frame : int
-        Number of the first frame. Frame k of an exposure is drawn with an expectation of one frame and
-        ``first_frame=k``.
-    """
-
+    # Whether to draw each frame, or their sum at once. "auto" draws frames only near zero or saturation, and if a frame
+    # has too little noise to treat its rounding as noise.
     mode: Mode = "auto"
+    # Whether to draw all noise of a pixel from one normal, or Poisson counts separately. "auto" draws separately only
+    # if the joint draw is not exact.
     recipe: Recipe = "auto"
-    processes: Processes = NONE
+    processes: Processes = NONE  # optional noise processes
+    # Number of the first frame. Frame k of an exposure is drawn with an expectation of one frame and ``first_frame=k``.
     first_frame: int = 0
 
     def __post_init__(self) -> None:

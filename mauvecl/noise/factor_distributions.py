@@ -137,7 +137,6 @@ class FactorDistributions:
 
         Parameters
         ----------
-        x : Expectation
         weighted : bool
             Whether the statistic is a weighted sum instead of a sum of squares.
 

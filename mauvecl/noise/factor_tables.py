@@ -41,7 +41,6 @@ class Factors:
 
         Parameters
         ----------
-        processes : Processes
         conditions : mapping of float
             Values of the expectation: ``temperature_c``, ``dark_slope_per_c``, ``light_loss``, ``pointing_loss``.
         """

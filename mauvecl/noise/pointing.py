@@ -26,15 +26,6 @@ class PointingDrifts(Section):
     The target is in place at the start of a stare. The time until a drift begins and the duration of the drift are
     exponentially distributed. In a drift, the lost share of all light (of star, flare, neighbours and sky) rises
     linearly from zero. The target is then acquired again, and the light returns at once.
-
-    Attributes
-    ----------
-    rate_per_h : float
-        Drifts per hour of good pointing.
-    duration_s : float
-        Mean duration of a drift.
-    depth : float
-        Largest share of the light lost at the end of a drift; the shares are uniform between zero and this.
     """
 
     stream: ClassVar[int] = 20
@@ -42,6 +33,7 @@ class PointingDrifts(Section):
     #: For messages and tables of assumptions.
     source: ClassVar[str] = "assumption: rate, depth and duration of drifts are not published"
 
+    # Drifts per hour of good pointing.
     rate_per_h: Annotated[
         float,
         Unit("1 / h"),
@@ -58,6 +50,7 @@ class PointingDrifts(Section):
             most=60.0,
         ),
     ] = 0.5
+    # Mean duration of a drift.
     duration_s: Annotated[
         Duration,
         Help("Mean duration of a drift", "exponential; an assumption"),
@@ -69,6 +62,7 @@ class PointingDrifts(Section):
             name="pointing_duration",
         ),
     ] = 300.0
+    # Largest share of the light lost at the end of a drift; the shares are uniform between zero and this.
     depth: Annotated[
         float,
         Range(0, 1, open_low=True),
@@ -91,8 +85,6 @@ class PointingDrifts(Section):
         ----------
         numbers : ndarray, shape (n_stare,)
             Numbers of the stares; each depends only on the seed and its number.
-        end_s : float
-        seed : int
 
         Returns
         -------
@@ -126,8 +118,6 @@ class PointingDrifts(Section):
         numbers : ndarray, shape (n_stare,)
         start_s : ndarray, shape (n_frame,)
             Start of the frames after the start of the stare.
-        frame_s : float
-        seed : int
         """
         import numpy as np
 

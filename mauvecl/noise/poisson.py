@@ -102,7 +102,6 @@ def table_set(means: Iterable[float], tables: list[AliasTable]) -> tuple[list[Al
 
     Parameters
     ----------
-    means : iterable of float
     tables : list of AliasTable
         Tables that are contiguous on the device; new ones are appended.
 

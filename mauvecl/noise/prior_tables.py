@@ -46,7 +46,6 @@ def table_of(prior: Prior, change: Callable[[Float], Float]) -> tuple[NDArray[np
 
     Parameters
     ----------
-    prior : Prior
     change : callable
         Function that converts the prior's values to a factor minus one.
 

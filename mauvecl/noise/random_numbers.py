@@ -74,7 +74,6 @@ def words(realisation: ArrayLike, frame: ArrayLike, stream: int, group: ArrayLik
         Top byte of the counter's last word.
     group : array_like of int
         Pixel index divided by four.
-    seed : int
     """
     index = np.asarray(realisation, dtype=np.uint64)
     last = np.uint64(stream << 24) | np.asarray(group, dtype=np.uint64)

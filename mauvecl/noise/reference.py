@@ -33,7 +33,6 @@ def words_at(
         A key of `layout.STREAMS`.
     group : array_like of int
         Pixel index divided by four.
-    seed : int
     exposure : int
         0 for the observed exposure, `layout.REFERENCE` for the reference.
     """

@@ -112,6 +112,9 @@ def prepare(
 ) -> Scene:
     """Compute the arrays of scenarios for the device.
 
+    Raises InputError if scenarios differ in more than their light, stacked draws are requested near a rail, or a
+    process needs joint draws that are not exact.
+
     Parameters
     ----------
     scenarios : sequence of Expectation
@@ -124,12 +127,6 @@ def prepare(
         Subtracted reference and variances.
     first_group : int
         Number of the first group of four pixels in the generator's counter.
-
-    Raises
-    ------
-    InputError
-        If scenarios differ in more than their light, stacked draws are requested near a rail, or a process needs joint
-        draws that are not exact.
     """
     drawing = drawing or Drawing(**words)
     quiet = scenarios[0]

@@ -55,32 +55,15 @@ class Amplitude:
 
 @dataclass(frozen=True, kw_only=True)
 class Unknown:
-    """Value that an observer does not know.
+    """Value that an observer does not know."""
 
-    Attributes
-    ----------
-    name : str
-        Its key in a section of studies.
-    of : str
-        Changed part of the signal, or "instrument".
-    when : {"frame", "exposure", "stare", "campaign"}
-        How often it takes another value.
-    prior : Uniform, Normal or Amplitude, optional
-        Default prior; None if it is known by default.
-    treatment : {"drawn", "marginalised", "both"}
-    label : str
-        Description in messages and tables.
-    source : str
-        Source of the default prior, or "assumption".
-    """
-
-    name: str
-    of: Of
-    when: When
-    prior: Prior | Amplitude | None = None
+    name: str  # its key in a section of studies
+    of: Of  # changed part of the signal, or "instrument"
+    when: When  # how often it takes another value
+    prior: Prior | Amplitude | None = None  # default prior; None if it is known by default
     treatment: Treatment
-    label: str = ""
-    source: str = ""
+    label: str = ""  # description in messages and tables
+    source: str = ""  # source of the default prior, or "assumption"
 
 
 @dataclass(frozen=True, kw_only=True)

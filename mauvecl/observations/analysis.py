@@ -34,68 +34,33 @@ CANDIDATES = 1.0
 
 @dataclass(frozen=True, eq=False)
 class SpectralAnalysis:
-    """Results that the analysis of spectra adds to that of a light curve.
-
-    Attributes
-    ----------
-    cleaned : CleanedSpectra
-    series : SpectralSeries
-    found : list of EventSpectrum
-        Spectra of the events, in their order.
-    measured : list of Measurement or str
-        Flares fitted to the events, or the reason why none is.
-    """
+    """Results that the analysis of spectra adds to that of a light curve."""
 
     cleaned: CleanedSpectra
     series: SpectralSeries
-    found: list[EventSpectrum]
-    measured: list[Measurement | str]
+    found: list[EventSpectrum]  # spectra of the events, in their order
+    measured: list[Measurement | str]  # flares fitted to the events, or the reason why none is
 
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """Analysis of the frames of one star.
-
-    Attributes
-    ----------
-    frames : Frames
-    flux, error : ndarray, shape (n_frame,)
-        The light curve that was searched; of spectra, the sum over wavelength.
-    level : QuiescentLevel
-    survey : SeriesSurvey
-    wanted : float
-        Wanted false alarms per star-day.
-    normal : SampledRate
-        False-alarm rate in normal noise of the measured variance.
-    measured : MeasuredRate
-        False-alarm rate in noise resampled from quiescent frames.
-    threshold : float
-        Threshold for the wanted rate: the higher of the thresholds of both.
-    candidates : float
-        Threshold for candidates.
-    events : list of ObservedEvent
-        Events above the threshold of candidates, in order of time.
-    completeness : Completeness
-        Share of flares that the search detects in these frames.
-    scatter : list of Scatter
-    spectra : SpectralAnalysis or None
-        Of spectra that are searched with weights for flares.
-    """
+    """Analysis of the frames of one star."""
 
     frames: Frames
+    # flux, error: shape (n_frame,); the light curve that was searched; of spectra, the sum over wavelength.
     flux: Float
     error: Float | None
     level: QuiescentLevel
     survey: SeriesSurvey
-    wanted: float
-    normal: SampledRate
-    measured: MeasuredRate
-    threshold: float
-    candidates: float
-    events: list[ObservedEvent]
-    completeness: Completeness
+    wanted: float  # wanted false alarms per star-day
+    normal: SampledRate  # false-alarm rate in normal noise of the measured variance
+    measured: MeasuredRate  # false-alarm rate in noise resampled from quiescent frames
+    threshold: float  # threshold for the wanted rate: the higher of the thresholds of both
+    candidates: float  # threshold for candidates
+    events: list[ObservedEvent]  # events above the threshold of candidates, in order of time
+    completeness: Completeness  # share of flares that the search detects in these frames
     scatter: list[Scatter]
-    spectra: SpectralAnalysis | None = None
+    spectra: SpectralAnalysis | None = None  # of spectra that are searched with weights for flares
 
     @cached_property
     def days(self) -> float:
@@ -178,7 +143,6 @@ def analyse_frames(
 
     Parameters
     ----------
-    frames : Frames
     false_alarms : float
         Wanted false alarms in a star-time of frames.
     per : {"day", "month", "year"}

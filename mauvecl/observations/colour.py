@@ -13,22 +13,14 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Colour:
-    """Spectrum of an event against the spectrum of the quiescent star.
+    """Spectrum of an event against the spectrum of the quiescent star."""
 
-    Attributes
-    ----------
-    chi2, dof : float, int
-        Chi-squared of the event's spectrum as a multiple of the quiescent one.
-    p_value : float
-        Probability of a chi-squared at least as large for an event without colour, such as a step of the throughput.
-    blue_over_red : float
-        Rise relative to the quiescent star in the blue half of the pixels over that in the red half: 1 without colour.
-    blue_over_red_error : float
-    """
-
+    # chi2, dof: chi-squared of the event's spectrum as a multiple of the quiescent one.
     chi2: float
     dof: int
+    # Probability of a chi-squared at least as large for an event without colour, such as a step of the throughput.
     p_value: float
+    # Rise relative to the quiescent star in the blue half of the pixels over that in the red half: 1 without colour.
     blue_over_red: float
     blue_over_red_error: float
 

@@ -37,26 +37,14 @@ NO_FIT = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class EventSpectrum:
-    """Spectrum of an event and its fits.
+    """Spectrum of an event and its fits."""
 
-    Attributes
-    ----------
-    cause : str
-        What explains the spectrum: a flare, or what resembles one.
-    snr : float
-        S/N of a flare whose amplitude is fitted together with changes of star, dark current and sky.
-    chi2 : dict of str to float
-        Chi-squared of single causes, each with its best amplitude; of flares, the best temperature.
-    dof : int
-    p_value : float
-        Probability of a chi-squared at least as large as the smallest, if its cause is right.
-    """
-
-    cause: Cause
-    snr: float
+    cause: Cause  # what explains the spectrum: a flare, or what resembles one
+    snr: float  # S/N of a flare whose amplitude is fitted together with changes of star, dark current and sky
+    # Chi-squared of single causes, each with its best amplitude; of flares, the best temperature.
     chi2: dict[Cause, float]
     dof: int
-    p_value: float
+    p_value: float  # probability of a chi-squared at least as large as the smallest, if its cause is right
 
     @property
     def ambiguous(self) -> bool:
@@ -84,11 +72,8 @@ def event_spectrum(
 
     Parameters
     ----------
-    survey : SeriesSurvey
-    series : SpectralSeries
     taken : ndarray of bool, shape (n_frame,)
         Frames of all events.
-    one : Detection
     """
     spectrum, variance = _weighted(survey, series, taken, one)
     flares = series.model.flares(TEMPERATURES_K)

@@ -33,46 +33,25 @@ STEP_GAIN = 9.0
 
 @dataclass(frozen=True, eq=False)
 class ObservedEvent:
-    """A detected event; frames are counted among the searched ones.
+    """A detected event; frames are counted among the searched ones."""
 
-    Attributes
-    ----------
-    value : float
-        Largest statistic of the search: the S/N of the best template.
-    first, last : int
-        First and last frame of the event, inclusive.
-    brightest : int
-        Frame of the largest flux.
-    half_width_s : float
-        Half-width of the best template.
-    amplitude : float
-        Largest flux above the level, relative to the level.
-    equivalent_duration_s, equivalent_duration_error_s : float
-        Sum of the flux above the level over the frames of the event, relative to the level, and its standard error.
-        Missing frames inside the event are interpolated.
-    missing : int
-        Number of frames missing inside the event.
-    cut : bool
-        True if the event reaches the first or last frame of the light curve or of the part before a longer gap.
-    kind : str
-        A flare, or what resembles one: a step of the level or, in spectra, a change of the throughput, the dark
-        current or the sky, or a cosmic ray.
-    components : list of Alarm
-        Flares fitted to the event together, the largest first; empty if the event is no flare.
-    """
-
-    value: float
+    value: float  # largest statistic of the search: the S/N of the best template
+    # first, last: first and last frame of the event, inclusive.
     first: int
     last: int
-    brightest: int
-    half_width_s: float
-    amplitude: float
+    brightest: int  # frame of the largest flux
+    half_width_s: float  # half-width of the best template
+    amplitude: float  # largest flux above the level, relative to the level
+    # equivalent_duration_s, equivalent_duration_error_s: Sum of the flux above the level over the frames of the event,
+    # relative to the level, and its standard error. Missing frames inside the event are interpolated.
     equivalent_duration_s: float
     equivalent_duration_error_s: float
-    missing: int
-    cut: bool
+    missing: int  # number of frames missing inside the event
+    cut: bool  # true if the event reaches the first or last frame of the light curve or of the part before a longer gap
+    # A flare, or what resembles one: a step of the level or, in spectra, a change of the throughput, the dark current
+    # or the sky, or a cosmic ray.
     kind: Kind
-    components: list[Alarm]
+    components: list[Alarm]  # flares fitted to the event together, the largest first; empty if the event is no flare
 
 
 @dataclass(frozen=True)

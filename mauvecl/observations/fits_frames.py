@@ -30,7 +30,6 @@ class FitsFile(FrameFile):
 
     Parameters
     ----------
-    hdus : HDUList
     what : str
         The file, for messages.
     hdu : str or int, optional

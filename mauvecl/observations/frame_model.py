@@ -34,44 +34,25 @@ NO_CEILING_DN = 2**31 - 1
 
 @dataclass(frozen=True, eq=False)
 class FrameModel:
-    """Frames of spectra of the instrument: its pixels or resolution elements.
+    """Frames of spectra of the instrument: its pixels or resolution elements."""
 
-    Attributes
-    ----------
-    quiet : Expectation
-        One frame of the quiescent star in the instrument's pixels.
-    flare : FlareModel
-        Flares in one frame in the instrument's pixels.
-    bins : ndarray, shape (n_value, n_pixel)
-        Weights of the instrument's pixels in each value of a frame: 0 or 1.
-    per_dn : ndarray, shape (n_value,)
-        Values of the frames per DN of an exposure: of flux densities, those of a flat spectrum.
-    raw : bool
-        True if the frames include bias and dark current.
-    """
-
-    quiet: Expectation
-    flare: FlareModel
-    bins: Float
+    quiet: Expectation  # one frame of the quiescent star in the instrument's pixels
+    flare: FlareModel  # flares in one frame in the instrument's pixels
+    bins: Float  # shape (n_value, n_pixel); weights of the instrument's pixels in each value of a frame: 0 or 1
+    # Shape (n_value,); values of the frames per DN of an exposure: of flux densities, those of a flat spectrum.
     per_dn: Float
-    raw: bool
+    raw: bool  # true if the frames include bias and dark current
 
     @classmethod
     def of(cls, frames: Frames, quiet: Expectation, flare: FlareModel, flux_per_dn: Float) -> Self:
         """Match frames with the pixels or resolution elements of an instrument.
 
+        Raises InputError if wavelengths differ from the instrument's, or the unit is neither counts nor a flux density.
+
         Parameters
         ----------
-        frames : Frames
-        quiet : Expectation
-        flare : FlareModel
         flux_per_dn : ndarray, shape (n_pixel,)
             Flux density, erg s-1 cm-2 nm-1, for one DN of the exposure in each pixel of the instrument.
-
-        Raises
-        ------
-        InputError
-            If wavelengths differ from the instrument's, or the unit is neither counts nor a flux density.
         """
         unit = _plain(frames.unit)
         counts = unit in {_plain(each) for each in (*COUNT_UNITS, *RATE_UNITS)}
@@ -151,7 +132,6 @@ class FrameModel:
         ----------
         light, variance : ndarray, shape (n_value,)
             Light of a quiescent frame and its variance, in the frames' unit.
-        n_frames : int
         """
         gain = self.gain / self.per_dn
         electrons = np.maximum(light / self.per_dn, 0.0) / gain / self.quiet.n_frames

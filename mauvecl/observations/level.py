@@ -30,28 +30,16 @@ MEDIAN_S = 0.3 * DAY_S
 
 @dataclass(frozen=True, eq=False)
 class QuiescentLevel:
-    """Quiescent level and noise of a light curve.
+    """Quiescent level and noise of a light curve."""
 
-    Attributes
-    ----------
-    level : ndarray, shape (n_frame,)
-        Median flux of the quiescent star around each frame.
-    error : ndarray, shape (n_frame,)
-        Standard deviation of a frame at that level: the stated error of quiescent frames times `excess`, or the
-        scatter of quiescent frames if no errors are stated.
-    excess : float
-        Measured scatter over the stated errors of quiescent frames; NaN if no errors are stated.
-    quiet : ndarray of bool, shape (n_frame,)
-        Frames that are used and within `CLIP` standard deviations of the level.
-    reasons : ndarray of int, shape (n_frame,)
-        Why frames are not searched; see `frames.Reason`.
-    """
-
-    level: Float
+    level: Float  # shape (n_frame,); median flux of the quiescent star around each frame
+    # Shape (n_frame,); standard deviation of a frame at that level: the stated error of quiescent frames times
+    # `excess`, or the scatter of quiescent frames if no errors are stated.
     error: Float
-    excess: float
+    excess: float  # measured scatter over the stated errors of quiescent frames; NaN if no errors are stated
+    # Shape (n_frame,); frames that are used and within `CLIP` standard deviations of the level.
     quiet: NDArray[np.bool_]
-    reasons: NDArray[np.int64]
+    reasons: NDArray[np.int64]  # shape (n_frame,); why frames are not searched; see `frames.Reason`
 
     @property
     def used(self) -> NDArray[np.bool_]:
@@ -77,7 +65,6 @@ def quiescent_level(
 
     Parameters
     ----------
-    frames : Frames
     flux, error : ndarray, shape (n_frame,)
         The light curve; of spectra, light in a band.
     median_s : float
@@ -144,7 +131,6 @@ def single_frames(frames: Frames, sigmas: Float, fine: NDArray[np.bool_]) -> NDA
 
     Parameters
     ----------
-    frames : Frames
     sigmas : ndarray, shape (n_frame,)
         Distance of the frames from the level, in standard deviations.
     fine : ndarray of bool, shape (n_frame,)

@@ -24,20 +24,11 @@ MISSING = 3
 
 @dataclass(frozen=True)
 class LightChange:
-    """Change of the light that all pixels share.
+    """Change of the light that all pixels share."""
 
-    Attributes
-    ----------
-    frame : int
-        First frame after the change.
-    width : int
-        Number of frames before and after it that are compared.
-    change, error : float
-        Light after the change less that before, relative to the quiescent star, and its standard error.
-    """
-
-    frame: int
-    width: int
+    frame: int  # first frame after the change
+    width: int  # number of frames before and after it that are compared
+    # change, error: light after the change less that before, relative to the quiescent star, and its standard error.
     change: float
     error: float
 

@@ -18,26 +18,13 @@ MIN_BINS = 8
 
 @dataclass(frozen=True)
 class Scatter:
-    """Scatter of means of several consecutive quiescent frames.
+    """Scatter of means of several consecutive quiescent frames."""
 
-    Attributes
-    ----------
-    frames : int
-        Number of frames in a mean.
-    count : int
-        Number of means.
-    measured : float
-        Their standard deviation, in units of the noise of one frame.
-    white : float
-        The same for independent frames: one over the root of `frames`.
-    low, high : float
-        Range of `measured` in 95 % of light curves of independent, normal frames.
-    """
-
-    frames: int
-    count: int
-    measured: float
-    white: float
+    frames: int  # number of frames in a mean
+    count: int  # number of means
+    measured: float  # their standard deviation, in units of the noise of one frame
+    white: float  # the same for independent frames: one over the root of `frames`
+    # low, high: range of `measured` in 95 % of light curves of independent, normal frames.
     low: float
     high: float
 

@@ -40,23 +40,12 @@ class PixelStatistics:
 
 @dataclass(frozen=True, eq=False)
 class WeightedSums:
-    """Weighted sums of the pixels of each frame.
+    """Weighted sums of the pixels of each frame."""
 
-    Attributes
-    ----------
-    sums : ndarray, shape (n_frame, n_weight)
-        NaN for frames with a pixel that is not finite.
-    errors : ndarray of the same shape, or None
-        From the stated errors of the pixels, which are taken to be independent.
-    pixels : PixelStatistics
-    dead : int
-        Number of pixels that are left out, because they are not finite in most frames.
-    """
-
-    sums: Float
-    errors: Float | None
+    sums: Float  # shape (n_frame, n_weight); naN for frames with a pixel that is not finite
+    errors: Float | None  # from the stated errors of the pixels, which are taken to be independent
     pixels: PixelStatistics
-    dead: int
+    dead: int  # number of pixels that are left out, because they are not finite in most frames
 
     def light(self, number: int, what: str, quality: Values | None) -> Light:
         """Return the sums of one weight with their errors, the quality of the frames and remarks."""

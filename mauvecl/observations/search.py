@@ -47,18 +47,10 @@ RESAMPLING_KEY = 0x72657361
 
 @dataclass(frozen=True, eq=False)
 class MeasuredRate:
-    """False-alarm rate in light curves made of the measured residuals.
+    """False-alarm rate in light curves made of the measured residuals."""
 
-    Attributes
-    ----------
-    largest : ndarray, shape (n,)
-        Largest statistic of each resampled light curve, ascending.
-    days : float
-        Star-days of each.
-    """
-
-    largest: Float
-    days: float
+    largest: Float  # shape (n,); largest statistic of each resampled light curve, ascending
+    days: float  # star-days of each
 
     def rate(self, threshold: float) -> float:
         """Return the false alarms per star-day above a threshold; beyond the largest value, three over the time."""
@@ -93,44 +85,23 @@ class MeasuredRate:
 
 @dataclass(frozen=True, eq=False)
 class SeriesSurvey:
-    """Observed frames as `lightcurve.search` sees a stare: sums in units of the quiescent noise.
+    """Observed frames as `lightcurve.search` sees a stare: sums in units of the quiescent noise."""
 
-    Attributes
-    ----------
-    stare : Stare
-        Times of the searched frames.
-    bank : Bank
-    templates : Templates
-        What a flare of unit amplitude, whose light is once that of the quiescent star, does to the sums.
-    sums : ndarray, shape (n_frame, n_sum)
-        Searched sums less their quiescent level: of spectra, sums weighted for flares; of a light curve, its flux.
-    variance : ndarray, shape (n_frame,)
-        Variance of the quiescent sums.
-    flux : ndarray, shape (n_frame,)
-        Flux less the quiescent level, over `scale`: what amplitudes and durations are measured of.
-    flux_variance : ndarray, shape (n_frame,)
-        Variance of the quiescent flux.
-    scale : float
-        Typical standard deviation of the flux of a frame, in the unit of the flux.
-    level : float
-        Typical quiescent level, in the unit of the flux, to which amplitudes are relative.
-    photon : float
-        Rise of the variance with the flux, in the unit of the flux.
-    time_s : ndarray, shape (n_frame,)
-        Times of the frames as observed, against those of the stare's regular grid.
-    """
-
-    stare: Stare
+    stare: Stare  # times of the searched frames
     bank: Bank
+    # What a flare of unit amplitude, whose light is once that of the quiescent star, does to the sums.
     templates: Templates
+    # Shape (n_frame, n_sum); searched sums less their quiescent level: of spectra, sums weighted for flares; of a light
+    # curve, its flux.
     sums: Float
-    variance: Float
+    variance: Float  # shape (n_frame,); variance of the quiescent sums
+    # Shape (n_frame,); flux less the quiescent level, over `scale`: what amplitudes and durations are measured of.
     flux: Float
-    flux_variance: Float
-    scale: float
-    level: float
-    photon: float
-    time_s: Float
+    flux_variance: Float  # shape (n_frame,); variance of the quiescent flux
+    scale: float  # typical standard deviation of the flux of a frame, in the unit of the flux
+    level: float  # typical quiescent level, in the unit of the flux, to which amplitudes are relative
+    photon: float  # rise of the variance with the flux, in the unit of the flux
+    time_s: Float  # shape (n_frame,); times of the frames as observed, against those of the stare's regular grid
     curves: None = None
 
     @classmethod
@@ -209,7 +180,6 @@ class SeriesSurvey:
         rate : float
             Largest rate of interest, false alarms per star-day: importance sampling uses a part of the light curve
             that is short enough for it.
-        seed : int
         """
         count = max(MIN_SAMPLED, int(SAMPLED_ALARMS / rate * DAY_S / self.stare.frame_s))
         return sample_rate(self.frames(np.arange(self.stare.n_frames) < count).search, seed=seed)
@@ -226,7 +196,6 @@ class SeriesSurvey:
             Searched frames of the quiescent star.
         rate : float
             Wanted false alarms per star-day: enough light curves are drawn for `MIN_ALARMS`, up to a limit.
-        seed : int
         """
         days = self.stare.observed_s / DAY_S
         n, n_sum = self.sums.shape

@@ -45,50 +45,30 @@ BLOCK = 1024
 
 @dataclass(frozen=True, eq=False)
 class CleanedSpectra:
-    """Frames whose single bad values are replaced.
+    """Frames whose single bad values are replaced."""
 
-    Attributes
-    ----------
-    frames : Frames
-        Without bias and dark current, in the pixels that are used.
-    model : FrameModel
-        Of these pixels.
-    rays : ndarray of int, shape (n_frame,)
-        Number of values of each frame that are replaced.
-    stated : ndarray, shape (n_pixel,)
-        Standard deviation of a quiescent frame, as the file states it or else by the noise model of the instrument.
-    stated_by : {"file", "instrument"}
-    saturated : ndarray of bool, shape (n_frame,)
-    """
-
-    frames: Frames
-    model: FrameModel
-    rays: NDArray[np.int64]
+    frames: Frames  # without bias and dark current, in the pixels that are used
+    model: FrameModel  # of these pixels
+    rays: NDArray[np.int64]  # shape (n_frame,); number of values of each frame that are replaced
+    # Shape (n_pixel,); standard deviation of a quiescent frame, as the file states it or else by the noise model of the
+    # instrument.
     stated: Float
     stated_by: str
-    saturated: Bool
+    saturated: Bool  # shape (n_frame,)
 
 
 @dataclass(frozen=True, eq=False)
 class PixelNoise:
-    """Noise of each pixel in quiescent frames, without the light and dark current that all pixels share.
+    """Noise of each pixel in quiescent frames, without the light and dark current that all pixels share."""
 
-    Attributes
-    ----------
-    wavelength_nm, stated, measured : ndarray, shape (n_pixel,)
-        Standard deviations of a frame.
-    low, high : ndarray, shape (n_pixel,)
-        Range of `measured` for 95 % of normal noise of the stated size.
-    count : int
-        Number of differences of neighbouring frames.
-    """
-
+    # wavelength_nm, stated, measured: shape (n_pixel,); standard deviations of a frame.
     wavelength_nm: Float
     stated: Float
     measured: Float
+    # low, high: shape (n_pixel,); range of `measured` for 95 % of normal noise of the stated size.
     low: Float
     high: Float
-    count: int
+    count: int  # number of differences of neighbouring frames
 
     @property
     def departs(self) -> Bool:
@@ -103,31 +83,16 @@ class PixelNoise:
 
 @dataclass(frozen=True, eq=False)
 class SpectralSeries:
-    """Spectra of the searched frames.
+    """Spectra of the searched frames."""
 
-    Attributes
-    ----------
-    excess : ndarray, shape (n_frame, n_pixel)
-        Spectra less that of the quiescent star.
-    light : ndarray, shape (n_pixel,)
-        Spectrum of the quiescent star.
-    noise : PixelNoise
-    model : FrameModel
-    jitters : mapping of str to float
-        Standard deviations of the unknowns that change from frame to frame; infinite for those that are projected out.
-    changes : list of LightChange
-        Sudden changes of the light that all pixels share.
-    kept : float
-        S/N of flares over that with a steady level of the frames.
-    """
-
-    excess: Float
-    light: Float
+    excess: Float  # shape (n_frame, n_pixel); spectra less that of the quiescent star
+    light: Float  # shape (n_pixel,); spectrum of the quiescent star
     noise: PixelNoise
     model: FrameModel
+    # Standard deviations of the unknowns that change from frame to frame; infinite for those that are projected out.
     jitters: Mapping[str, float]
-    changes: list[LightChange]
-    kept: float
+    changes: list[LightChange]  # sudden changes of the light that all pixels share
+    kept: float  # S/N of flares over that with a steady level of the frames
 
 
 def relative_error(differences: int) -> float:
@@ -242,7 +207,6 @@ def survey_spectra(
 
     Parameters
     ----------
-    cleaned : CleanedSpectra
     flux : ndarray, shape (n_frame,)
         Their sum over wavelength.
     level : QuiescentLevel

@@ -29,27 +29,15 @@ EXPECTED = "a file that `mauvecl realise` wrote, whole"
 
 @dataclass(frozen=True, eq=False)
 class StoredScene:
-    """Raw spectra with the calibration of their pixels.
+    """Raw spectra with the calibration of their pixels."""
 
-    Attributes
-    ----------
-    path : str
-        Name of the array, such as ``star-1/flare-1``.
-    rows : array
-        DN, shape (n_realisation, n_pixel) or (n_realisation, n_frame, n_pixel), read from the file when it is sliced.
-    calibration : mapping of ndarray
-        Wavelength, bias, dark, read noise and gain of each pixel and frame.
-    attributes : mapping
-        ``exposure_s`` and ``frames`` of an exposure, star, instrument, temperature, saturation, unit of the dark.
-    frames : ndarray, shape (n_frame,), or None
-        Numbers of the stored frames of each exposure.
-    """
-
-    path: str
+    path: str  # name of the array, such as ``star-1/flare-1``
+    # DN, shape (n_realisation, n_pixel) or (n_realisation, n_frame, n_pixel), read from the file when it is sliced.
     rows: Any
-    calibration: Mapping[str, Float]
+    calibration: Mapping[str, Float]  # wavelength, bias, dark, read noise and gain of each pixel and frame
+    # ``exposure_s`` and ``frames`` of an exposure, star, instrument, temperature, saturation, unit of the dark.
     attributes: Mapping[str, Any]
-    frames: NDArray[np.int64] | None
+    frames: NDArray[np.int64] | None  # shape (n_frame,), or None; numbers of the stored frames of each exposure
 
 
 class StoredFile(FrameFile):

@@ -132,7 +132,6 @@ def converted(values: Values, given: str | None, unit: str, key: str) -> Values:
 
     Parameters
     ----------
-    values : Values
     given : str or None
         What the mapping says, which counts more than the file.
     unit : str

@@ -110,7 +110,6 @@ def show_spectra(axis: Any, stare: Stare, spectra: NDArray[Any], sd: NDArray[Any
 
     Parameters
     ----------
-    axis : matplotlib Axes
     stare : Stare
         Times of the frames.
     spectra, sd : ndarray, shape (n_frame, n_pixel)

@@ -107,10 +107,7 @@ class Within:
     def figure(self, **_: Any) -> Any:
         """Return the part of the caller's figure that the axes occupy.
 
-        Raises
-        ------
-        InputError
-            If the axes are not part of a grid.
+        Raises InputError if the axes are not part of a grid.
         """
         spec = self._ax.get_subplotspec()
         if spec is None:

@@ -33,10 +33,7 @@ def statistics(
 
     Parameters
     ----------
-    scene : Scene
     realisation : ndarray of uint64, shape (n,)
-    seed : int
-    plan : ChannelPlan
     pair : bool
         Whether to compute `chi2_pair`; its rows are zero otherwise.
     smoothed : Smoothed, optional

@@ -98,11 +98,8 @@ class Checkpoint:
     def __enter__(self) -> Self:
         """Lock the output folder and read its state.
 
-        Raises
-        ------
-        InputError
-            If another process writes to the folder, or it contains an unfinished run without `resume` or `restart`, or
-            one of another study (the message lists the keys that differ).
+        Raises InputError if another process writes to the folder, or it contains an unfinished run without `resume` or
+        `restart`, or one of another study (the message lists the keys that differ).
         """
         if not self._is_held:
             self._stack.enter_context(locked(self.parent, "output folder"))
@@ -261,7 +258,6 @@ def kept(checkpoint: Checkpoint | None, question: object, compute: Callable[[], 
         If omitted, the arrays are computed.
     question : object
         Everything on which the result depends, as for `fingerprint`.
-    compute : callable
     """
     if checkpoint is None:
         return compute()

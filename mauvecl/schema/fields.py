@@ -163,24 +163,12 @@ def _or_error(schema: CoreSchema, words: str, **metadata: str) -> CoreSchema:
 
 @dataclass(frozen=True)
 class Help:
-    """Description of a field, for ``--help``, tooltips of the page and the reference.
+    """Description of a field, for ``--help``, tooltips of the page and the reference."""
 
-    Attributes
-    ----------
-    text : str
-        Noun phrase, without unit and default.
-    more : str
-        Explanation, in lower case, which follows the unit.
-    default : str
-        Words for the default, if the value does not tell.
-    choices : str
-        Words for the accepted values, instead of the list of them.
-    """
-
-    text: str
-    more: str = ""
-    default: str = ""
-    choices: str = ""
+    text: str  # noun phrase, without unit and default
+    more: str = ""  # explanation, in lower case, which follows the unit
+    default: str = ""  # words for the default, if the value does not tell
+    choices: str = ""  # words for the accepted values, instead of the list of them
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
         return handler(schema) | {"description": f"{self.text}; {self.more}" if self.more else self.text}
@@ -237,50 +225,23 @@ class Slider:
 
 @dataclass(frozen=True, kw_only=True)
 class Widget:
-    """Field of the page that sets a key.
-
-    Attributes
-    ----------
-    label : str
-    hint : str
-        Explanation for visitors, in sentences.
-    group : str
-        Heading under which the field stands; empty for fields that show at once.
-    place : int
-        Order within the group; fields of the same place follow the order of the study.
-    name : str
-        Name in links; that of the key by default.
-    first : str, optional
-        Text of a new page; the default of the key by default.
-    choices : tuple of str
-        Accepted words; those of the key by default.
-    unit : str
-        Unit as the page shows it; that of the key by default.
-    scale : float
-        Factor from the value of the key to that of the page.
-    most : float, optional
-        Largest value that a server computes for a visitor; that of the key by default.
-    kind : str
-        "day" for a calendar, "library" for a name of the library, "table" for a text of several lines, "file" for a
-        spectrum, "upload" for a file as it is; by default a field of text, or a choice of words.
-    slider : Slider, optional
-    suggestions : tuple of str
-        Texts that the page offers for a field of text.
-    """
+    """Field of the page that sets a key."""
 
     label: str
-    hint: str
-    group: str = ""
-    place: int = 0
-    name: str = ""
-    first: str | None = None
-    choices: tuple[str, ...] = ()
-    unit: str | None = None
-    scale: float = 1.0
-    most: float | None = None
+    hint: str  # explanation for visitors, in sentences
+    group: str = ""  # heading under which the field stands; empty for fields that show at once
+    place: int = 0  # order within the group; fields of the same place follow the order of the study
+    name: str = ""  # name in links; that of the key by default
+    first: str | None = None  # text of a new page; the default of the key by default
+    choices: tuple[str, ...] = ()  # accepted words; those of the key by default
+    unit: str | None = None  # unit as the page shows it; that of the key by default
+    scale: float = 1.0  # factor from the value of the key to that of the page
+    most: float | None = None  # largest value that a server computes for a visitor; that of the key by default
+    # "day" for a calendar, "library" for a name of the library, "table" for a text of several lines, "file" for a
+    # spectrum, "upload" for a file as it is; by default a field of text, or a choice of words.
     kind: str = ""
     slider: Slider | None = None
-    suggestions: tuple[str, ...] = ()
+    suggestions: tuple[str, ...] = ()  # texts that the page offers for a field of text
 
 
 def found(kind: Any, of: type[Metadata]) -> list[Metadata]:
@@ -328,7 +289,6 @@ def checked(kind: Any, what: str, value: Any) -> float:
         Annotation with `Unit` and `Range`.
     what : str
         Name of the value, for messages.
-    value : Quantity or float
     """
     return checked_number(what, value, unit_of(kind), range_of(kind))
 

@@ -6,16 +6,10 @@ from collections.abc import Iterable
 
 
 class Message(str):
-    """A sentence with its kind.
-
-    Attributes
-    ----------
-    kind : str
-        What the sentence is about, such as "saturated" or "wrong sign"; programs compare it, not the sentence.
-    """
+    """A sentence with its kind."""
 
     __slots__ = ("kind",)
-    kind: str
+    kind: str  # what the sentence is about, such as "saturated" or "wrong sign"; programs compare it, not the sentence
 
     def __new__(cls, text: str, kind: str = "") -> Message:
         """Make a message from its sentence and its kind."""

@@ -41,22 +41,18 @@ def number(
 ) -> float:
     """Return one finite number in a unit.
 
+    Raises InputError if it is no such number, not finite, or outside.
+
     Parameters
     ----------
     what : str
         What it is, for the sentence of an error.
-    value : Quantity or float
     unit : str
         As astropy reads it. Wavelengths may come as frequencies or energies, temperatures on any scale.
     low, high : float
         Where it may lie.
     expected : str
         What the sentence says of it; made of unit and range by default.
-
-    Raises
-    ------
-    InputError
-        If it is no such number, not finite, or outside.
     """
     wanted = expected or _expected(unit, low, high)
     if type(value) is float:
@@ -87,10 +83,7 @@ def numbers(
 def count(what: str, value: Any, *, low: int = 0, high: int = 2**63 - 1) -> int:
     """Return a whole number, given as an int, a float such as 1e5 or a dimensionless Quantity.
 
-    Raises
-    ------
-    InputError
-        If it is none, or outside `low` to `high`.
+    Raises InputError if it is none, or outside `low` to `high`.
     """
     wanted = f"a whole number from {low} to {high}" if high < 2**63 - 1 else f"a whole number of at least {low}"
     try:

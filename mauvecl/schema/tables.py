@@ -17,33 +17,18 @@ INTERVAL = "95 % interval"
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table.
+    """A column of a table."""
 
-    Attributes
-    ----------
-    name : str
-        Name in files and JSON; empty for a column that only people read.
-    get : str or callable
-        Attribute or key of a row that holds the value, or a function of the row; the column's name if empty. A value
-        may be an array: the row then stands for as many rows of the table. None is a missing value.
-    unit, description : str
-    heading : str
-        Heading for people; without one, only files and JSON have the column.
-    format : str or callable
-        Format specification of a value, or a function that returns its text.
-    others : tuple of str
-        Further columns whose values `format` takes after the column's own.
-    kind : type, optional
-        Type of the values, where it does not follow from them: in a table without rows, or with missing values.
-    """
-
-    name: str
+    name: str  # name in files and JSON; empty for a column that only people read
+    # Attribute or key of a row that holds the value, or a function of the row; the column's name if empty. A value may
+    # be an array: the row then stands for as many rows of the table. None is a missing value.
     get: str | Callable[[Any], Any] = ""
     unit: str = ""
     description: str = ""
-    heading: str = ""
-    format: str | Callable[..., str] = ""
-    others: tuple[str, ...] = ()
+    heading: str = ""  # heading for people; without one, only files and JSON have the column
+    format: str | Callable[..., str] = ""  # format specification of a value, or a function that returns its text
+    others: tuple[str, ...] = ()  # further columns whose values `format` takes after the column's own
+    # Type of the values, where it does not follow from them: in a table without rows, or with missing values.
     kind: type | None = None
 
     def value(self, row: object) -> Any:

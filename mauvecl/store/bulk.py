@@ -53,8 +53,6 @@ def draw(
     ----------
     study : Study
         Study that gives seed, mode, recipe and processes.
-    scene : StoredScene
-    engine : Engine or Pool
     start, count : int
         Range of realisations, `start` to `start + count - 1`.
     out : ndarray, shape (count, *scene.row), optional

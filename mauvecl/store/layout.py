@@ -76,10 +76,8 @@ class Store:
     def open(cls, path: str | Path) -> Store:
         """Open an existing store.
 
-        Raises
-        ------
-        InputError
-            If the folder is not a store, no copy of its study is intact, or intact copies contradict each other.
+        Raises InputError if the folder is not a store, no copy of its study is intact, or intact copies contradict each
+        other.
         """
         path = Path(path)
         copies: dict[str, Path] = {}
@@ -148,10 +146,8 @@ class Store:
     def make(self) -> None:
         """Write the description of the arrays, or check that an existing one is the same.
 
-        Raises
-        ------
-        InputError
-            If the store exists and is another study's (the message lists keys that differ), or cannot be written.
+        Raises InputError if the store exists and is another study's (the message lists keys that differ), or cannot be
+        written.
         """
         root = self.path / "zarr.json"
         if root.exists():

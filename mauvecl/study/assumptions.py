@@ -24,7 +24,6 @@ def assumption_line(study: Study, uses: Collection[Use], varied: Collection[str]
 
     Parameters
     ----------
-    study : Study
     uses : collection of str
         Parts of the study; see `Use`.
     varied : collection of str

@@ -296,7 +296,6 @@ def targets_in(table: Table, named: str, folder: Path | None = None) -> list[dic
 
     Parameters
     ----------
-    table : Table
     named : str
         Description of the table, for messages.
     folder : Path, optional

@@ -14,7 +14,6 @@ class First(list[T]):
 
     Parameters
     ----------
-    things : collection
     most : int
         Things that are kept, at most.
     name : str

@@ -140,8 +140,6 @@ def expect_stare(
 
     Parameters
     ----------
-    stare : Stare
-    events : sequence of Event
     quiet : Expectation
         One frame without a flare.
     flare_electrons : callable

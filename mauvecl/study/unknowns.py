@@ -90,12 +90,8 @@ def drawn(study: Study) -> DrawnStudies:
 def throughput_cases(case: Case) -> list[Case]:
     """Return the case with each mode of its calibration at one standard deviation; empty if it has none.
 
-    The sign of a mode is arbitrary; it is chosen so that the same pixels lie in the output range.
-
-    Raises
-    ------
-    InputError
-        If the wavelengths are not known well enough for that.
+    The sign of a mode is arbitrary; it is chosen so that the same pixels lie in the output range. Raises InputError if
+    the wavelengths are not known well enough for that.
     """
     moved, pixels = [], case.instrument.read_pixels
     for mode in values_of(case.instrument).values():

@@ -77,7 +77,10 @@ def test_changes_are_slopes_of_recorded_moments(magnitude: float) -> None:
     light = ("source_electrons", "sky_electrons", "neighbour_electrons")
     for row, names in ((0, light), (1, light[1:2]), (2, ("dark_dn",))):
         moved = replace(quiet, **{name: getattr(quiet, name) * (1 + step) for name in names})
-        slope, unclipped = (moved.recorded_dn - quiet.recorded_dn) / step, (moved.mean_raw_dn - quiet.mean_raw_dn) / step
+        slope, unclipped = (
+            (moved.recorded_dn - quiet.recorded_dn) / step,
+            (moved.mean_raw_dn - quiet.mean_raw_dn) / step,
+        )
         # The width of the distribution changes too, by much less than its mean.
         assert slope / quiet.n_frames == pytest.approx(means[row] / quiet.n_frames, abs=5e-3 * unclipped.max())
     # Dark and light together are all of what factors change: without them the variance is not negative.

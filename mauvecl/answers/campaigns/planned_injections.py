@@ -90,7 +90,6 @@ def found_by_energy(critical_erg: Float, half_widths_s: Float, energy_erg: Float
         are ignored, since false alarms are counted separately.
     half_widths_s : ndarray, shape (n_half_width,)
     energy_erg : ndarray, shape (n_energy,)
-    law : DurationLaw
     """
     of_width = np.empty((half_widths_s.size, energy_erg.size))
     for row, one in zip(of_width, critical_erg, strict=True):

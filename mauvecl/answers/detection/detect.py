@@ -66,26 +66,15 @@ class StarDetection(InCell):
 
 @dataclass(eq=False)
 class DetectAnswer(Answer):
-    """Answer of `mauvecl detect`.
-
-    Attributes
-    ----------
-    study : Study
-    stars : list of StarDetection
-        One per star and cell of the sweep.
-    messages : list of str
-        Messages for users, the most severe first.
-    paper : list of str
-        Comparison with the paper's values, if the study has its G2V star.
-    """
+    """Answer of `mauvecl detect`."""
 
     USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "processes", "nuisances", "seed")
     JSON = MappingProxyType({"rows": "table", "departures": "departures"})
 
     study: Study
-    stars: list[StarDetection]
-    messages: list[str] = field(default_factory=list)
-    paper: list[str] = field(default_factory=list)
+    stars: list[StarDetection]  # one per star and cell of the sweep
+    messages: list[str] = field(default_factory=list)  # messages for users, the most severe first
+    paper: list[str] = field(default_factory=list)  # comparison with the paper's values, if the study has its G2V star
 
     @property
     def columns(self) -> tuple[Column, ...]:

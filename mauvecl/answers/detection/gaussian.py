@@ -118,7 +118,6 @@ def beyond(x: Expectation, sigmas: float) -> NDArray[np.float64]:
 
     Parameters
     ----------
-    x : Expectation
     sigmas : float
         Number of standard deviations; negative for deviations below the mean.
 

@@ -56,29 +56,19 @@ COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class UnknownAnswer(Answer):
-    """The answer of `unknown_table`.
-
-    Attributes
-    ----------
-    study : Study
-    costs : dict of dict of Cost
-        By (star, amplitude), then by unknown.
-    quiets : tuple of Expectation
-        The stars without a flare.
-    """
+    """The answer of `unknown_table`."""
 
     USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "nuisances", "seed")
 
     study: Study
-    costs: dict[tuple[str, float], dict[str, Cost]]
-    quiets: tuple[Expectation, ...] = ()
+    costs: dict[tuple[str, float], dict[str, Cost]]  # by (star, amplitude), then by unknown
+    quiets: tuple[Expectation, ...] = ()  # the stars without a flare
 
     def smallest(self, star: str, unknown: str | None) -> float:
         """Return the flare amplitude detected with the study's power at its false-alarm probability, marginalised.
 
         Parameters
         ----------
-        star : str
         unknown : str or None
             None for everything known.
 

@@ -37,52 +37,24 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Limit:
-    """Limit of a quantity.
-
-    Attributes
-    ----------
-    star : str
-    amplitude : float
-        Amplitude of the flare; NaN if the amplitude is the limit.
-    of, statistic : str
-    fap, power : float
-    value : Interval
-        Limit with its 95 % interval, including that of the threshold.
-    closed_form : float
-        Limit for Gaussian noise.
-    check : Point
-        Detection probability at the value, simulated again with another seed.
-    points : tuple of Point
-        Simulations of the search.
-    curve : tuple of (value, probability)
-        The closed form around the limit.
-    at : mapping
-        Sweep values.
-    unknown : Unknown, optional
-        For limits averaged over unknown instrument values.
-    messages : tuple of str
-        Saturation at the limit, without and with the flare.
-    cost : Cost, optional
-        Loss of S/N to unknowns at the limit.
-    quiet : Expectation, optional
-        The star at the limit, without the flare.
-    """
+    """Limit of a quantity."""
 
     star: str
-    amplitude: float
+    amplitude: float  # amplitude of the flare; NaN if the amplitude is the limit
     of: str
     statistic: str
     fap: float
     power: float
-    value: Interval
-    closed_form: float
-    check: Point
-    points: tuple[Point, ...]
-    curve: tuple[tuple[float, float], ...]
-    at: Mapping[str, float | str] = field(default_factory=dict)
-    unknown: Unknown | None = None
-    messages: tuple[str, ...] = ()
-    cost: Cost | None = None
+    value: Interval  # limit with its 95 % interval, including that of the threshold
+    closed_form: float  # limit for Gaussian noise
+    check: Point  # detection probability at the value, simulated again with another seed
+    points: tuple[Point, ...]  # simulations of the search
+    curve: tuple[tuple[float, float], ...]  # the closed form around the limit
+    at: Mapping[str, float | str] = field(default_factory=dict)  # sweep values
+    unknown: Unknown | None = None  # for limits averaged over unknown instrument values
+    messages: tuple[str, ...] = ()  # saturation at the limit, without and with the flare
+    cost: Cost | None = None  # loss of S/N to unknowns at the limit
+    # The star at the limit, without the flare.
     quiet: Expectation | None = field(default=None, compare=False, repr=False)
 
     @property
@@ -240,12 +212,8 @@ class LimitAnswer(Answer):
 def solve(case: Case, statistic: str, engine: Engine | Pool) -> Limit:
     """Return the limit of a case's first flare, or of its amplitude, and simulate it again with another seed.
 
-    Averages over draws of unknown instrument values if the study has some.
-
-    Raises
-    ------
-    InputError
-        If the power is not crossed in the searched range, or too few realisations lie beyond the threshold.
+    Averages over draws of unknown instrument values if the study has some. Raises InputError if the power is not
+    crossed in the searched range, or too few realisations lie beyond the threshold.
     """
     study = case.study
     check_fap(study.run.fap, study.run.realisations, study.run.tails)

@@ -69,7 +69,6 @@ class ExpectedMeasurement(InCell):
         ----------
         rise : float
             Increase of chi-squared that bounds the region.
-        n : int
 
         Returns
         -------

@@ -41,24 +41,14 @@ AMPLITUDES = (0.4, 4.0)
 
 @dataclass(frozen=True, eq=False)
 class ChangeRow(InCell):
-    """One change of one star.
-
-    Attributes
-    ----------
-    change : Change
-    error, error_known : float
-        Standard error of one visit, with unknowns marginalised over and with everything known.
-    smallest : Smallest
-        In the unit of the change.
-    magnitude : float or None
-        Of the star.
-    """
+    """One change of one star."""
 
     change: Change
+    # error, error_known: standard error of one visit, with unknowns marginalised over and with everything known.
     error: float
     error_known: float
-    smallest: Smallest
-    magnitude: float | None
+    smallest: Smallest  # in the unit of the change
+    magnitude: float | None  # of the star
 
 
 @dataclass(frozen=True, eq=False)

@@ -73,23 +73,14 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class ExposureAnswer(Answer):
-    """The answer of `exposure_for`, one row per star.
-
-    Attributes
-    ----------
-    study : Study
-    exposures : tuple of Exposure
-    messages : tuple of str
-    expectations : tuple of Expectation
-        Each star at its exposure.
-    """
+    """The answer of `exposure_for`, one row per star."""
 
     USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky")
 
     study: Study
     exposures: tuple[Exposure, ...]
     messages: tuple[str, ...]
-    expectations: tuple[Expectation, ...]
+    expectations: tuple[Expectation, ...]  # each star at its exposure
 
     @property
     def table(self) -> QTable:

@@ -50,21 +50,13 @@ class StarSnr(InCell):
 
 @dataclass(eq=False)
 class SnrAnswer(Answer):
-    """The answer of `mauvecl snr`.
-
-    Attributes
-    ----------
-    study : Study
-    stars : list of StarSnr
-        One per star and cell of the sweep.
-    messages : list of str
-    """
+    """The answer of `mauvecl snr`."""
 
     USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "processes", "seed")
     JSON = MappingProxyType({"snr-element": "element", "noise-budget": "noise_budget"})
 
     study: Study
-    stars: list[StarSnr]
+    stars: list[StarSnr]  # one per star and cell of the sweep
     messages: list[str]
 
     @property

@@ -30,10 +30,8 @@ def light_curve_file(one: StarStare, sky: SkyLight, *, seed: int, number: int) -
 
     Parameters
     ----------
-    one : StarStare
     sky : SkyLight
         The study's section with position and time.
-    seed : int
     number : int
         Number of the stare.
     """

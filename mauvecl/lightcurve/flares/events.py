@@ -220,23 +220,17 @@ def coefficients(events: Sequence[Event], start_s: Float, frame_s: float, temper
 
     Flares of constant temperature are integrated exactly. The light of a flare that cools is interpolated linearly in
     1 / T between the spectra of the two neighbouring temperatures, with a constant temperature in each step of a frame.
+    Raises InputError if a flare has a temperature outside the range of `temperatures_k`.
 
     Parameters
     ----------
-    events : sequence of Event
     start_s : ndarray, shape (n_frame,)
-    frame_s : float
     temperatures_k : ndarray, shape (n_temperature,)
         Ascending; at least those of `temperatures_of`.
 
     Returns
     -------
     ndarray, shape (n_frame, n_temperature)
-
-    Raises
-    ------
-    InputError
-        If a flare has a temperature outside the range of `temperatures_k`.
     """
     factors = np.zeros((start_s.size, temperatures_k.size))
     for event in events:

@@ -39,26 +39,14 @@ DAYS_PER_YEAR = 365.25
 
 @dataclass(frozen=True, kw_only=True)
 class Rates(ABC):
-    """Cumulative distribution of flare energies.
+    """Cumulative distribution of flare energies."""
 
-    Attributes
-    ----------
-    band : str
-        Name of the band of the energies, or "bolometric".
-    source : str
-    measured_erg : (float, float)
-        Range in which it was measured; it is extrapolated outside.
-    scatter_dex : float
-        Standard deviation of the logarithm of a single star's rate.
-    definition : {"light", "quiescent", "patch"}
-        Energy of the flares' isotropic light; equivalent duration times the star's luminosity in the band (Davenport);
-        or the bolometric energy of a patch of 10 000 K seen face-on (Shibayama). `of_light` converts to the first.
-    """
-
-    band: str = "Kepler"
+    band: str = "Kepler"  # name of the band of the energies, or "bolometric"
     source: str = "given"
-    measured_erg: tuple[float, float] = ENERGIES
-    scatter_dex: float = 0.0
+    measured_erg: tuple[float, float] = ENERGIES  # range in which it was measured; it is extrapolated outside
+    scatter_dex: float = 0.0  # standard deviation of the logarithm of a single star's rate
+    # Energy of the flares' isotropic light; equivalent duration times the star's luminosity in the band (Davenport); or
+    # the bolometric energy of a patch of 10 000 K seen face-on (Shibayama). `of_light` converts to the first.
     definition: Definition = "light"
 
     def __post_init__(self) -> None:
@@ -93,17 +81,14 @@ class Rates(ABC):
     def of_light(self, erg_per_s: float, luminosity_erg_s: float) -> Self:
         """Return the rates by the bolometric energy of the light of one star's flares.
 
+        Raises InputError if the energies are already those of light; see `in_band`.
+
         Parameters
         ----------
         erg_per_s : float
             Bolometric energy per second of equivalent duration in `amplitude_band`; see `EnergyScale`.
         luminosity_erg_s : float
             Luminosity of the star in that band; see `quiescent_luminosity`.
-
-        Raises
-        ------
-        InputError
-            If the energies are already those of light; see `in_band`.
         """
         if self.definition == "light":
             raise InputError.of("definition", self.definition, "a published definition, not that of light")

@@ -97,12 +97,10 @@ def alarms(
 
     Parameters
     ----------
-    survey : Survey or other SearchedStare
     templates : Templates
         Templates from which the survey's bank and components are made.
     sums : ndarray, shape (n_frame, n_sum)
         Simulated sums; known means are subtracted here.
-    threshold : float
     energy : callable, optional
         Logarithm of the energy per second of equivalent duration as a function of the logarithm of the temperature,
         and its derivative.

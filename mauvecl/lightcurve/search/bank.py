@@ -126,7 +126,6 @@ class Bank:
 
         Parameters
         ----------
-        half_width_s : float
         phases : sequence of float, optional
             Positions of peaks within their frames; by default one or two, depending on the half-width.
         """

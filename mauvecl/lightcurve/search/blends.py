@@ -359,7 +359,6 @@ class Block:
 
         Parameters
         ----------
-        best : BlendFit
         j, column : int
             Flare and column.
         factor : callable, optional

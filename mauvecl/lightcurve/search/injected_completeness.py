@@ -72,7 +72,6 @@ class InjectedCompleteness:
 
         Parameters
         ----------
-        power : float
         half_width : int, optional
             Index of a half-width; by default the average over all.
         """

@@ -64,10 +64,8 @@ def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float, response:
 
     Parameters
     ----------
-    survey : Survey
     widths_s : sequence of float
         Half-widths of the flares.
-    peak_s : float
     response : ndarray, shape (n_sum,)
         Mean sums of a frame for a flare of unit amplitude.
     """

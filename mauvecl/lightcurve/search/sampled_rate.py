@@ -45,8 +45,6 @@ def draw_shifts(survey: Survey, seed: int, part: Survey | None = None) -> Unknow
 
     Parameters
     ----------
-    survey : Survey
-    seed : int
     part : Survey, optional
         Part of the stare in which shifts are evaluated; all of it by default.
     """

@@ -199,7 +199,6 @@ def frame_nuisances(
     ----------
     quiet : Expectation
         One frame.
-    stare : Stare
     more : mapping of str to float, or Nuisances, optional
         Standard deviations by name, which replace jitters of the same kind; an infinite one is projected out.
     """

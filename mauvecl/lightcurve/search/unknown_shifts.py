@@ -42,7 +42,6 @@ class UnknownShifts:
 
         Parameters
         ----------
-        threshold : float
         days : float
             Star-days of the stare.
         rate : callable

@@ -84,7 +84,6 @@ class StareExpectation:
         ----------
         weights : ndarray, shape (n_sum, n_pixel)
             Zero in pixels that are not used.
-        draw : callable
         kind : type
             Type of the arrays.
 
@@ -149,18 +148,14 @@ def draw_light_curves(
 ) -> LightCurves:
     """Draw a stare in bands and resolution elements, all from the same pixels.
 
+    Raises InputError if a band contains no pixel.
+
     Parameters
     ----------
-    expectation : StareExpectation
     bands_nm : sequence of (float, float)
         Wavelengths, nm; the upper limit is excluded, and saturated pixels are not used.
     draw : callable
         Draws the same pixels for all sums.
-
-    Raises
-    ------
-    InputError
-        If a band contains no pixel.
     """
     quiet, used = expectation.quiet, expectation.used.astype(np.float64)
     rows = []

@@ -57,10 +57,7 @@ class SumTable:
     def of(cls, components: Components) -> Self:
         """Compute the table.
 
-        Raises
-        ------
-        InputError
-            If weights are linearly dependent, or counts are too few for the expansion.
+        Raises InputError if weights are linearly dependent, or counts are too few for the expansion.
         """
         n = components.n_statistics
         constant, each = components.sum_cumulants(2)

@@ -25,46 +25,28 @@ EXPOSURE_RATIO = 2.0
 
 @dataclass(frozen=True, eq=False)
 class DarkFit:
-    """Dark current as level_p exp(slope (T - reference)), and bias.
+    """Dark current as level_p exp(slope (T - reference)), and bias."""
 
-    Attributes
-    ----------
-    reference_c : float
-        Temperature at which the levels hold.
-    level_dn_per_s, level_error : ndarray, shape (n_pixel,)
-    bias_dn, bias_error : ndarray, shape (n_pixel,)
-        The error is 0 if the bias is assumed.
-    covariance : ndarray, shape (n_pixel, 2, 2)
-        Of bias and level of each pixel, independent between pixels.
-    shared : ndarray, shape (3, 3)
-        Covariance of bias, level and slope of the mean pixel, which all pixels share.
-    slope_per_c, slope_error : float
-        Common to all pixels; the error is 0 if the slope is assumed.
-    pixel_slope_per_c, pixel_slope_error : ndarray, shape (n_pixel,)
-        Of each pixel alone; NaN if it is not determined.
-    chi2 : float
-    dof : int
-    slopes_p_value : float
-        Probability of pixel slopes at least as different if all are equal; NaN if they are not determined.
-    assumed : tuple of str
-        Quantities that these frames do not determine.
-    """
-
-    reference_c: float
+    reference_c: float  # temperature at which the levels hold
+    # level_dn_per_s, level_error: shape (n_pixel,).
     level_dn_per_s: Float
     level_error: Float
+    # bias_dn, bias_error: shape (n_pixel,); the error is 0 if the bias is assumed.
     bias_dn: Float
     bias_error: Float
-    covariance: Float
-    shared: Float
+    covariance: Float  # shape (n_pixel, 2, 2); of bias and level of each pixel, independent between pixels
+    shared: Float  # shape (3, 3); covariance of bias, level and slope of the mean pixel, which all pixels share
+    # slope_per_c, slope_error: common to all pixels; the error is 0 if the slope is assumed.
     slope_per_c: float
     slope_error: float
+    # pixel_slope_per_c, pixel_slope_error: shape (n_pixel,); of each pixel alone; NaN if it is not determined.
     pixel_slope_per_c: Float
     pixel_slope_error: Float
     chi2: float
     dof: int
+    # Probability of pixel slopes at least as different if all are equal; NaN if they are not determined.
     slopes_p_value: float
-    assumed: tuple[str, ...]
+    assumed: tuple[str, ...]  # quantities that these frames do not determine
 
     @property
     def p_value(self) -> float:
@@ -120,7 +102,6 @@ def fit_dark(dark: Sequence[CalibrationFrames], nominal: Instrument, noise: Nois
     ----------
     dark : sequence of CalibrationFrames
         At least one.
-    nominal : Instrument
     noise : NoiseModel
         Its variances are the weights.
     """

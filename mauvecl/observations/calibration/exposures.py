@@ -23,26 +23,13 @@ MOST_OF_SATURATION = 0.98
 
 @dataclass(frozen=True, eq=False)
 class CalibrationFrames:
-    """Raw frames of one observation that have no fault.
-
-    Attributes
-    ----------
-    name : str
-    raw_dn : ndarray, shape (n_frame, n_pixel)
-        With bias and dark.
-    exposure_s : float
-        Of each frame.
-    temperature_c : ndarray, shape (n_frame,)
-        Of the detector.
-    star : Source or None
-        The known spectrum at its brightness; None for frames without light.
-    """
+    """Raw frames of one observation that have no fault."""
 
     name: str
-    raw_dn: Float
-    exposure_s: float
-    temperature_c: Float
-    star: Source | None = None
+    raw_dn: Float  # shape (n_frame, n_pixel); with bias and dark
+    exposure_s: float  # of each frame
+    temperature_c: Float  # shape (n_frame,); of the detector
+    star: Source | None = None  # the known spectrum at its brightness; None for frames without light
 
     @classmethod
     def of(cls, frames: Frames, nominal: Instrument, star: Source | None, temperature_c: float | None = None) -> Self:
@@ -52,8 +39,6 @@ class CalibrationFrames:
         ----------
         frames : Frames
             Raw DN of each pixel that the instrument reads.
-        nominal : Instrument
-        star : Source or None
         temperature_c : float, optional
             Of the detector, where the frames do not state it.
         """

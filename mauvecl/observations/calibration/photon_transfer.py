@@ -50,55 +50,32 @@ class NoiseModel:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredVariance:
-    """Variance of the frames of one observation, for each usable pixel.
+    """Variance of the frames of one observation, for each usable pixel."""
 
-    Attributes
-    ----------
-    variance, light_dn, dark_dn : ndarray, shape (n_pixel,)
-        Of a frame.
-    dof : float
-        Degrees of freedom of each variance.
-    """
-
+    # variance, light_dn, dark_dn: shape (n_pixel,); of a frame.
     variance: Float
     light_dn: Float
     dark_dn: Float
-    dof: float
+    dof: float  # degrees of freedom of each variance
 
 
 @dataclass(frozen=True, eq=False)
 class PhotonTransfer:
-    """Fit of measured variances.
-
-    Attributes
-    ----------
-    noise : NoiseModel
-    covariance : ndarray, shape (2, 2)
-        Of read variance and gain, for known dark counts; of an assumed gain by `ASSUMED_ERROR`.
-    read_noise_error : float
-        Standard error, DN, with that of the dark counts.
-    dark_unit : {"DN", "electrons"}
-    dark_unit_chi2 : float
-        Chi-squared with dark counts in DN, less that with electrons.
-    chi2 : float
-    dof : int
-    mean_dn, variance, model : ndarray, shape (n_value,)
-        All means of light, measured and fitted variances.
-    assumed : tuple of str
-        Quantities that these frames do not determine.
-    """
+    """Fit of measured variances."""
 
     noise: NoiseModel
+    # Shape (2, 2); of read variance and gain, for known dark counts; of an assumed gain by `ASSUMED_ERROR`.
     covariance: Float
-    read_noise_error: float
+    read_noise_error: float  # standard error, DN, with that of the dark counts
     dark_unit: Literal["DN", "electrons"]
-    dark_unit_chi2: float
+    dark_unit_chi2: float  # chi-squared with dark counts in DN, less that with electrons
     chi2: float
     dof: int
+    # mean_dn, variance, model: shape (n_value,); all means of light, measured and fitted variances.
     mean_dn: Float
     variance: Float
     model: Float
-    assumed: tuple[str, ...] = ()
+    assumed: tuple[str, ...] = ()  # quantities that these frames do not determine
 
     @property
     def read_noise_dn(self) -> float:

@@ -63,49 +63,29 @@ class Value:
 
 @dataclass(frozen=True, eq=False)
 class ThroughputFit:
-    """Fit of the throughput.
+    """Fit of the throughput."""
 
-    Attributes
-    ----------
-    wavelength_nm : ndarray, shape (n_pixel,)
-    log_factor : ndarray, shape (n_pixel,)
-        Logarithm of the throughput over the nominal one.
-    joint : ndarray, shape (n_pixel + n_shape, n_pixel + n_shape)
-        Covariance of `log_factor` and, if they are fitted, of shift and stretch in nm and of the relative width and its
-        change.
-    shift_nm, stretch_nm : Value or None
-        Wavelength of a feature less the nominal one in the middle of the spectrum, and its change to either end.
-    fwhm_nm, fwhm_change_nm : Value or None
-        Width of the line function's Gaussian in the middle of the spectrum, and its change to the red end.
-    residual : ndarray, shape (n_star, n_pixel)
-        Observed less fitted counts in standard deviations; NaN for pixels that are not used.
-    chi2 : float
-    dof : float
-        Pixels less the effective number of parameters.
-    smoothing : float
-        Weight of the squared second derivative.
-    spectrum_error : float
-        Relative error of the stars' spectra at each of `ERROR_KNOTS` knots.
-    structure : float
-        Relative standard deviation of the pixels about the spline; 0 if it follows the throughput.
-    assumed : tuple of str
-        Quantities that these stars do not determine.
-    """
-
-    wavelength_nm: Float
-    log_factor: Float
+    wavelength_nm: Float  # shape (n_pixel,)
+    log_factor: Float  # shape (n_pixel,); logarithm of the throughput over the nominal one
+    # Shape (n_pixel + n_shape, n_pixel + n_shape); covariance of `log_factor` and, if they are fitted, of shift and
+    # stretch in nm and of the relative width and its change.
     joint: Float
+    # shift_nm, stretch_nm: wavelength of a feature less the nominal one in the middle of the spectrum, and its change
+    # to either end.
     shift_nm: Value | None
     stretch_nm: Value | None
+    # fwhm_nm, fwhm_change_nm: width of the line function's Gaussian in the middle of the spectrum, and its change to
+    # the red end.
     fwhm_nm: Value | None
     fwhm_change_nm: Value | None
+    # Shape (n_star, n_pixel); observed less fitted counts in standard deviations; NaN for pixels that are not used.
     residual: Float
     chi2: float
-    dof: float
-    smoothing: float
-    spectrum_error: float
-    structure: float
-    assumed: tuple[str, ...]
+    dof: float  # pixels less the effective number of parameters
+    smoothing: float  # weight of the squared second derivative
+    spectrum_error: float  # relative error of the stars' spectra at each of `ERROR_KNOTS` knots
+    structure: float  # relative standard deviation of the pixels about the spline; 0 if it follows the throughput
+    assumed: tuple[str, ...]  # quantities that these stars do not determine
 
     @property
     def error(self) -> Float:
@@ -131,22 +111,12 @@ class ThroughputFit:
 
 @dataclass(frozen=True, eq=False)
 class _Linearised:
-    """Observed counts as a linear function of the parameters, independent and of variance one.
+    """Observed counts as a linear function of the parameters, independent and of variance one."""
 
-    Attributes
-    ----------
-    values : ndarray, shape (n,)
-    design : ndarray, shape (n, n_parameter)
-        The spline's coefficients first.
-    prior : ndarray, shape (n_parameter,)
-        Standard deviations; infinite for free parameters.
-    penalty : ndarray, shape (n_coefficient, n_coefficient)
-    """
-
-    values: Float
-    design: Float
-    prior: Float
-    penalty: Float
+    values: Float  # shape (n,)
+    design: Float  # shape (n, n_parameter); the spline's coefficients first
+    prior: Float  # shape (n_parameter,); standard deviations; infinite for free parameters
+    penalty: Float  # shape (n_coefficient, n_coefficient)
 
     def solved(self, smoothing: float, prior: Float | None = None) -> tuple[Float, Float]:
         """Return the parameters and their covariance."""
@@ -195,7 +165,6 @@ class _Linearised:
         ----------
         found, covariance : ndarray
             From `solved`.
-        smoothing : float
         basis : ndarray, shape (n_pixel, n_coefficient)
         """
         n = len(self.penalty)
@@ -233,21 +202,7 @@ class _Linearised:
 
 @dataclass(frozen=True, eq=False)
 class ThroughputModel:
-    """Mean light of standard stars for a throughput, wavelength scale and line width.
-
-    Attributes
-    ----------
-    stars : tuple of CalibrationFrames
-    nominal : Instrument
-    dark : DarkFit
-    transfer : PhotonTransfer
-    sky : Sky
-    order : {"paper", "physical"}
-    basis, penalty : ndarray
-        B-spline at the pixels, shape (n_pixel, n_coefficient), and the matrix of its squared second derivative.
-    light_error : float
-        Relative standard deviation of the light of an observation.
-    """
+    """Mean light of standard stars for a throughput, wavelength scale and line width."""
 
     stars: tuple[CalibrationFrames, ...]
     nominal: Instrument
@@ -255,9 +210,11 @@ class ThroughputModel:
     transfer: PhotonTransfer
     sky: Sky
     order: Order
+    # basis, penalty: B-spline at the pixels, shape (n_pixel, n_coefficient), and the matrix of its squared second
+    # derivative.
     basis: Float
     penalty: Float
-    light_error: float
+    light_error: float  # relative standard deviation of the light of an observation
 
     @cached_property
     def x(self) -> Float:
@@ -418,12 +375,8 @@ def fit_throughput(
     ----------
     stars : sequence of CalibrationFrames
         At least one, each with its spectrum.
-    nominal : Instrument
-    dark : DarkFit
-    transfer : PhotonTransfer
     knots : int
         Number of intervals of the spline.
-    sky : Sky
     order : {"paper", "physical"}
     light_error : float
         Relative standard deviation of the light of an observation, by pointing.
@@ -476,24 +429,14 @@ def fit_throughput(
 
 @dataclass(frozen=True, eq=False)
 class _Pixels:
-    """Factors of single pixels on the throughput that the spline leaves.
+    """Factors of single pixels on the throughput that the spline leaves."""
 
-    Attributes
-    ----------
-    log_factor, variance : ndarray, shape (n_pixel,)
-        0 if the spline follows the throughput.
-    structure : float
-        Relative standard deviation of the factors.
-    disagree : bool
-        True if the stars differ from each other.
-    chi2, dof : float
-        Of the fit with these factors.
-    """
-
+    # log_factor, variance: shape (n_pixel,); 0 if the spline follows the throughput.
     log_factor: Float
     variance: Float
-    structure: float
-    disagree: bool
+    structure: float  # relative standard deviation of the factors
+    disagree: bool  # true if the stars differ from each other
+    # chi2, dof: of the fit with these factors.
     chi2: float
     dof: float
 

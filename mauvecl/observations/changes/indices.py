@@ -34,22 +34,12 @@ GRID_NM = np.linspace(150.0, 760.0, 6101)
 
 @dataclass(frozen=True)
 class Index:
-    """Definition of a line index: light in a band above a straight continuum.
+    """Definition of a line index: light in a band above a straight continuum."""
 
-    Attributes
-    ----------
-    name : str
-        As in `EmissionLine.named`.
-    band_nm : tuple of float
-    continuum_nm : tuple of tuple
-    published : str
-        The usual definition for spectra of higher resolution, with its source.
-    """
-
-    name: str
+    name: str  # as in `EmissionLine.named`
     band_nm: tuple[float, float]
     continuum_nm: tuple[tuple[float, float], ...]
-    published: str
+    published: str  # the usual definition for spectra of higher resolution, with its source
 
     @property
     def lines(self) -> EmissionLine:
@@ -82,23 +72,12 @@ INDICES = {
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """A change of a star's spectrum by one unit.
-
-    Attributes
-    ----------
-    name : str
-    unit : str
-        Unit of the change; empty if it is relative.
-    meaning : str
-        What a change of one unit is.
-    counts_dn : ndarray, shape (n_pixel,)
-        DN of the exposure that it adds.
-    """
+    """A change of a star's spectrum by one unit."""
 
     name: str
-    unit: str
-    meaning: str
-    counts_dn: Float
+    unit: str  # unit of the change; empty if it is relative
+    meaning: str  # what a change of one unit is
+    counts_dn: Float  # shape (n_pixel,); DN of the exposure that it adds
 
     @classmethod
     def named(
@@ -121,7 +100,6 @@ class Change:
             At its brightness.
         quiet : Expectation
             One exposure.
-        instrument : Instrument
         order : {"paper", "physical"}
         file : Source, optional
             Light that the change ``spectrum`` adds.
@@ -202,26 +180,13 @@ def flux_per_dn(quiet: Expectation, instrument: Instrument) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class IndexValue:
-    """A line index of a star in one exposure.
-
-    Attributes
-    ----------
-    index : Index
-    weights : ndarray, shape (n_pixel,)
-        The index, erg s-1 cm-2, for one DN of the exposure in each pixel.
-    value : float
-        Of the mean exposure.
-    equivalent_width_nm : float
-        Positive in emission.
-    captured : float
-        Share of a line's flux that the index holds at Mauve's resolution.
-    """
+    """A line index of a star in one exposure."""
 
     index: Index
-    weights: Float
-    value: float
-    equivalent_width_nm: float
-    captured: float
+    weights: Float  # shape (n_pixel,); the index, erg s-1 cm-2, for one DN of the exposure in each pixel
+    value: float  # of the mean exposure
+    equivalent_width_nm: float  # positive in emission
+    captured: float  # share of a line's flux that the index holds at Mauve's resolution
 
     @classmethod
     def of(cls, index: Index, quiet: Expectation, instrument: Instrument, order: Order) -> Self:

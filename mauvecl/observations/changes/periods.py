@@ -31,25 +31,14 @@ IN_TAIL = 20
 
 @dataclass(frozen=True, eq=False)
 class Recovery:
-    """Share of sinusoids whose period is recovered.
+    """Share of sinusoids whose period is recovered."""
 
-    Attributes
-    ----------
-    time_d : ndarray, shape (n_visit,)
-    threshold : float
-        Normalised power that noise exceeds with the false-alarm probability, anywhere in the periodogram.
-    periods_d : ndarray, shape (n_period,)
-    amplitudes : ndarray, shape (n_amplitude,)
-        Semi-amplitudes in standard errors of a visit.
-    recovered : list of list of Interval
-        For each amplitude and period.
-    """
-
-    time_d: Float
+    time_d: Float  # shape (n_visit,)
+    # Normalised power that noise exceeds with the false-alarm probability, anywhere in the periodogram.
     threshold: float
-    periods_d: Float
-    amplitudes: Float
-    recovered: list[list[Interval]]
+    periods_d: Float  # shape (n_period,)
+    amplitudes: Float  # shape (n_amplitude,); semi-amplitudes in standard errors of a visit
+    recovered: list[list[Interval]]  # for each amplitude and period
 
 
 def visit_times_d(windows: Windows, visits: int, exposure_s: float, seed: int) -> Float:

@@ -32,18 +32,10 @@ LEAST_KEPT = 1e-10
 
 @dataclass(frozen=True)
 class Smallest:
-    """Smallest detectable changes, in the unit of the error of a visit.
+    """Smallest detectable changes, in the unit of the error of a visit."""
 
-    Attributes
-    ----------
-    one : float
-        Difference of one visit from all others.
-    scatter : float
-        Standard deviation of a star that differs normally in each visit.
-    """
-
-    one: float
-    scatter: float
+    one: float  # difference of one visit from all others
+    scatter: float  # standard deviation of a star that differs normally in each visit
 
 
 @validated
@@ -88,8 +80,6 @@ def error_of_change(counts_dn: Float, quiet: Expectation, unknown: Nuisances | N
     ----------
     counts_dn : ndarray, shape (n_pixel,)
         DN of the exposure for an amplitude of one.
-    quiet : Expectation
-    unknown : Nuisances or None
     """
     variance, used = variance_of(quiet)
     delta = np.where(used, counts_dn, 0.0)
@@ -106,8 +96,6 @@ def error_of_index(weights: Float, quiet: Expectation, unknown: Nuisances | None
     Parameters
     ----------
     weights : ndarray, shape (n_pixel,)
-    quiet : Expectation
-    unknown : Nuisances or None
     """
     variance = float(np.sum(weights**2 * quiet.variance_dn2))
     if unknown:

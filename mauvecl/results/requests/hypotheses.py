@@ -28,28 +28,15 @@ LEAST_SHIFT = 1e-3
 @validated
 @dataclass(eq=False)
 class Hypotheses:
-    """The null hypothesis, the flares, and the statistics that distinguish them.
-
-    Attributes
-    ----------
-    quiet : Expectation
-    flares : tuple of Expectation
-    asked : sequence of str or Linear
-        Requested statistics.
-    scene : Scene
-    nuisances : Nuisances, optional
-        Parameters over which the statistics are marginalised.
-    statistics : tuple of str
-        Names of the statistics.
-    """
+    """The null hypothesis, the flares, and the statistics that distinguish them."""
 
     quiet: Expectation
     flares: tuple[Expectation, ...]
-    asked: Sequence[str | Linear]
+    asked: Sequence[str | Linear]  # requested statistics
     scene: Scene
     _: KW_ONLY
-    nuisances: Nuisances | None = None
-    statistics: tuple[str, ...] = field(init=False)
+    nuisances: Nuisances | None = None  # parameters over which the statistics are marginalised
+    statistics: tuple[str, ...] = field(init=False)  # names of the statistics
     setting: Setting = field(init=False, repr=False)
     _chosen: dict[str, Statistic] = field(init=False, repr=False)
     _forms: dict[tuple[str, int | None, int], Form] = field(default_factory=dict, init=False, repr=False, compare=False)
@@ -93,7 +80,6 @@ class Hypotheses:
 
         Parameters
         ----------
-        statistic : str
         template : int
             Index of the flare that shaped statistics use as template.
         """
