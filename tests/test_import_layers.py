@@ -40,7 +40,6 @@ TAKE_STUDIES = {
     "answers.answer",
     "answers.detection.unknown_table",
     "answers.limits.assumptions",
-    "answers.observations.neighbour_flares",
     "answers.verbs",
     "cli.foresight",
     "cli.question",

@@ -42,7 +42,7 @@ class PixelStatistics:
 class WeightedSums:
     """Weighted sums of the pixels of each frame."""
 
-    sums: Float  # shape (n_frame, n_weight); naN for frames with a pixel that is not finite
+    sums: Float  # shape (n_frame, n_weight); NaN for frames with a pixel that is not finite
     errors: Float | None  # from the stated errors of the pixels, which are taken to be independent
     pixels: PixelStatistics
     dead: int  # number of pixels that are left out, because they are not finite in most frames

@@ -23,6 +23,7 @@ from mauvecl.observations.frames import Frames
 from mauvecl.observations.line_index import MG_II_CONTINUUM_NM, MG_II_NM, line_index
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.observations.reading import frames_of, read_frames, reduce_frames
+from mauvecl.study.cases import cases
 
 TIME = np.arange(100) * 20.0
 FLUX = 1000 + np.random.default_rng(29).normal(0, 5, 100)
@@ -86,7 +87,7 @@ CALLS: dict[str, tuple[Callable[[], object], str]] = {
     "reversed periods": (lambda: changes("change.shortest_d=40"), "change.longest_d"),
     "visits longer than windows": (lambda: visits(4000.0), "observation.exposure_s"),
     "calibration without a star": (lambda: calibrate(Study()), "calibrate.observations"),
-    "neighbours of two stars": (lambda: blended_stars(Study()), "star"),
+    "neighbours of two stars": (lambda: blended_stars(cases(Study(), swept=False)), "star"),
 }
 
 

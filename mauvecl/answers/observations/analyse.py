@@ -10,7 +10,7 @@ import numpy as np
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.observations.neighbour_flares import COLUMNS as BLENDS
-from mauvecl.answers.observations.neighbour_flares import blended_stars, neighbour_flares
+from mauvecl.answers.observations.neighbour_flares import NeighbourFlare, blended_stars
 from mauvecl.host.orbit.orbit import Orbit
 from mauvecl.host.orbit.targets import Target
 from mauvecl.host.stars.source import Source
@@ -438,7 +438,9 @@ class AnalyseAnswer(Answer):
     @cached_property
     def neighbour_flares(self) -> QTable:
         """One row per event and star in the fibre: the flare of that star which would look like the event."""
-        return neighbour_flares(self.study, [(row.date, row.event) for row in self.rows])
+        stars = blended_stars(cases(self.study, swept=False))
+        flares = [NeighbourFlare(row.date, row.event, star) for row in self.rows for star in stars]
+        return table_of(BLENDS, flares, study=self.study.text())
 
     @property
     def views(self) -> list[View]:
@@ -517,7 +519,7 @@ def analyse(
     jitters = search.spreads() or None
     if study.has_neighbours:
         # What is wrong with the star or its neighbours is refused before the search.
-        blended_stars(study)
+        blended_stars(cases(study, swept=False))
     analysis = analyse_frames(
         frames, false_alarms=search.false_alarms, per=search.per, shape=search.shape, seed=study.run.seed,
         model=model if isinstance(model, FrameModel) else None, rank=search.sums, jitters=jitters,

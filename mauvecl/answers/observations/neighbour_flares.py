@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from mauvecl.host.stars.flare import check_scales
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.tables import Column, number, percent, table_of
-from mauvecl.study.cases import cases
+from mauvecl.schema.tables import Column, number, percent
 
 if TYPE_CHECKING:
-    from astropy.table import QTable
-
     from mauvecl.host.stars.source import Source
     from mauvecl.observations.events import ObservedEvent
     from mauvecl.study.cases import Case
-    from mauvecl.study.study import Study
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,20 +29,17 @@ class BlendedStar:
         return event.amplitude / self.rise if self.rise else float("inf")
 
 
-def blended_stars(study: Study) -> list[BlendedStar]:
-    """Return the stars in the fibre of a study's star, the star itself first.
-
-    Raises InputError unless the study has a single star.
-    """
-    if len(study.star) != 1:
+def blended_stars(cases: Sequence[Case]) -> list[BlendedStar]:
+    """Return the stars in the fibre of the observed star, itself first; raises InputError for several cases."""
+    if len(cases) != 1:
         raise InputError(
-            f"neighbours of observed frames with {len(study.star)} stars",
+            f"neighbours of observed frames with {len(cases)} stars",
             "the star that was observed, such as `star=G2V` with its magnitude",
             key="star",
-            value=[star.library or str(star.file) for star in study.star],
+            value=[case.star.library or str(case.star.file) for case in cases],
         )
-    (case,) = cases(study, swept=False)
-    check_scales(study.flare.light())
+    (case,) = cases
+    check_scales(case.study.flare.light())
     near, quiet = case.neighbours, case.quiet
     assert near is not None
     total = float((quiet.source_electrons + quiet.neighbour_electrons).sum())
@@ -96,10 +89,3 @@ COLUMNS = (
     Column("equivalent_duration", "equivalent_duration_s", "s", "of that flare, in the flare's band", "ED (s)",
            number(".4g")),
 )  # fmt: skip
-
-
-def neighbour_flares(study: Study, events: Iterable[tuple[str, ObservedEvent]]) -> QTable:
-    """Return the flares of each star in the fibre that would look like each event, given with its date."""
-    stars = blended_stars(study)
-    rows = [NeighbourFlare(date, event, star) for date, event in events for star in stars]
-    return table_of(COLUMNS, rows, study=study.text())
