@@ -66,7 +66,18 @@ class CalibrateQuestion(Section):
             kind="upload",
         ),
     ] = ()
-    knots: Annotated[int, Range(4, 200), Help("Intervals of the spline of the throughput"), Flag("--knots")] = 100
+    knots: Annotated[
+        int,
+        Range(4, 200),
+        Help("Intervals of the spline of the throughput"),
+        Flag("--knots"),
+        Widget(
+            label="Intervals of the throughput",
+            hint="Intervals of the spline that describes the throughput: more of them follow narrower features, with "
+            "larger errors.",
+            group="Standards",
+        ),
+    ] = 100
     light_error: Annotated[
         float,
         Range(0, 1),

@@ -50,7 +50,7 @@ class SearchChoice(Section):
         Flag("--false-alarms"),
         Widget(
             label="False alarms",
-            hint="How many detections that are only noise the search may report in the time of the next field.",
+            hint="Expected number of detections that are only noise, in the time that the next field states.",
             group="Search",
         ),
     ] = 1.0
@@ -60,7 +60,7 @@ class SearchChoice(Section):
         Flag("--alarms-per"),
         Widget(
             label="False alarms per",
-            hint="Time on one star in which so many false alarms are expected.",
+            hint="Observing time of one star to which the number of false alarms refers.",
             group="Search",
             place=1,
         ),

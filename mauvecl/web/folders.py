@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import hashlib
 import shutil
 import tempfile
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import IO
@@ -28,6 +30,18 @@ def _own() -> tuple[Path, IO[bytes]]:
 def visitor_folder() -> tempfile.TemporaryDirectory[str]:
     """Make a folder for a visitor in that of this server."""
     return tempfile.TemporaryDirectory(dir=_own()[0])
+
+
+def content_folder(folder: Path, content: bytes, fill: Callable[[Path], object]) -> Path:
+    """Return the subfolder for some content, named after its digest; the first call fills it."""
+    home = folder / hashlib.sha256(content).hexdigest()
+    if not home.exists():
+        new = Path(tempfile.mkdtemp(dir=folder))
+        fill(new)
+        # Another thread may have been faster; the visitor's folder is removed as a whole.
+        with contextlib.suppress(OSError):
+            new.rename(home)
+    return home
 
 
 def remove_abandoned() -> None:

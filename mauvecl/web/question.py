@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
 from mauvecl.web.fields import FIELDS, READ_WITH, Draws, Field
+from mauvecl.web.folders import content_folder
 
 if TYPE_CHECKING:
     from mauvecl.host.spectra.conversion import ReadSpectrum
@@ -126,23 +126,19 @@ class Question:
 
 def write_table(text: str, folder: Path) -> Path:
     """Write a table of neighbours to a file, once per text, and return its path."""
-    path = folder / hashlib.sha256(text.encode()).hexdigest() / NEIGHBOURS_FILE
-    if not path.exists():
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(text)
-    return path
+    home = content_folder(folder, text.encode(), lambda new: (new / NEIGHBOURS_FILE).write_text(text))
+    return home / NEIGHBOURS_FILE
 
 
 def write_spectrum(source: Source | ReadSpectrum, folder: Path, name: str) -> Path:
     """Write an uploaded spectrum to a file of this name without loss, once per spectrum, and return its path."""
     from astropy.table import Table
 
-    digest = hashlib.sha256(source.wavelength_nm.tobytes() + source.flux_flam.tobytes()).hexdigest()
-    path = folder / digest / name
-    if not path.exists():
+    def write(new: Path) -> None:
         table = Table({"wavelength": source.wavelength_nm, "flux": source.flux_flam})
         table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
         table.meta |= {"name": source.name, "told": list(source.messages)}
-        path.parent.mkdir(exist_ok=True)
-        table.write(path, format="ascii.ecsv")
-    return path
+        table.write(new / name, format="ascii.ecsv")
+
+    content = name.encode() + source.wavelength_nm.tobytes() + source.flux_flam.tobytes()
+    return content_folder(folder, content, write) / name

@@ -141,7 +141,7 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
     async def run() -> None:
         from tornado.ioloop import PeriodicCallback
 
-        # A server that is told to end leaves through Python's own exit, which removes its folders.
+        # Exit normally on SIGTERM, so that the folders of visitors are removed.
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
         remove_abandoned()
         make(address, port, allow_origin)

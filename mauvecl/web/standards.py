@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import tomllib
 import zipfile
@@ -15,6 +14,7 @@ from typing import Any
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import printable, shortened
 from mauvecl.study.calibrations import PATHS, CalibrateQuestion, CalibrationObservation
+from mauvecl.web.folders import content_folder
 
 #: Files and observations of an archive, and bytes to which it unpacks, at most.
 MOST_FILES, MOST_BYTES = 40, 64 * 2**20
@@ -54,11 +54,12 @@ class Observations:
 
     def written(self, folder: Path) -> list[dict[str, Any]]:
         """Write the files below a folder, once, and return the observations with their paths."""
-        home = folder / hashlib.sha256(self.content).hexdigest()
-        if not home.exists():
-            home.mkdir()
+
+        def unpack(new: Path) -> None:
             for name, content in self.files.items():
-                (home / name).write_bytes(content)
+                (new / name).write_bytes(content)
+
+        home = content_folder(folder, self.content, unpack)
         return placed(self.rows, lambda name: str(home / name))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -20,6 +19,7 @@ from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 from mauvecl.web.fields import FIELDS, READ_WITH, UPLOADED, UPLOADED_FILE, UPLOADED_FLARE, UPLOADED_UNKNOWN
+from mauvecl.web.folders import content_folder
 from mauvecl.web.question import Points
 from mauvecl.web.sandboxed_reader import Spectrum, read_frames_limited, read_limited
 from mauvecl.web.standards import Observations
@@ -92,13 +92,7 @@ def read_pairs(name: str, content: bytes) -> Points:
     InputError
         If it is too large or holds no such columns.
     """
-    if len(content) > MOST_PAIRS_BYTES:
-        raise InputError(
-            f"upload of {len(content) / 1024:.0f} KiB",
-            f"at most {MOST_PAIRS_BYTES // 1024} KiB",
-            key="upload",
-            value=len(content),
-        )
+    check_size(content, MOST_PAIRS_BYTES)
     try:
         text = content.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -139,11 +133,10 @@ class VisitorFile:
 
     def written(self, folder: Path) -> Path:
         """Write the file below a folder, once, and return its path."""
-        path = folder / hashlib.sha256(self.content).hexdigest() / self.name
-        if not path.exists():
-            path.parent.mkdir(exist_ok=True)
-            path.write_bytes(self.content)
-        return path
+        home = content_folder(
+            folder, self.name.encode() + self.content, lambda new: (new / self.name).write_bytes(self.content)
+        )
+        return home / self.name
 
 
 @dataclass(frozen=True)

@@ -852,6 +852,26 @@ def test_star_is_filled_in_or_offered(page: Page) -> None:
     until(page, lambda: "V = 9," in shown(page))
 
 
+@pytest.mark.parametrize("answered", [True, False])
+def test_star_is_filled_in_before_and_after_its_answer(page: Page, answered: bool) -> None:
+    """The name is confirmed after the answer to the typed text has come, or while the server still computes it."""
+    if not answered:
+        # Every message of the server comes late.
+        page.evaluate("""() => { const come = page.live.come.bind(page.live)
+            page.live.come = data => setTimeout(() => come(data), 1500) }""")
+    field = page.get_by_label("Star", exact=True)
+    field.fill("gj 581")
+    if answered:
+        until(page, lambda: "M3V star" in page.locator("#words-of").inner_text())
+        settled(page)
+    field.press("Enter")
+    until(page, lambda: "V = 10.57" in shown(page))
+    assert page.get_by_label("Magnitude", exact=True).input_value() == "10.57"
+    # Name and magnitude are one step of the history.
+    page.go_back()
+    until(page, lambda: "a G2V star of V = 8.5" in shown(page))
+
+
 def test_chosen_realisations_come_back(page: Page) -> None:
     enter(page, "Realisations", "1000000")
     enter(page, "False-alarm probability", "1e-6")

@@ -8,6 +8,8 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -61,3 +63,22 @@ def test_folder_of_a_running_server_stays(tmp_path: Path, monkeypatch: pytest.Mo
         (tmp_path / f"{folders.PREFIX}killed" / folders.LOCK).touch()
         folders.remove_abandoned()
         assert [path.name for path in tmp_path.iterdir()] == [f"{folders.PREFIX}running"]
+
+
+def test_content_is_written_once_and_whole(tmp_path: Path) -> None:
+    """Two threads that write the same content get one folder, with whatever either of them wrote in full."""
+    filled: list[Path] = []
+    both = threading.Barrier(2)
+
+    def fill(new: Path) -> None:
+        both.wait(20.0)
+        (new / "a.txt").write_text("content")
+        filled.append(new)
+
+    with ThreadPoolExecutor(2) as threads:
+        first, second = threads.map(lambda _: folders.content_folder(tmp_path, b"content", fill), range(2))
+    assert first == second
+    assert (first / "a.txt").read_text() == "content"
+    assert folders.content_folder(tmp_path, b"content", fill) == first
+    assert len(filled) == 2
+    assert folders.content_folder(tmp_path, b"other", lambda new: (new / "b.txt").touch()) != first

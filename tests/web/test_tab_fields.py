@@ -58,8 +58,7 @@ OTHER = {
     "shortest_d": "2", "longest_d": "20", "distance_pc": "7", "false_alarms": "2",
     "per": "day", "neighbours": NEAR, "neighbours_of": "0 0", "neighbour_share": "0.5", "pointing_rate": "2",
     "pointing_duration": "100", "pointing_depth": "10", "frames": UPLOADED_FILE, "mapping": UPLOADED_FILE,
-
-    "observations": UPLOADED_FILE, "light_error": "1", "spectrum_error": "2",
+    "observations": UPLOADED_FILE, "knots": "50", "light_error": "1", "spectrum_error": "2",
 }  # fmt: skip
 #: A file, and fields that say how an upload is read, which change nothing without one.
 READS = set().union(*READ_WITH.values()) | {"flare_file"}

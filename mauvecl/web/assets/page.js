@@ -116,7 +116,11 @@ class Page {
       this.withdraw()
       this.ask()
       this.routing.step(last)
-    } else if (last) this.routing.editing = false
+    } else if (last) {
+      this.routing.editing = false
+      // The star is chosen after the answer to its name has come: ask again for what is known of it.
+      if (this.fields.fresh) this.ask()
+    }
   }
 
   /** @param {Entered} given */

@@ -69,8 +69,8 @@ class Completeness(Tab):
 
     name, title = "completeness", "Stare"
     about = (
-        "One exposure sees a flare at its peak; a stare sees it rise and fade. What a search of a stare of one orbit "
-        "finds at so many false alarms, also where the star drifts out of the fibre."
+        "One exposure sees a flare at its peak; a stare sees it rise and fade. This tab shows which flares a search of "
+        "one orbit finds at the chosen rate of false alarms, with losses while the star drifts out of the fibre."
     )
     pictures = (Shares(),)
     headline = False
