@@ -253,7 +253,7 @@ def _panels(figure: Any, answer: PlanAnswer, k: int) -> None:
         rate = one.rates.per_day_above(energy[shown]) * one.hours / 24
         used = rate > 0
         often.plot(energy[shown][used], rate[used], color=COLOURS[4])
-        often.set(yscale="log", ylabel=f"flares of so much or more in {one.hours:.0f} h")
+        often.set(yscale="log", ylabel=f"flares above this energy in {one.hours:.0f} h")
         often.spines["right"].set_visible(True)
         often.yaxis.label.set_color(COLOURS[4])
         _plain_decades(often.yaxis)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -45,7 +46,7 @@ class Column:
     def text(self, record: Mapping[str, Any]) -> str:
         """Return a cell as people read it, from the values of its row by column."""
         values = [record[name] for name in (self.name, *self.others) if name]
-        return self.format(*values) if callable(self.format) else format(values[0], self.format)
+        return self.format(*values) if callable(self.format) else formatted(values[0], self.format)
 
 
 @dataclass(frozen=True)
@@ -126,9 +127,15 @@ def records(table: Table) -> list[dict[str, Any]]:
     return [dict(zip(table.colnames, values, strict=True)) for values in zip(*columns, strict=True)]
 
 
+def formatted(value: Any, spec: str) -> str:
+    """Format a value; numbers below a million that `spec` writes with a power of ten, as 1e+04, are written out."""
+    text = format(value, spec)
+    return f"{float(text):.0f}" if spec.endswith("g") and re.search(r"e\+0[0-5]$", text) else text
+
+
 def number(spec: str, undefined: str = "") -> Callable[[float], str]:
     """Return a function that formats a number, and returns `undefined` for NaN."""
-    return lambda value: format(value, spec) if value == value else undefined
+    return lambda value: formatted(value, spec) if value == value else undefined
 
 
 def percent(spec: str) -> Callable[[float], str]:
@@ -138,7 +145,9 @@ def percent(spec: str) -> Callable[[float], str]:
 
 def interval(spec: str, factor: float = 1.0) -> Callable[[float, float], str]:
     """Return a function that formats the ends of an interval, times a factor; empty for NaN."""
-    return lambda low, high: f"[{factor * low:{spec}}, {factor * high:{spec}}]" if low == low else ""
+    return lambda low, high: (
+        f"[{formatted(factor * low, spec)}, {formatted(factor * high, spec)}]" if low == low else ""
+    )
 
 
 def short(value: float | str) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
-from bokeh.models import BoxZoomTool, DataRange1d, HoverTool, Range1d, ResetTool, WheelZoomTool
+from bokeh.models import BasicTickFormatter, BoxZoomTool, DataRange1d, HoverTool, Range1d, ResetTool, WheelZoomTool
 from bokeh.models.annotations import Label, Span
 from bokeh.models.sources import ColumnDataSource
 from bokeh.plotting import figure
@@ -113,6 +113,8 @@ class Canvas:
                 major_label_text_color=ink.text, axis_line_color=ink.text, major_tick_line_color=ink.text,
                 minor_tick_line_color=None,
             )  # fmt: skip
+            if isinstance(axis.formatter, BasicTickFormatter):
+                axis.formatter.power_limit_high = 7
         plot.xaxis.name, plot.yaxis.name = "x axis", "y axis"
         plot.grid.grid_line_color = ink.grid
         plot.x_range.name, plot.y_range.name = "wavelength" if wavelength else "x range", "y range"

@@ -106,7 +106,7 @@ SEARCH_COLUMNS = (
     Column("templates", "surveyed.survey.search.n_filters", "", "templates of the bank", "templates"),
     Column("sums", "surveyed.survey.components.n_statistics", "", "weighted sums of a frame", "sums of a frame"),
     Column("spectral_loss", lambda one: float(one.surveyed.templates.loss.max()), "",
-           "largest share of S/N lost to so few sums"),
+           "largest share of S/N lost because only these sums are searched"),
     Column("star_days", lambda one: one.surveyed.survey.stare.observed_s / DAY_S, "", "star-days of a stare"),
 )  # fmt: skip
 

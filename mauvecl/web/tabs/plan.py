@@ -57,7 +57,9 @@ class Recovered(Picture):
 
     def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         if "plan" not in answers:
-            return PictureData("For each target, from which energy on flares are found.", curves("recovered", []))
+            return PictureData(
+                "The share of flares that are found on each target, against their energy.", curves("recovered", [])
+            )
         parts = [
             f"{row['target']}: half of the flares at {_energy(row['E50'])}, 90 % at {_energy(row['E90'])}"
             if row["seen"] > 0
@@ -72,7 +74,7 @@ class Recovered(Picture):
 class Expected(Picture):
     """Numbers of recovered flares above an energy."""
 
-    name, title = "expected", "Recovered flares of so much energy or more in the campaign"
+    name, title = "expected", "Recovered flares above an energy, in the whole campaign"
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         name = "bolometric energy of the flare (erg)"
@@ -82,7 +84,7 @@ class Expected(Picture):
 
     def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         if "plan" not in answers:
-            return PictureData("For each target, how many flares are expected.", curves("found", []))
+            return PictureData("The number of flares expected to be found on each target.", curves("found", []))
         found, parts = [], []
         for row, (energy, recovered, above) in zip(answers["plan"].table, _columns(answers), strict=True):
             # Each step of the rate is recovered as at its middle.
