@@ -70,20 +70,9 @@ def _check_file(file: Path) -> None:
 
 
 def question_time(study: Study, *, device: str | None, cluster: str | None, insist: bool) -> None:
-    """Raise InputError for a study that cannot end within a year.
+    """Raise InputError for a study whose smallest number of draws takes more than a year; `insist` skips this check.
 
-    Parameters
-    ----------
-    device, cluster : str, optional
-        Values of these flags.
-    insist : bool
-        Whether to skip the check of the time.
-
-    Raises
-    ------
-    InputError
-        If the smallest number of draws would take longer; the message contains the estimate and names `--insist`. Also
-        if there are more realisations than the index can count, regardless of `insist`.
+    The message contains the estimate and names `--insist`. More realisations than the index can count always raise it.
     """
     count = study.run.realisations
     if count > MOST_REALISATIONS:
@@ -107,13 +96,7 @@ def question_time(study: Study, *, device: str | None, cluster: str | None, insi
 
 
 def question_room(store: Store, *, insist: bool) -> None:
-    """Raise InputError for a store that does not fit on its disk.
-
-    Raises
-    ------
-    InputError
-        With the required and the available space.
-    """
+    """Raise InputError, with the required and the available space, for a store that does not fit on its disk."""
     if insist:
         return
     there = next(folder for folder in (store.path, *store.path.absolute().parents) if folder.is_dir())

@@ -37,12 +37,7 @@ def as_text(kind: Any) -> tuple[Any, str, Callable[[str, str], Any] | None]:
 
 
 def within(text: str, flag: str, *, read: Callable[[str, str], Any], low: float | None, high: float | None) -> Any:
-    """Read a number between two ends, either of which may be missing.
-
-    Raises
-    ------
-    InputError
-    """
+    """Read a number between two ends, either of which may be missing."""
     value = read(text, flag)
     if (low is not None and not value >= low) or (high is not None and not value <= high):
         reach = f"at least {low:g}" if high is None else f"{low:g} to {high:g}"
