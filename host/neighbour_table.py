@@ -187,7 +187,7 @@ class _Columns:
                 key="neighbours",
                 value=float(values[row] / factor),
             )
-        note = f"Separations are the column {name} of {self.named}, taken for degrees since it states no unit."
+        note = f"Separations are the column {name} of {self.named}, read as degrees since it states no unit."
         return values, (note,) if stated is None and name == "dist" else ()
 
     def _from_positions(self, ra: str, dec: str, own: int | None, target: str) -> Float:

@@ -171,7 +171,7 @@ def _nearest(values: Sequence[tuple[str, float]], wanted: float) -> tuple[str, f
 
 
 def _typed() -> list[str]:
-    """Return the names of the embedded spectra that stand for a spectral type."""
+    """Return the names of the embedded spectra that represent a spectral type."""
     table = library_table()
     return [str(row["name"]) for row in table if row["kept"] == "embedded" and row["name"] == row["spectral_type"]]
 

@@ -49,9 +49,9 @@ def main() -> None:
             return
         cluster.scale(jobs=given.jobs)
         # Written whole: a reader finds a scheduler in it, or no file.
-        beside = given.scheduler_file.with_suffix(".part")
-        beside.write_text(f'{{"address": "{cluster.scheduler_address}"}}\n')
-        beside.replace(given.scheduler_file)
+        partial = given.scheduler_file.with_suffix(".part")
+        partial.write_text(f'{{"address": "{cluster.scheduler_address}"}}\n')
+        partial.replace(given.scheduler_file)
         print(f"Scheduler at {cluster.scheduler_address}, in {given.scheduler_file}")
         try:
             signal.sigwait({signal.SIGINT, signal.SIGTERM})

@@ -147,7 +147,7 @@ def _row_asked(identifiers: Sequence[Sequence[str]], asked: Sequence[str], names
     if len(set(labels)) < len(labels):
         labels = [f"row {row + 1}" for row in fitting]
     raise InputError(
-        f"{len(fitting)} spectra stand in it, one a row ({listed(labels)})",
+        f"{len(fitting)} spectra are in it, one in each row ({listed(labels)})",
         f"one: name it as in FILE[{(labels or ['row 1'])[0][:30]}]",
         key="rows",
         value=labels,

@@ -131,7 +131,7 @@ class Source(Drawable, ContentEquality):
         if model is not None:
             return cls(
                 *model.spectrum(), model.name, model.origin,
-                unscaled="a formula has no level of its own", temperature_k=model.temperature_k,
+                unscaled="a formula has no absolute level", temperature_k=model.temperature_k,
             )  # fmt: skip
         mine = own_stars.find(name) if catalogue.embedded(name) is None else None
         if mine is not None:
@@ -292,9 +292,7 @@ class Source(Drawable, ContentEquality):
             raise InputError.of("spectrum", spectrum, "a SourceSpectrum of synphot")
         own = spectrum.waveset
         if own is None:
-            raise InputError(
-                f"{name} has no wavelengths of its own", "a spectrum with a waveset", key="spectrum", value=name
-            )
+            raise InputError(f"{name} defines no wavelengths", "a spectrum with a waveset", key="spectrum", value=name)
         grid = np.arange(160.0, 1150.0, 0.5)
         nm = np.unique(own.to_value(u.nm))
         inside = grid[(grid > nm[0]) & (grid < nm[-1])]

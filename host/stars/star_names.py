@@ -86,7 +86,7 @@ def spectrum_name(text: str, key: str = "star", *, own: bool = True) -> str:
             value=text,
         )
     raise InputError(
-        f"star {text.strip()!r} has no spectrum of its own in the library",
+        f"star {text.strip()!r} has no spectrum in the library",
         f"that of the nearest type and its V: {proposed} with `magnitude={star.known.magnitude:g}` "
         f"({star.name}: {star.known.about})",
         key=key,

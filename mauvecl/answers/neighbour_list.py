@@ -30,7 +30,7 @@ class NeighbourRow:
 
     @property
     def spectrum(self) -> str:
-        """Spectrum that stands for the neighbour; empty beyond the fibre, where none is needed."""
+        """Spectrum that represents the neighbour; empty beyond the fibre, where none is needed."""
         return self.neighbour.spectrum[0] if self.enters else ""
 
     @property
@@ -53,7 +53,7 @@ COLUMNS = (
     Column("magnitude", lambda row: float("nan") if row.neighbour.magnitude is None else row.neighbour.magnitude,
            "mag", "in the band", "magnitude", ".2f"),
     Column("band", "neighbour.band", heading="band", kind=str),
-    Column("spectrum", description="spectrum that stands for it; empty if its light does not enter",
+    Column("spectrum", description="spectrum that represents it; empty if its light does not enter",
            heading="spectrum", kind=str),
     Column("enters", description="whether it is within the fibre's radius, so that the assumed share of its light "
            "enters", heading="enters", format=lambda value: "yes" if value else "no", kind=bool),

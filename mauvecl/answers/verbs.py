@@ -56,7 +56,7 @@ STARE = (
     "stare.search",
     "nuisances.usual",
 )
-#: Those of verbs that look from the orbit; targets are given in a way of their own.
+#: Those of verbs that look from the orbit; targets are given in another way.
 ORBIT = (
     *(f"orbit.{key}" for key in ("start", "days", "step_s", "tle", "kind", "simbad")),
     "orbit.limits",

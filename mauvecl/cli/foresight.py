@@ -89,7 +89,7 @@ def question_time(study: Study, *, device: str | None, cluster: str | None, insi
         raise InputError(
             f"realisations = {count:.3g} of {len(study.star) * combinations} stars draw {drawn:.2g} "
             f"pixels and take some {years:.2g} years at {rate:.2g} a second ({by})",
-            "less than a year; --insist begins all the same",
+            "less than a year; --insist starts it anyway",
             key="realisations",
             value=count,
         )
@@ -106,7 +106,7 @@ def question_room(store: Store, *, insist: bool) -> None:
         raise InputError(
             f"realisations = {store.rows} take {_size(store.n_bytes)} and {str(store.path)!r} has room "
             f"for {_size(free)}",
-            f"at most {rows} of them, or another place; --insist begins all the same",
+            f"at most {rows} of them, or another place; --insist starts it anyway",
             key="realisations",
             value=store.rows,
         )

@@ -111,7 +111,7 @@ def load_opencl() -> Any:
     _provide_libraries(kernel_cache().work / "libraries")
     if kernel_cache().pid != os.getpid():
         # PoCL's threads do not survive a fork; its next call would wait forever.
-        raise DeviceError("OpenCL was loaded before a fork, expected a process of its own start (use spawn)")
+        raise DeviceError("OpenCL was loaded before a fork, expected a newly started process (use spawn)")
     # pyopencl's own cache would duplicate PoCL's.
     os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
     try:

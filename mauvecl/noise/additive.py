@@ -24,7 +24,7 @@ NEGLIGIBLE = 2.0**-40
 class AdditiveProcess(Section, ABC):
     """Charge that each pixel collects independently in each draw, and the study section that describes it.
 
-    Kernels draw it from a table of `charge` in a stream of its own, multiply it by the gain, and add it to the other
+    Kernels draw it from a table of `charge` in a separate stream, multiply it by the gain, and add it to the other
     noise of the pixel. Subclasses are listed in `unknowns.ADDITIVE` by their study keys.
     """
 

@@ -138,7 +138,7 @@ def _draw_frames(
         coarse = ~stack_is_exact(_scaled(x, Cumulants.of(x, 1), corners[0]), x)
         for pixels, why in (
             (near, f"cannot clip, and a frame comes within {RAIL_SIGMA:g} sigma of zero or saturation"),
-            (coarse, "takes rounding for noise, and a frame has too little noise of its own for that"),
+            (coarse, "treats rounding as noise, and a frame has too little noise for that"),
         ):
             if pixels.any():
                 if mode == "stacked":

@@ -78,7 +78,7 @@ def detect_events(survey: SeriesSurvey, threshold: float) -> tuple[list[Detectio
     """Detect all events above a threshold, in order of time, and return the frames that belong to them.
 
     The search is repeated without the frames of events that were found, until there is no further event: what a bright
-    flare of an unusual shape leaves in the residuals of a fit is not taken for other flares.
+    flare of an unusual shape leaves in the residuals of a fit is not mistaken for other flares.
     """
     taken = np.zeros(survey.stare.n_frames, np.bool_)
     found: list[Detection] = []

@@ -21,7 +21,7 @@ Float = NDArray[np.float64]
 MIN_FRAMES = 20
 #: Largest number of frames, for which a search needs some 2 GiB.
 MAX_FRAMES = 2**22
-#: Share of frames in which a pixel has to be finite; others are left out of every frame.
+#: Share of frames in which a pixel must be finite; others are left out of every frame.
 LIVE_SHARE = 0.5
 #: Shortest time between frames as a share of the cadence; frames that are closer overlap.
 MIN_STEP = 0.5
@@ -153,7 +153,7 @@ class Frames:
             row = int(np.argmin(step))
             least = f"frames that are at least {MIN_STEP:g} of the median step of {cadence:g} s apart"
             if not cadence > 0:
-                least = "a time of its own for each frame"
+                least = "a different time for each frame"
             raise _bad(name, "time", f"{step[row]:g} s from one frame to the next", least)
         if exposure is None:
             exposure = np.full(n, cadence)

@@ -394,7 +394,7 @@ def _times(
         scale, unit, epoch, offset = scale or "utc", u.d, 0.0, 0.0
         edges = [mjd_of(text or [], scale, one.name, file.what) for text, one in zip(texts, time, strict=True)]
         if not (mapping.scale or stated.scale):
-            remarks.append(f"the dates of {file.what} state no time scale and are taken for UTC")
+            remarks.append(f"the dates of {file.what} state no time scale and are assumed to be in UTC")
     else:
         stated_unit = mapping.time_unit or time[0].unit or stated.unit
         if len({one.unit for one in time}) > 1 and not mapping.time_unit:
@@ -424,7 +424,7 @@ def _light(found: Quantities, mapping: FrameMapping) -> tuple[str, Values, Value
     if mapping.flux_unit and stated and mapping.flux_unit != stated:
         remarks = (f"the unit of {found.flux.name!r} is {mapping.flux_unit} as the mapping says, not {stated}",)
     if "mag" in unit.lower() and "maggie" not in unit.lower():
-        raise InputError.of("flux_unit", unit, "a linear unit: light in magnitudes is to be converted first",
+        raise InputError.of("flux_unit", unit, "a linear unit: light in magnitudes must be converted first",
                             where=found.flux.what)  # fmt: skip
     error = found.error
     if error is None:
@@ -443,7 +443,7 @@ def _light(found: Quantities, mapping: FrameMapping) -> tuple[str, Values, Value
 
 
 def _vacuum_nm(wavelength: Values, given: str | None) -> Float:
-    """Return the wavelengths of the pixels, which have to be the same in every frame."""
+    """Return the wavelengths of the pixels, which must be the same in every frame."""
     plain = (given or "").removesuffix(" air").removesuffix(" vacuum") or None
     nm = converted(wavelength, plain, "nm", "wavelength_unit")
     rows = np.atleast_2d(nm.rows(0, 1) if len(nm.shape) == 2 else nm.numbers())[0]

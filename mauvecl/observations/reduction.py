@@ -81,7 +81,7 @@ def weighted_sums(
 
 
 def _piece(flux: Values, quality: Values | None, part: slice) -> Float:
-    """Return rows of spectra, NaN in pixels with a quality flag of their own."""
+    """Return rows of spectra, NaN in pixels with their own quality flag."""
     values = flux.rows(part.start, part.stop)
     if quality is not None and len(quality.shape) == 2:
         flags = quality.rows(part.start, part.stop) != 0

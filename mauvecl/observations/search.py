@@ -37,7 +37,7 @@ MAX_VALUES = 2**24
 #: Expected number of false alarms at the largest rate of interest in the part of the light curve that importance
 #: sampling uses, and the smallest number of its frames.
 SAMPLED_ALARMS, MIN_SAMPLED = 0.6, 200
-#: Temperature that stands for flares in a light curve without colour, K.
+#: Temperature assumed for flares in a light curve without colour, K.
 NO_COLOUR_K = 10_000.0
 #: Smallest number of quiescent frames of a window whose residuals are resampled.
 MIN_WINDOW = 10

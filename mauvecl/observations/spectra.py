@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-#: Expected number of values of normal noise in all frames that are taken for cosmic rays.
+#: Expected number of values of normal noise in all frames that are mistaken for cosmic rays.
 CHANCE_RAYS = 0.01
 #: Flares that explain the light of many pixels at once, K; what they leave in one pixel of one frame is a cosmic ray.
 RAY_FLARES_K = (6_000.0, 12_000.0, 30_000.0)

@@ -66,7 +66,7 @@ def calibration_residuals(plt: Any, answer: CalibrateAnswer) -> Any:
 def photon_transfer(plt: Any, answer: CalibrateAnswer) -> Any:
     """Plot the variance of frames against their mean, binned, with the fit and its residuals."""
     t = answer.transfer
-    # Dark counts have a variance of their own, which the fit knows.
+    # Dark counts have their own variance, which the fit includes.
     groups = np.array_split(np.argsort(t.model), TRANSFER_BINS)
     model, measured = (np.array([values[group].mean() for group in groups]) for values in (t.model, t.variance))
     error = np.array([(t.variance - t.model)[group].std() / np.sqrt(group.size) for group in groups])

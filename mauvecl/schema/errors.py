@@ -54,7 +54,7 @@ class InputError(ValueError):
         Parameters
         ----------
         key : str
-            The parameter or key. Words such as "flare amplitude" stand for the parameter `flare_amplitude`.
+            The parameter or key. Words such as "flare amplitude" name the parameter `flare_amplitude`.
         value : object
             Shown on one line, shortened.
         expected : str

@@ -22,7 +22,7 @@ class Column:
 
     name: str  # name in files and JSON; empty for a column that only people read
     # Attribute or key of a row that holds the value, or a function of the row; the column's name if empty. A value may
-    # be an array: the row then stands for as many rows of the table. None is a missing value.
+    # be an array: each of its elements then has a row of the table. None is a missing value.
     get: str | Callable[[Any], Any] = ""
     unit: str = ""
     description: str = ""

@@ -49,7 +49,7 @@ class Loader:
         self._unchanged: dict[str, Instrument] = {}
 
     def neighbours(self, star: Star) -> Neighbours | None:
-        """Return the neighbours of a star, whatever its magnitude."""
+        """Return the neighbours of a star, which do not depend on its magnitude."""
         return None if star.neighbours is None else self._near(star.model_copy(update={"magnitude": None}))
 
     def instrument(self, observation: Observation) -> Instrument:

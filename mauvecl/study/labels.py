@@ -25,7 +25,7 @@ def label(star: Star, x: Expectation) -> str:
 def place_columns(sweep: Sweep, *own: str, star: str = "label") -> tuple[Column, ...]:
     """Return the columns of the star and of the swept quantities, for rows with the values `at` a cell of the sweep.
 
-    `own` names quantities for which a table has columns of its own, and `star` the attribute with the star's label.
+    `own` names quantities for which a table has separate columns, and `star` the attribute with the star's label.
     """
     return (
         star_column(star),

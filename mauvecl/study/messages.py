@@ -87,7 +87,7 @@ def _coarse(x: Expectation) -> tuple[str, ...]:
     return (
         Message(
             f"In {pixels} of {x.wavelength_nm.size} pixels of {x.name} a frame has too little noise for its rounding "
-            "to whole DN to be like noise: closed forms take it for noise, and are wrong there; simulations round each "
+            "to whole DN to be like noise: closed forms treat it as noise and are wrong there; simulations round each "
             "frame.",
             "rounding",
         ),

@@ -141,7 +141,7 @@ def test_dates_are_times(tmp_path: Path) -> None:
     np.testing.assert_allclose(frames.time_s, TIME - 15, atol=2e-3)
     frames = read_frames(tmp_path / "a.csv", FrameMapping(time="when", flux="flux"))
     assert frames.scale == "utc"
-    assert "taken for UTC" in frames.remarks[0]
+    assert "assumed to be in UTC" in frames.remarks[0]
 
 
 @pytest.mark.parametrize("ending", ["fits", "ecsv"])

@@ -327,7 +327,7 @@ def test_invalid_field_removes_the_answer(page: Page) -> None:
         ("Magnitude", "7,4", "8.5", "'7,4' is not a number"),
         ("Seed", "", "1", "nothing is entered, expected a whole number"),
         ("Star", "Nowhere", "G2V", "'Nowhere' is unknown"),
-        ("Star", "Proxima", "G2V", "'Proxima' has no spectrum of its own in the library"),
+        ("Star", "Proxima", "G2V", "'Proxima' has no spectrum in the library"),
     ):
         enter(page, label, wrong)
         answerless(page)

@@ -269,7 +269,7 @@ class PlanAnswer(Answer):
         if typical:
             lines.append(
                 f"Flare rates of {', '.join(typical)} are those typical of their types at 1000 Myr: mass_msun and "
-                "age_myr, or rates of their own, say more."
+                "age_myr, or their own rates, are more accurate."
             )
         for one in self.planned:
             if one.no_rates:

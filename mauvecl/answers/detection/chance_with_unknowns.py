@@ -20,7 +20,7 @@ MAX_FLARES = 100
 def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
     """Return a sentence on the chance with and without the usual unknowns, or none if the study has unknowns.
 
-    It is that of the flare whose chance is nearest to one half: others are seen, or lost, whatever is unknown.
+    It is that of the flare whose chance is nearest to one half: others are seen, or lost, with and without unknowns.
     """
     study = prepared[0].study
     if study.nuisances != NuisanceChoice() or study.run.comparison().estimated:

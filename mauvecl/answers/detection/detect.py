@@ -341,7 +341,7 @@ def _wanted(asked: CampaignQuestion, tests: int, stack: int, seed: int) -> list[
         one = per_test(asked.fap, asked.frames, stack, step=asked.step, seed=seed)
         text = (
             f"For a chance of {asked.fap:g} of any false alarm in the campaign each of its {tests} tests may have "
-            f"{one.independent:.4g} if they are independent, {one.at_least:.4g} whatever they are"
+            f"{one.independent:.4g} if they are independent, {one.at_least:.4g} in any case"
         )
         if one.overlapping is not None:
             o = one.overlapping
@@ -358,7 +358,7 @@ def _wanted(asked: CampaignQuestion, tests: int, stack: int, seed: int) -> list[
         alarms = "false alarm" if asked.alarms == 1 else "false alarms"
         lines.append(
             f"For {asked.alarms:g} {alarms} expected in the campaign each of its {tests} tests may have "
-            f"{asked.alarms / tests:.4g}, whatever their dependence: `fap={asked.alarms / tests:.4g}`."
+            f"{asked.alarms / tests:.4g} for any dependence between them: `fap={asked.alarms / tests:.4g}`."
         )
     return lines
 

@@ -48,7 +48,7 @@ NO_SPECTRA = "no spectra of the instrument are given"
 NO_DISTANCE = (
     "the distance of the star is not known: name the star that was observed, and its distance (star.distance_pc)"
 )
-#: V magnitude of the star that stands for one that is not named: far from saturation.
+#: V magnitude of the star that replaces one that is not named: far from saturation.
 ANY_MAGNITUDE = 12.0
 
 
@@ -467,7 +467,7 @@ class AnalyseAnswer(Answer):
         flare = self.study.flare
         title = (
             f"Flares of each star in the fibre that would look like these events: {flare.light().describe()}, "
-            f"amplitudes in the {flare.band} band, the light taken for that of all stars in the fibre"
+            f"amplitudes in the {flare.band} band, for light that is that of all stars in the fibre"
         )
         return [View(title, BLENDS, self.neighbour_flares)]
 
@@ -531,7 +531,7 @@ def analyse(
 def frame_model(study: Study, frames: Frames) -> FrameModel | str:
     """Return what the pixels of frames record, or the reason why that is not known; empty for a light curve.
 
-    The star is known if the study names exactly one. Otherwise a faint one stands for it: the fluxes of flares do not
+    The star is known if the study names exactly one. Otherwise a faint one replaces it: the fluxes of flares do not
     depend on it, and the light of the star is measured.
     """
     if frames.flux.ndim == 1:

@@ -265,7 +265,7 @@ class CalibrateAnswer(Answer):
         if self.throughput.structure > 0:
             lines.append(
                 "The throughput has structure finer than the spline follows, of "
-                f"{100 * self.throughput.structure:.2g} %: every pixel has a factor of its own."
+                f"{100 * self.throughput.structure:.2g} %: every pixel has its own factor."
             )
         far = float(np.exp(np.abs(self.throughput.log_factor).max()))
         if far > FAR_FROM_NOMINAL:

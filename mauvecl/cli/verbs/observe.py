@@ -1,4 +1,4 @@
-"""The command that draws one observation: which realisation is an option of its own."""
+"""The command that draws one observation; the number of the realisation is an option."""
 
 from __future__ import annotations
 

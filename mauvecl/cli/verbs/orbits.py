@@ -1,4 +1,4 @@
-"""The command that plans campaigns: its report and its closed form have needs of their own."""
+"""The command that plans campaigns."""
 
 from __future__ import annotations
 

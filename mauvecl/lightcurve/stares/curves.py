@@ -74,7 +74,7 @@ class Curve(Section):
         start_s : ndarray, shape (n_frame,)
         frame_s : float
         orbit_s : float
-            Period of a sinusoid that has no period of its own.
+            Period of a sinusoid without a given period.
         """
         import numpy as np
 

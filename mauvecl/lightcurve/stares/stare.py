@@ -175,7 +175,7 @@ class Stare:
         throughput, sky : Curve, optional
             Known relative changes of all light, and of the sky brightness.
         orbit_s : float
-            Period of `cycles`, and of sinusoids without a period of their own.
+            Period of `cycles`, and of sinusoids without a given period.
         jitters : mapping of {"light", "sky", "temperature"} to float, optional
             Standard deviation from frame to frame.
         offsets, drifts, cycles : mapping of {"star", "light", "sky", "temperature"} to float, optional

@@ -229,7 +229,7 @@ class ThroughputModel:
 
     @property
     def n_stars(self) -> int:
-        """Number of stars with different spectra, whatever their brightness."""
+        """Number of stars with different spectra; stars that differ in brightness alone count once."""
         flux = [one.star.flux_flam / one.star.flux_flam.max() for one in self.stars if one.star is not None]
         return sum(
             all(one.shape != other.shape or not np.allclose(one, other) for other in flux[:k])
