@@ -27,10 +27,7 @@ HOST = r"(?:[a-z0-9](?:[a-z0-9.-]*[a-z0-9])?|\[[0-9a-f:.]+\])(?::\d{1,5})?"
 def local(address: str) -> bool:
     """Return whether an address is reachable from this machine only.
 
-    Raises
-    ------
-    InputError
-        If it is empty, or this machine cannot resolve it.
+    Raises InputError if it is empty, or this machine cannot resolve it.
     """
     if not address.strip():
         raise InputError(
@@ -56,10 +53,7 @@ def plain(host: str) -> str:
 def origin(text: str) -> str:
     """Parse a value of `--allow-origin`, ``https://name`` or ``name:port``, to a host with its port.
 
-    Raises
-    ------
-    InputError
-        If it does not name a single host.
+    Raises InputError if it does not name a single host.
     """
     host = re.sub(r"^https?://", "", text.strip().lower()).removesuffix("/")
     if re.fullmatch(HOST, host) is None:
@@ -70,18 +64,14 @@ def origin(text: str) -> str:
 def hosts(address: str, port: int, allowed: Iterable[str]) -> frozenset[str]:
     """Return the hosts under which the page is served.
 
+    Raises InputError if other machines may connect and no origin is given, or an origin or the address is invalid.
+
     Parameters
     ----------
     address : str
         Address on which the server listens.
-    port : int
     allowed : iterable of str
         Values of `--allow-origin`.
-
-    Raises
-    ------
-    InputError
-        If other machines may connect and no origin is given, or an origin or the address is invalid.
     """
     named = {origin(text) for text in allowed}
     if not local(address) and not named:

@@ -45,20 +45,16 @@ class ClosedForms:
     ) -> ClosedForms:
         """Answer a question.
 
+        Raises InputError for incompatible values.
+
         Parameters
         ----------
-        question : Question
         folder : Path
             Folder to which an uploaded spectrum is written for the study.
         headline : bool
             Whether the chance of detection is asked, without which a star may be too bright for it.
         given : mapping, optional
             What was read of the visitor's files.
-
-        Raises
-        ------
-        InputError
-            For incompatible values.
         """
         uploaded = question.uploaded
         # An uploaded spectrum is not read from its file at every change.

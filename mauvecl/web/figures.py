@@ -70,7 +70,6 @@ class Canvas:
 
     Parameters
     ----------
-    ink : Ink
     x, y : str
         Labels of the axes, with units.
     logs : frozenset of str

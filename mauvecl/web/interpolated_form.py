@@ -17,12 +17,7 @@ if TYPE_CHECKING:
 
 
 class InterpolatedForm:
-    """Closed form that is exact at some points and interpolated in the probit between them.
-
-    Parameters
-    ----------
-    form : Form
-    """
+    """Closed form that is exact at some points and interpolated in the probit between them."""
 
     def __init__(self, form: Form) -> None:
         self.mean, self.std = form.mean, form.std

@@ -52,7 +52,8 @@ _turns = threading.BoundedSemaphore(TOGETHER)
 def read_limited(content: bytes, kind: type[Spectrum], options: Mapping[str, Any] | None = None) -> Spectrum:
     """Read a spectrum from the bytes of a file, like its `read`, in a process with limited memory and time.
 
-    Blocks for about a second, most of it for the start of Python: call it from a thread.
+    Blocks for about a second, most of it for the start of Python: call it from a thread. Raises InputError if it holds
+    no usable spectrum, or reading it takes more memory or time than allowed.
 
     Parameters
     ----------
@@ -62,11 +63,6 @@ def read_limited(content: bytes, kind: type[Spectrum], options: Mapping[str, Any
         `Source` or `ObservedFlare`.
     options : mapping, optional
         Further arguments of its `read`.
-
-    Raises
-    ------
-    InputError
-        If it holds no usable spectrum, or reading it takes more memory or time than allowed.
     """
     return kind(**_read("spectrum" if kind is Source else "flare", {"upload": content}, options or {}))
 

@@ -27,7 +27,6 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
     ----------
     address : str
         Address; 127.0.0.1 accepts only this machine.
-    port : int
     allowed : sequence of str
         Origins of the page in addition to this machine's own.
 
@@ -120,7 +119,6 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
     ----------
     address : str
         Address; 127.0.0.1 accepts only this machine.
-    port : int
     show : bool
         Whether to open a browser.
     allow_origin : sequence of str

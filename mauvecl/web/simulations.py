@@ -73,27 +73,16 @@ def _tabulated(answers: Answers) -> Answers:
 
 @dataclass(frozen=True)
 class Simulation:
-    """Question that a button of the page asks.
+    """Question that a button of the page asks."""
 
-    Attributes
-    ----------
-    verbs : dict
-        Verbs that answer it, by the names under which the page keeps their answers; the first is the main one.
-    asked : callable
-        Makes the study that is asked from that of the page.
-    completed : callable
-        Adds to the answers what the page reads repeatedly.
-    others : dict
-        Further answers of the main verb by name, with what makes their study; a refused one is left out.
-    needs : str
-        Field without which it cannot start.
-    """
-
+    # Verbs that answer it, by the names under which the page keeps their answers; the first is the main one.
     verbs: Mapping[str, str]
-    asked: Callable[[Study], Study] = lambda study: study
+    asked: Callable[[Study], Study] = lambda study: study  # makes the study that is asked from that of the page
+    # Adds to the answers what the page reads repeatedly.
     completed: Callable[[Answers], Answers] = lambda answers: answers
+    # Further answers of the main verb by name, with what makes their study; a refused one is left out.
     others: Mapping[str, Callable[[Study], Study]] = field(default_factory=dict)
-    needs: str = ""
+    needs: str = ""  # field without which it cannot start
 
     def __call__(
         self,
@@ -107,8 +96,6 @@ class Simulation:
 
         Parameters
         ----------
-        study : Study
-        pool : Pool
         progress : callable, optional
             Called with numbers of what the main verb counts.
         given : mapping, optional

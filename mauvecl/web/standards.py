@@ -26,21 +26,11 @@ BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 @dataclass(frozen=True)
 class Observations:
-    """Archive of a visitor's with frames of standard stars.
+    """Archive of a visitor's with frames of standard stars."""
 
-    Attributes
-    ----------
-    name : str
-        Name on the visitor's computer.
-    content : bytes
-        The zip archive.
-    rows : tuple of CalibrationObservation
-        Observations with the names of their files.
-    """
-
-    name: str
-    content: bytes
-    rows: tuple[CalibrationObservation, ...]
+    name: str  # name on the visitor's computer
+    content: bytes  # the zip archive
+    rows: tuple[CalibrationObservation, ...]  # observations with the names of their files
 
     @classmethod
     def of(cls, name: str, content: bytes) -> Observations:

@@ -123,15 +123,12 @@ class State:
     def question(self, names: Collection[str] = tuple(FIELDS)) -> Question:
         """Return the question.
 
+        Raises InputError if a field that is asked is invalid, with the accepted values of each.
+
         Parameters
         ----------
         names : collection of str
             Fields that are asked; the others have their first values.
-
-        Raises
-        ------
-        InputError
-            If a field that is asked is invalid, with the accepted values of each.
         """
         faults = self.faults_of(names)
         if faults:

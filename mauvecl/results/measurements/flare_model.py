@@ -52,22 +52,15 @@ BANDS_NM = ((200.0, 320.0), (200.0, 700.0))
 
 @dataclass(frozen=True, eq=False)
 class Derived:
-    """Quantity that follows from temperature and amplitudes.
-
-    Attributes
-    ----------
-    name, unit, description : str
-    factors : ndarray, shape (n_node, n_linear), optional
-        The quantity is the sum of these times the amplitudes; None for the temperature and for a ratio.
-    ratio : ndarray, shape (n_node,), optional
-        The quantity is `offset` plus amplitude 1 over amplitude 0 times this.
-    offset : float
-    """
+    """Quantity that follows from temperature and amplitudes."""
 
     name: str
     unit: str
     description: str
+    # Shape (n_node, n_linear); the quantity is the sum of these times the amplitudes; None for the
+    # temperature and for a ratio.
     factors: Float | None = None
+    # Shape (n_node,); the quantity is `offset` plus amplitude 1 over amplitude 0 times this.
     ratio: Float | None = None
     offset: float = 1.0
 

@@ -104,20 +104,14 @@ class Reduction(MeanSums):
     ) -> Self:
         """Compute the reduction for exposures with the variance of a given flare.
 
+        Raises InputError if every pixel saturates, or the flare is degenerate with the unknowns.
+
         Parameters
         ----------
-        model : FlareModel
-        quiet : Expectation
         added_dn : ndarray, shape (n_pixel,), optional
             Mean DN of the flare; none by default.
-        nuisances : Nuisances, optional
         skipped_nm : sequence of tuple
             Wavelength ranges of pixels that are not used, in addition to saturated ones.
-
-        Raises
-        ------
-        InputError
-            If every pixel saturates, or the flare is degenerate with the unknowns.
         """
         variance, used = usable_variance(quiet, added_dn, skipped_nm)
         inverse = np.divide(1.0, variance, out=np.zeros_like(variance), where=used)

@@ -35,52 +35,30 @@ def target_words(question: Question) -> str:
 
 @dataclass
 class PictureData:
-    """Data of a picture.
+    """Data of a picture."""
 
-    Attributes
-    ----------
-    text : str
-        The picture in words, for who does not see it.
-    sources : dict
-        Columns by the name of the figure's data source.
-    props : dict
-        Properties by the name of the figure's model, such as an axis's label.
-    names : dict
-        Entries of the legend that have another name than in the figure.
-    """
-
-    text: str
+    text: str  # the picture in words, for visitors who do not see it
+    # Columns by the name of the figure's data source.
     sources: dict[str, dict[str, ArrayLike | Sequence[str]]] = field(default_factory=dict)
+    # Properties by the name of the figure's model, such as an axis's label.
     props: dict[str, dict[str, Any]] = field(default_factory=dict)
+    # Entries of the legend that have another name than in the figure.
     names: dict[str, str] = field(default_factory=dict)
 
 
 class Picture(ABC):
-    """Picture: a static empty figure and data for it.
+    """Picture: a static empty figure and data for it."""
 
-    Attributes
-    ----------
-    name : str
-        Within the page.
-    title : str
-    logs : tuple of str
-        Axes, of x and y, that the visitor may have logarithmic, and those that are at first in capitals.
-    shows : dict of str
-        Parts that are hidden by default, by tag of their models, with their names.
-    sets : str
-        Fields that a click on the picture sets, with the axis that gives each, as in "magnitude=x".
-    pins : str
-        The source whose columns are shown of pinned scenarios, too; none where they are not.
-    alike : tuple of str
-        Fields in which a pinned scenario must agree with the question to be shown with it.
-    """
-
-    name: ClassVar[str]
+    name: ClassVar[str]  # within the page
     title: ClassVar[str]
+    # Axes, of x and y, that the visitor can make logarithmic; in capitals those that are logarithmic at first.
     logs: ClassVar[tuple[str, ...]] = ()
+    # Parts that are hidden by default, by tag of their models, with their names.
     shows: ClassVar[Mapping[str, str]] = {}
+    # Fields that a click on the picture sets, with the axis that gives each, as in "magnitude=x".
     sets: ClassVar[str] = ""
-    pins: ClassVar[str] = ""
+    pins: ClassVar[str] = ""  # the source whose columns are also shown for pinned scenarios; empty if they are not
+    # Fields in which a pinned scenario must agree with the question to be shown with it.
     alike: ClassVar[tuple[str, ...]] = ()
 
     @abstractmethod
@@ -93,32 +71,16 @@ class Picture(ABC):
 
 
 class Tab(ABC):
-    """Tab of the page; a `verb` gives name, title, help, button, answer and file that the tab does not state itself.
+    """Tab of the page; a `verb` gives name, title, help, button, answer and file that the tab does not state itself."""
 
-    Attributes
-    ----------
-    verb : str
-        Name of the verb that it shows, if any.
-    name, title : str
-    about : str
-        What it shows, in a sentence.
-    pictures : tuple of Picture
-    simulations : dict of str
-        What can be simulated here, with what the button is called.
-    answer : str
-        Name of the simulated answer whose table stands below the pictures.
-    view : int
-        Number of that table among the answer's `views`.
-    """
-
-    verb: ClassVar[str] = ""
+    verb: ClassVar[str] = ""  # name of the verb that it shows, if any
     name: ClassVar[str]
     title: ClassVar[str]
-    about: ClassVar[str]
+    about: ClassVar[str]  # what it shows, in a sentence
     pictures: ClassVar[tuple[Picture, ...]] = ()
-    simulations: ClassVar[Mapping[str, str]] = {}
-    answer: ClassVar[str] = ""
-    view: ClassVar[int] = 0
+    simulations: ClassVar[Mapping[str, str]] = {}  # what can be simulated here, with the label of the button
+    answer: ClassVar[str] = ""  # name of the simulated answer whose table is below the pictures
+    view: ClassVar[int] = 0  # number of that table among the answer's `views`
     #: What is taken along: names of simulations or verbs; by default its own simulations.
     questions: ClassVar[tuple[str, ...]] = ()
     #: Whether the chance of detection stands above it, whose fields it then shows.
