@@ -127,7 +127,7 @@ class Neighbours:
         return {"neighbours": "; ".join(inside), "share of neighbours": f"{self.share:g} (assumption)"}
 
     def messages(self, target: str, instrument: Instrument) -> list[str]:
-        """Return what readers must know of the neighbours of a target."""
+        """Return the messages on the neighbours of a target."""
         radius, inside = instrument.field_of_view_radius_arcsec, self.within(instrument)
         outside = len(self.stars) - len(inside)
         beyond = f"{_stars(outside)} beyond {'does' if outside == 1 else 'do'} not enter"

@@ -19,7 +19,7 @@ class NamedStar:
 
     name: str
     spectrum: str | None  # name of its own spectrum, in the library or among the user's
-    known: WellKnown | None  # what the list of well-known stars says of it
+    known: WellKnown | None  # its entry in the list of well-known stars
 
     @property
     def nearest(self) -> str:

@@ -125,7 +125,7 @@ class Answer(Drawable, ContentEquality, ABC):
         return str(next(iter(self.tables.values()))._repr_html_())
 
     def as_json(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
+        """Return the content that `--json` prints."""
         tables = {key: getattr(self, name) for key, name in self.JSON.items()}
         found = tables or {"rows": next(iter(self.tables.values()))}
         near = {} if self.neighbours is None else {"neighbours": self.neighbours}

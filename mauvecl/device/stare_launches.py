@@ -137,7 +137,7 @@ class StareLaunches(Launches):
             out[..., begin : begin + size] = host[..., tile.start : tile.stop].transpose(1, 3, 2, 0)
 
     def glow(self, tile: Tile, out: Floats, row: int) -> None:
-        """Compute what `Injections` need to add flares to a tile's frames.
+        """Compute the values with which `Injections` add flares to a tile's frames.
 
         `out` has the shape (1, n_stare, n_statistic + 1, n_padded_frame).
         """

@@ -83,7 +83,7 @@ class Node:
 
 
 def changes_of(x: Expectation) -> tuple[Float, Float]:
-    """Return what factors add to an exposure's means (DN) and variances (DN^2), each shape (3, n_pixel).
+    """Return changes by factors of an exposure's means (DN) and variances (DN^2), each shape (3, n_pixel).
 
     Rows are for all light, which includes the sky's, for the sky's alone, and for the dark current, each for an amount
     of one. A pixel that saturates records a change only in those frames that are not clipped, and its variance changes

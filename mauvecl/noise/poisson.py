@@ -28,7 +28,7 @@ class AliasTable:
     entries: NDArray[np.uint32]  # alias << (32 - bits) | threshold, shape (2**bits,)
 
     def words_per_column(self) -> NDArray[np.int64]:
-        """Return how many of the 2**32 words give each column, which are its exact probabilities."""
+        """Return the number of the 2**32 words that give each column: its exact probability."""
         shift = WORD_BITS - self.bits
         threshold = self.entries.astype(np.int64) & ((1 << shift) - 1)
         alias = self.entries.astype(np.int64) >> shift

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 Conditions = Mapping[str, float]
 SignalPart = Literal["light", "dark", "sky"]
-#: What an unknown is of: a part of the signal, the wavelength dependence of the response, or an instrument value.
+#: Object of an unknown: a part of the signal, the wavelength dependence of the response, or an instrument value.
 Of = Literal["star", "light", "sky", "dark", "response", "instrument"]
 #: How often an unknown takes another value.
 When = Literal["frame", "exposure", "stare", "campaign"]

@@ -77,7 +77,7 @@ def barycentric(frames: Frames, target: Target, orbit: Orbit | None = None) -> F
 
 
 def _light_travel_s(when: Time, target: Target, orbit: Orbit | None) -> Float:
-    """Return how much later light reaches the barycentre than the observer, s, shape (n,); call inside `offline`."""
+    """Return the delay of light from the observer to the barycentre, s, shape (n,); call inside `offline`."""
     import astropy.units as u
     from astropy.coordinates import ITRS, TEME, CartesianRepresentation, EarthLocation, SkyCoord
     from astropy.utils import iers
@@ -102,7 +102,7 @@ def _light_travel_s(when: Time, target: Target, orbit: Orbit | None) -> Float:
 
 
 def _accuracy(orbit: Orbit, when: Time) -> str:
-    """Return how well the satellite's position is known, as a part of a sentence."""
+    """Return the accuracy of the satellite's position, as a part of a sentence."""
     days = float(np.abs(when.utc.jd - orbit.elements.epoch_jd).max())
     if orbit.resolved_at(days) == "mean":
         return f"good to {1e3 * orbit.elements.axis_km / LIGHT_KM_S:.0f} ms: the place in the orbit is not known"

@@ -39,7 +39,7 @@ NO_FIT = 1e-6
 class EventSpectrum:
     """Spectrum of an event and its fits."""
 
-    cause: Cause  # what explains the spectrum: a flare, or what resembles one
+    cause: Cause  # explanation of the spectrum: a flare, or a change that resembles one
     snr: float  # S/N of a flare whose amplitude is fitted together with changes of star, dark current and sky
     # Chi-squared of single causes, each with its best amplitude; of flares, the best temperature.
     chi2: dict[Cause, float]
@@ -142,10 +142,10 @@ def _weighted(
 
 
 def drifts(survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], n_frames: int) -> dict[str, float]:
-    """Return how much star, dark current and sky differ between parts of the frames and their surroundings.
+    """Return the differences of star, dark current and sky between parts of the frames and their surroundings.
 
     Measured from means of `n_frames` quiescent frames against the means before and after: the scatter beyond that of
-    noise, and what of it the noise may hide. If there are fewer than `MIN_PARTS` such means, shorter ones are taken,
+    noise, and the part that the noise may hide. If there are fewer than `MIN_PARTS` such means, shorter ones are taken,
     and changes are assumed to grow in proportion to time. The sky changes by its documented prior.
 
     Returns

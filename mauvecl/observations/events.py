@@ -1,4 +1,4 @@
-"""Events in an observed light curve: their extent, what they resemble, and what is measured of each."""
+"""Events in an observed light curve: their extent, their resemblance to other changes, and their measurements."""
 
 from __future__ import annotations
 

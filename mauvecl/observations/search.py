@@ -89,7 +89,7 @@ class SeriesSurvey:
 
     stare: Stare  # times of the searched frames
     bank: Bank
-    # What a flare of unit amplitude, whose light is once that of the quiescent star, does to the sums.
+    # Sums of a flare of unit amplitude, whose light equals that of the quiescent star.
     templates: Templates
     # Shape (n_frame, n_sum); searched sums less their quiescent level: of spectra, sums weighted for flares; of a light
     # curve, its flux.

@@ -32,7 +32,7 @@ Bool = NDArray[np.bool_]
 
 #: Expected number of values of normal noise in all frames that are mistaken for cosmic rays.
 CHANCE_RAYS = 0.01
-#: Flares that explain the light of many pixels at once, K; what they leave in one pixel of one frame is a cosmic ray.
+#: Flares that explain the light of many pixels at once, K; their residual in one pixel of one frame is a cosmic ray.
 RAY_FLARES_K = (6_000.0, 12_000.0, 30_000.0)
 #: Largest number of rounds of replacing bad values by the fit to the others, which end where the values change by less
 #: than this share of a standard deviation.
@@ -158,7 +158,7 @@ def _replace_rays(
         rows = rows[far | (np.abs(moved) > SETTLED * sd).any(axis=1)]
         if not rows.size:
             break
-    # What stands out in the same pixel of a neighbouring frame as well is no ray, but light that the fit does not know.
+    # An excess in the same pixel of a neighbouring frame as well is not a ray, but light that the fit does not include.
     adjacent = np.diff(numbers[at]) == 1
     both = bad[1:] & bad[:-1] & adjacent[:, None]
     bad[1:] &= ~both
@@ -179,7 +179,7 @@ def measure_noise(excess: Float, pairs: NDArray[np.intp], stated: Float, shared:
     stated : ndarray, shape (n_pixel,)
         Standard deviation of a frame that is expected.
     shared : ndarray, shape (k, n_pixel)
-        Spectra of what all pixels share; their part is fitted in each frame.
+        Spectra of changes that all pixels share; their amplitudes are fitted in each frame.
     nm : ndarray, shape (n_pixel,)
     """
     basis = np.linalg.svd(shared / stated, full_matrices=False)[2]

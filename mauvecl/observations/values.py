@@ -32,7 +32,7 @@ class Values:
     read: Callable[[int, int], Any]  # rows `start` to `stop - 1`, as the file has them
     unit: str = ""
     what: str = ""  # the file, for messages
-    row_bytes: int = 0  # what reading a row takes, if that is more than its values
+    row_bytes: int = 0  # bytes that are read for a row, if more than those of its values
 
     @classmethod
     def of(cls, name: str, values: Any, unit: object = None, what: str = "") -> Values:

@@ -91,7 +91,7 @@ def _drawn_flares(names: Sequence[str]) -> list[int]:
 
 
 def _flare_note(stars: Sequence[Shown]) -> str:
-    """Return how many of the flares are drawn, or nothing if all are."""
+    """Return the note on the number of drawn flares; empty if all are drawn."""
     most = max(len(names) for *_, names in stars)
     return part_note(min(MOST_FLARES, most), most, "flares")
 

@@ -120,7 +120,7 @@ def without_unit(value: Any, unit: str) -> Any:
     """
     import astropy.units as u
 
-    # What detectors count is called DN here and adu elsewhere.
+    # Detector counts are called DN here and adu elsewhere.
     equivalent: Any = [(u.adu, u.DN)]
     wanted = u.Unit(unit)
     if wanted.is_equivalent(u.nm):

@@ -120,7 +120,7 @@ def _own_error(model: type[BaseModel], path: list[str], key: str, first: Any) ->
     if not isinstance(inner, InputError):
         fault, _, expected = message.partition(", expected ")
         inner = InputError(fault, expected or None, key=key if path else None, value=first.get("input"))
-    # What read the value knows more of it than where it stands.
+    # The message of the value's reader is more precise than its location.
     found = inner if own else inner.within(key)
     found.key = _full_key(model, path, inner.key)
     if field is not None and model_in(field.annotation) is None and isinstance(first.get("input"), dict) and inner.key:

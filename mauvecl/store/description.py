@@ -98,7 +98,7 @@ def describe(study: Study, scenes: Sequence[StoredScene], folder: Path) -> None:
 
 
 def exposure_attributes(x: Expectation) -> dict[str, float | str]:
-    """Return what a reader must know of the exposure in every row of an array."""
+    """Return the attributes that describe the exposure in every row of an array."""
     known: dict[str, float | str] = {"exposure_s": x.exposure_s, "frames": x.n_frames, "instrument": x.instrument}
     known |= {"saturation_dn": float(x.saturation_dn), "dark_unit": x.dark_unit}
     return known | ({"temperature_c": x.conditions["temperature_c"]} if "temperature_c" in x.conditions else {})

@@ -63,7 +63,7 @@ def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
 
 
 def without_headline(tab: Tab, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
-    """Return what `card` returns, for a tab that asks for no chance of detection."""
+    """Return the `card` of a tab that asks for no chance of detection."""
     messages = list(answers[tab.answer].messages) if tab.answer in answers else []
     return {
         "headline": False,

@@ -36,7 +36,7 @@ class ClosedForms:
 
     question: Question
     case: Case
-    #: What was read of the visitor's files, as arguments of the verb by name.
+    #: Content of the visitor's files, as arguments of the verb by name.
     given: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod

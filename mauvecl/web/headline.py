@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.detection.detect import DetectAnswer
     from mauvecl.web.tabs.tab import Answers
 
-#: What each choice of the field "unknown" is called.
+#: Labels of the choices of the field "unknown".
 TITLES = dict(zip(UNKNOWN, ("everything known", "usual unknowns"), strict=True))
 #: Sensible relative uncertainty of the nominal throughput (assumed; see the documentation's page on what is nominal).
 THROUGHPUT = 0.3
@@ -84,7 +84,7 @@ def _spread(closed: ClosedForms) -> str:
 class Wording(NamedTuple):
     """Words for a limit."""
 
-    before: str  # what precedes its value
+    before: str  # text before its value
     value: Callable[[float], str]
     none: str  # for a limit that does not exist
     slow: str  # for a limit whose closed form is slow

@@ -13,7 +13,7 @@ from mauvecl.web.state import State
 
 
 def known(state: State) -> dict[str, Any]:
-    """Return what is known of the star and of each target, and what can be entered for it.
+    """Return the known values of the star and of each target, and the values that can be entered for it.
 
     Returns
     -------

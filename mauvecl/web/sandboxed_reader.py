@@ -39,7 +39,7 @@ READERS = {
     "flare": ("mauvecl.host.stars.flare_spectra", "ObservedFlare.read"),
     "frames": ("mauvecl.observations.reading", "read_frames"),
 }
-#: What an upload is expected to be, by the function that reads it.
+#: Expected content of an upload, by the function that reads it.
 EXPECTED = {
     "spectrum": ("a spectrum of some thousand points", "a spectrum as text, ECSV, VOTable or FITS"),
     "flare": ("a spectrum of some thousand points", "a spectrum as text, ECSV, VOTable or FITS"),
@@ -81,7 +81,7 @@ def read_frames_limited(files: Mapping[str, bytes], mapping: str | None = None) 
 
 
 def _read(reader: str, files: Mapping[str, bytes], options: Mapping[str, Any]) -> dict[str, Any]:
-    """Run a reading process, and return the attributes of what it has read."""
+    """Run a reading process, and return the attributes of the object that it reads."""
     if not _turns.acquire(timeout=SECONDS):
         raise InputError("too many uploads are read at the same time", "yours again in a minute", key="upload")
     try:

@@ -20,7 +20,7 @@ from mauvecl.web.folders import content_folder
 MOST_FILES, MOST_BYTES = 40, 64 * 2**20
 #: Bytes of a TOML file of it, and characters of a file's name, at most.
 MOST_TOML_BYTES, MOST_NAME = 2**18, 100
-#: Packings that are read to the stated size and no further; others, such as LZMA, unpack what they hold.
+#: Packings that are read to the stated size and no further; others, such as LZMA, unpack to any size.
 BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 

@@ -29,7 +29,7 @@ KINDS = {
     "json": "application/json",
     "html": "text/html; charset=utf-8",
 }
-#: What to cite, as in the project's file CITATION.cff; the paper's volume and pages are not known there.
+#: Citation, as in the project's file CITATION.cff; the paper's volume and pages are not known there.
 BIBTEX = """@software{{mauvecl,
   author = {{{{The mauvecl developers}}}},
   title = {{mauvecl: would the Mauve satellite see this stellar flare?}},
@@ -180,7 +180,7 @@ class CompressedHandler(RequestHandler):
         small, digest = packed(content)
         self.set_header("Content-Type", KINDS[kind])
         self.set_header("Vary", "Accept-Encoding")
-        # What has its digest in its address never changes.
+        # A file with its digest in its address never changes.
         self.set_header("Cache-Control", "public, max-age=31536000, immutable" if keep else "no-cache")
         self.set_header("Etag", f'"{digest}"')
         if self.check_etag_header():

@@ -172,7 +172,7 @@ class Visitor(WebSocketHandler):
         await self._or_why(answer(), **message)
 
     def closed(self, state: State, tab: Tab) -> ClosedForms:
-        """Return the closed forms of what a tab reads of a question; the last ones are cached."""
+        """Return the closed forms of the part of a question that a tab reads; the last ones are cached."""
         key = self._key(state, tab.reads), tab.headline
         if self._closed is None or self._closed[0] != key:
             question = state.question(tab.reads)
@@ -181,7 +181,7 @@ class Visitor(WebSocketHandler):
         return self._closed[1]
 
     def given(self, state: State, tab: Tab) -> dict[str, Any]:
-        """Return what was read of the files that a tab reads; the last ones are cached."""
+        """Return the content of the files that a tab reads; the last ones are cached."""
         key = tab.name, self._key(state, tab.reads & UPLOADS.keys())
         if self._given is None or self._given[0] != key:
             self._given = key, tab.given(state.question(tab.reads))
@@ -236,7 +236,7 @@ class Visitor(WebSocketHandler):
         return await asyncio.get_running_loop().run_in_executor(_closed_forms, work)
 
     def _ask_solve(self, asked: dict[str, Any]) -> None:
-        """Send the limit of what the question solves for, and the chances with other payloads."""
+        """Send the limit of the quantity for which the question solves, and the chances with other payloads."""
         n = self._solving = asked["n"]
         self._give(self._solve(n, self.state(asked["link"])), n=n, solved="")
 

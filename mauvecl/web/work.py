@@ -128,14 +128,14 @@ class Job:
             self._cancelled.set()
             if self._thread is not None and not again:
                 _strike(self._thread, Cancelled)
-        # What waits for fits in other threads is not struck: they end between two of their draws.
+        # Work that waits for fits in other threads is not interrupted: fits end between two of their draws.
         if self._pool is not None:
             self._pool.stop()
         self.future.cancel()
 
     @property
     def counts(self) -> tuple[int, int]:
-        """Return what is done and the total, or 0 if nothing is counted yet."""
+        """Return the finished part and the total, or 0 if nothing is counted yet."""
         if self.unit:
             return self._counted
         standing = None if self._pool is None else self._pool.standing

@@ -255,7 +255,7 @@ def detect(
             "100 beyond them."
         )
     last = [*_few_terms(stars), *marginal_lines(study.nuisances)]
-    # One sentence on unknowns: what they would do to the chance, or to the S/N where they are taken into account.
+    # One sentence on unknowns: their effect on the chance, or on the S/N where they are taken into account.
     last += chance_with_unknowns(prepared) or _cost_of_unknowns(prepared)
     answer.messages = list(dict.fromkeys([*messages, *campaigns, *costs, *last]))
     answer.paper = paper

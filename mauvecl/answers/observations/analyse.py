@@ -518,7 +518,7 @@ def analyse(
     model = frame_model(study, frames)
     jitters = search.spreads() or None
     if study.has_neighbours:
-        # What is wrong with the star or its neighbours is refused before the search.
+        # Errors of the star or its neighbours are reported before the search.
         blended_stars(cases(study, swept=False))
     analysis = analyse_frames(
         frames, false_alarms=search.false_alarms, per=search.per, shape=search.shape, seed=study.run.seed,
@@ -529,7 +529,7 @@ def analyse(
 
 
 def frame_model(study: Study, frames: Frames) -> FrameModel | str:
-    """Return what the pixels of frames record, or the reason why that is not known; empty for a light curve.
+    """Return the model of frames' pixels, or the reason why it is not known, which is empty for a light curve.
 
     The star is known if the study names exactly one. Otherwise a faint one replaces it: the fluxes of flares do not
     depend on it, and the light of the star is measured.

@@ -306,7 +306,7 @@ def cooling_course(
     stare: Stare,
     skipped_nm: Ranges = (),
 ) -> CoolingCourse:
-    """Return what a flare is in the quantities of a fit, and in each frame; parameters as for `fit_cooling`."""
+    """Return a flare in the quantities of a fit and in each frame; parameters as for `fit_cooling`."""
     data = _data(frames, quiet, model, None, stare, event.form, skipped_nm)
     cooling = event.temperature
     if not isinstance(cooling, Cooling):
@@ -405,7 +405,7 @@ def _solve(data: _Data, whitening: _Whitening, theta: Float, free: NDArray[np.in
 
 
 def _quantities(data: _Data, stare: Stare, cooling: bool) -> list[_Quantity]:
-    """Return what a fit reports."""
+    """Return the quantities that a fit reports."""
     found = [
         _Quantity("peak time", "s", 0), _Quantity("half width", "s", 1), _Quantity("amplitude", "", 2),
         _Quantity("temperature", "K", 3),

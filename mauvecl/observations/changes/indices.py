@@ -76,7 +76,7 @@ class Change:
 
     name: str
     unit: str  # unit of the change; empty if it is relative
-    meaning: str  # what a change of one unit is
+    meaning: str  # meaning of a change of one unit
     counts_dn: Float  # shape (n_pixel,); DN of the exposure that it adds
 
     @classmethod

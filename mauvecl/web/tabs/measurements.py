@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.measurements.measure import MeasuredFlare
     from mauvecl.web.closed_forms import ClosedForms
 
-#: What an observer may not know, by name on the page, as the study's section of nuisances.
+#: Unknowns of an observer, by name on the page, as the study's section of nuisances.
 ASSUMED = {
     "everything known": NuisanceChoice(),
     "usual unknowns": NuisanceChoice(usual=True),

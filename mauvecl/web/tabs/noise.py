@@ -36,7 +36,7 @@ class Budget(Picture):
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         canvas = Canvas(ink, "wavelength (nm)", "DN rms in the exposure", logs, wavelength=True)
         for name, (called, colour) in PARTS.items():
-            # What is nearly all of it stays in sight behind the sum.
+            # The largest part stays visible behind the sum.
             how: dict[str, Any] = {"line_dash": "dashed"} if name == "total" else {}
             curve = canvas.line(name, called, colour, line_width=2, **how)
             lines = (("wavelength (nm)", "x"),) if name == "total" else ()

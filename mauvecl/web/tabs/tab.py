@@ -81,7 +81,7 @@ class Tab(ABC):
     simulations: ClassVar[Mapping[str, str]] = {}  # what can be simulated here, with the label of the button
     answer: ClassVar[str] = ""  # name of the simulated answer whose table is below the pictures
     view: ClassVar[int] = 0  # number of that table among the answer's `views`
-    #: What is taken along: names of simulations or verbs; by default its own simulations.
+    #: Questions of "Take along": names of simulations or verbs; by default its own simulations.
     questions: ClassVar[tuple[str, ...]] = ()
     #: Whether the chance of detection stands above it, whose fields it then shows.
     headline: ClassVar[bool] = True
@@ -132,7 +132,7 @@ class Tab(ABC):
         return {}
 
     def words(self, question: Question) -> str:
-        """Return what a tab without a headline is asked, in words."""
+        """Return the question of a tab without a headline, in words."""
         star = "your own star" if question.uploaded is not None else star_words(question.star)
         return f"{star} of {question.band} = {question.magnitude:g}"
 
