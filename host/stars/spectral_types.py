@@ -34,7 +34,7 @@ def as_type(text: str) -> str | None:
 
 
 def nearest_spectrum(spectral_type: str) -> str:
-    """Return the name of the embedded spectrum of the nearest type; of several, the first in the library."""
+    """Return the name of the embedded spectrum of the nearest type; the first in the library if there are several."""
     wanted = subtype(spectral_type)
     names = [(one["name"], one["spectral_type"]) for one in entries() if _TYPE.match(one["spectral_type"])]
     return min(names, key=lambda one: abs(subtype(one[1]) - wanted))[0]

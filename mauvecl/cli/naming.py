@@ -47,7 +47,7 @@ def _flags(name: str, command: Any) -> list[str]:
     """Return the flags that set a parameter or a key of the study, the long one first."""
     from mauvecl.study.keys import keys_with_flags
 
-    # Of several flags of a key, the last takes its value as it is.
+    # If a key has several flags, the last takes its value unchanged.
     parameters = {key: flag.parameter for key, _, flag in keys_with_flags()}
     wanted = {name} | {parameter for key, parameter in parameters.items() if f".{key}".endswith(f".{name}")}
     for parameter in command.params:

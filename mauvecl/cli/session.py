@@ -149,7 +149,7 @@ class Session:
         if not kept:
             return "nothing was written, and nothing is half written"
         parts = f"{kept} part{'s' if kept > 1 else ''} of the work"
-        return f"{parts} kept in {str(checkpoint.folder)!r}, and the same command with --resume goes on from there"
+        return f"{parts} kept in {str(checkpoint.folder)!r}, and the same command with --resume continues from there"
 
     def say(self, lines: Sequence[str]) -> None:
         """Print messages, unless standard output is reserved for JSON."""
@@ -270,7 +270,7 @@ class Session:
 
 @contextmanager
 def working(device: str | None, cluster: str | None) -> Iterator[Workers]:
-    """Open the requested workers; release them at the end, at once if the work ended early."""
+    """Open the requested workers; release them at the end, immediately if the work ended early."""
     from mauvecl.runs.pool import LocalWorkers
 
     if cluster is not None:

@@ -185,7 +185,7 @@ def quantile_at_score(table: NDArray[np.float32], score: Float) -> Float:
 
 
 def _product(ones: list[FactorDistribution], median: float) -> FactorDistribution:
-    """Return the distribution of a product of independent factors; of several, a normal with its mean and variance."""
+    """Return the distribution of a product of independent factors, which is normal if there are several."""
     if len(ones) == 1:
         return FactorDistribution(median * ones[0].values, ones[0].weights)
     mean = np.prod([one.mean for one in ones])

@@ -47,7 +47,7 @@ class Analysis:
     """Analysis of the frames of one star."""
 
     frames: Frames
-    # flux, error: shape (n_frame,); the light curve that was searched; of spectra, the sum over wavelength.
+    # flux, error: shape (n_frame,); the light curve that was searched; for spectra, the sum over wavelength.
     flux: Float
     error: Float | None
     level: QuiescentLevel

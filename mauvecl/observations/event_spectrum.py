@@ -41,7 +41,7 @@ class EventSpectrum:
 
     cause: Cause  # explanation of the spectrum: a flare, or a change that resembles one
     snr: float  # S/N of a flare whose amplitude is fitted together with changes of star, dark current and sky
-    # Chi-squared of single causes, each with its best amplitude; of flares, the best temperature.
+    # Chi-squared of single causes, each with its best amplitude, and flares with their best temperature.
     chi2: dict[Cause, float]
     dof: int
     p_value: float  # probability of a chi-squared at least as large as the smallest, if its cause is right

@@ -39,7 +39,7 @@ class FrameModel:
     quiet: Expectation  # one frame of the quiescent star in the instrument's pixels
     flare: FlareModel  # flares in one frame in the instrument's pixels
     bins: Float  # shape (n_value, n_pixel); weights of the instrument's pixels in each value of a frame: 0 or 1
-    # Shape (n_value,); values of the frames per DN of an exposure: of flux densities, those of a flat spectrum.
+    # Shape (n_value,); values of the frames per DN of an exposure; for flux densities, those of a flat spectrum.
     per_dn: Float
     raw: bool  # true if the frames include bias and dark current
 

@@ -66,7 +66,7 @@ def quiescent_level(
     Parameters
     ----------
     flux, error : ndarray, shape (n_frame,)
-        The light curve; of spectra, light in a band.
+        The light curve; for spectra, light in a band.
     median_s : float
         Length of the running median.
     saturated : ndarray of bool, shape (n_frame,), optional

@@ -57,7 +57,7 @@ def line_index(
     """Integrate a line above the straight line through windows of the continuum.
 
     The index is linear in the fluxes, so that its error follows exactly from those of the pixels, of the continuum's
-    as well as of the band's. Pixels that a limit of the band cuts count in part.
+    as well as of the band's. Pixels across a limit of the band count in part.
 
     Parameters
     ----------

@@ -76,7 +76,7 @@ def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any 
     Parameters
     ----------
     container : Table, TimeSeries, LightCurve or Spectrum
-        A table of astropy, of which its time series and those of lightkurve are kinds; or spectra as of specutils, with
+        A table, time series or light curve of astropy or lightkurve; or spectra such as those of specutils, with
         the attributes ``flux`` of shape (n_frame, n_pixel), ``spectral_axis``, ``uncertainty`` and ``mask``.
     mapping : FrameMapping, optional
         Where the quantities of a table are; columns with known names need none.

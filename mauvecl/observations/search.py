@@ -47,7 +47,7 @@ RESAMPLING_KEY = 0x72657361
 
 @dataclass(frozen=True, eq=False)
 class MeasuredRate:
-    """False-alarm rate in light curves made of the measured residuals."""
+    """False-alarm rate in light curves composed of the measured residuals."""
 
     largest: Float  # shape (n,); largest statistic of each resampled light curve, ascending
     days: float  # star-days of each
@@ -91,8 +91,8 @@ class SeriesSurvey:
     bank: Bank
     # Sums of a flare of unit amplitude, whose light equals that of the quiescent star.
     templates: Templates
-    # Shape (n_frame, n_sum); searched sums less their quiescent level: of spectra, sums weighted for flares; of a light
-    # curve, its flux.
+    # Shape (n_frame, n_sum); searched sums less their quiescent level: for spectra, sums weighted for flares; for a
+    # light curve, its flux.
     sums: Float
     variance: Float  # shape (n_frame,); variance of the quiescent sums
     # Shape (n_frame,); flux less the quiescent level, over `scale`: what amplitudes and durations are measured of.

@@ -243,7 +243,7 @@ def survey_spectra(
     nuisances = Nuisances(names, np.array([unknown[name] for name in names]).reshape(len(names), light.size),
                           np.array([known[name] for name in names]))  # fmt: skip
     typical = abs(float(np.median(level.level[level.used])))
-    # Flares that once more add the light of the star, in the sum over wavelength.
+    # Flares that double the light of the star, in the sum over wavelength.
     flares *= typical / flares.sum(axis=1, keepdims=True)
     templates, steady = (
         Templates.of_spectra(noise.used**2, flares, model.gain, TEMPERATURES_K, nuisances=some, rank=rank)

@@ -103,7 +103,7 @@ class Counts:
         # Dense bins; the first and the last stay empty.
         self.pixel = np.zeros((n_pixel, layout.OBSERVER_BINS), np.int64)
         self.element = np.zeros((n_element, layout.OBSERVER_BINS), np.int64)
-        # Bins of the same width beyond, with keys made of the pixel or element and the bin.
+        # Bins of the same width beyond, with keys that combine the pixel or element and the bin.
         self.far = {"pixel": SparseCounts(), "element": SparseCounts()}
         # Frames clipped at zero and at saturation.
         self.clipped = np.zeros((n_pixel, 2), np.int64)

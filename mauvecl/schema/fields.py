@@ -229,7 +229,7 @@ class Widget:
 
     label: str
     hint: str  # explanation for visitors, in sentences
-    group: str = ""  # heading under which the field stands; empty for fields that show at once
+    group: str = ""  # heading of the field's group; empty for fields that show at once
     place: int = 0  # order within the group; fields of the same place follow the order of the study
     name: str = ""  # name in links; that of the key by default
     first: str | None = None  # text of a new page; the default of the key by default

@@ -52,7 +52,7 @@ def number(
     low, high : float
         Where it may lie.
     expected : str
-        What the sentence says of it; made of unit and range by default.
+        Accepted values in the sentence; from unit and range by default.
     """
     wanted = expected or _expected(unit, low, high)
     if type(value) is float:

@@ -98,7 +98,7 @@ class CalibrateQuestion(Section):
         Flag("--spectrum-error"),
         Widget(
             label="Error of the spectra",
-            hint="Of the spectra of stars, at each of 12 wavelengths. Empty: 10 % for one star, fitted if several "
+            hint="Error of the stars' spectra, at each of 12 wavelengths. Empty: 10 % for one star, fitted if several "
             "disagree.",
             group="Standards",
             unit="%",

@@ -417,7 +417,7 @@ class SkyLight(Section):
         Flag("--sky", kind=str),
         Widget(
             label="Sky brightness",
-            hint="Of the zodiacal light, V magnitudes per square arc second.",
+            hint="Zodiacal light, V magnitudes per square arc second.",
             group="Sky",
             place=1,
             name="sky_brightness",

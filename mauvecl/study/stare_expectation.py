@@ -159,7 +159,7 @@ def unused_lines(exposure_s: float, stare: Stare, events: Sequence[Event]) -> li
         lines.insert(
             0,
             Message(
-                f"A stare is made of frames of {stare.frame_s:g} s: observation.exposure_s = {exposure_s:g} s is not "
+                f"A stare consists of frames of {stare.frame_s:g} s: observation.exposure_s = {exposure_s:g} s is not "
                 "used.",
                 "not used",
             ),

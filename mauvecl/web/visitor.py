@@ -243,7 +243,7 @@ class Visitor(WebSocketHandler):
     async def _solve(self, n: int, state: State) -> None:
         closed = await self._in_thread(partial(self.closed, state, tab_of("")))
         if n != self._solving:
-            # Of a bright star it takes long, and a later question waits.
+            # It takes long for a bright star, and a later question waits.
             self.send(n=n, solved="")
             return
         self.send(n=n, payloads=await self._in_thread(partial(other_payloads, closed)))

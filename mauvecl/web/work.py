@@ -99,7 +99,7 @@ class Job:
         except Stopped as error:
             raise Cancelled from error
         finally:
-            # A strike that has not come yet would meet whatever this thread does next.
+            # A pending interruption would otherwise reach the next work of this thread.
             with self._lock:
                 if self._thread is not None:
                     _strike(self._thread, None)

@@ -423,7 +423,7 @@ def test_interrupted_run_is_resumed_to_the_same_bits(tmp_path: Path) -> None:
         assert process.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}[stop]
         assert "Traceback" not in errors
         if stop != signal.SIGKILL:
-            assert "kept in 'out/checkpoint', and the same command with --resume goes on from there" in errors
+            assert "kept in 'out/checkpoint', and the same command with --resume continues from there" in errors
         assert counted() > kept
         kept = counted()
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)

@@ -241,7 +241,7 @@ def test_interrupted_cluster_ends_its_workers(stop: signal.Signals, tmp_path: Pa
             os.killpg(run.pid, signal.SIGKILL)
     assert run.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143}[stop]
     assert len(errors.splitlines()) == 1, errors
-    assert "kept in 'out/checkpoint', and the same command with --resume goes on from there" in errors
+    assert "kept in 'out/checkpoint', and the same command with --resume continues from there" in errors
     kept = sum(int(p.stem.split("-")[-1]) for p in shards.glob("[!.]*.npz"))
     if stop == signal.SIGTERM:
         return

@@ -256,7 +256,7 @@ EVENTS = (
 #: Columns of the table of frames, one row for all frames of an analysis.
 FRAMES = (
     Column("time", lambda one: one.frames.time_s / DAY_S, "d", "middle of the frame, from time zero"),
-    Column("flux", "flux", "", "light in the unit of the file; of spectra, the sum over wavelength"),
+    Column("flux", "flux", "", "light in the unit of the file; for spectra, the sum over wavelength"),
     Column("level", "level.level", "", "quiescent level"),
     Column("error", "level.error", "", "standard deviation of a quiescent frame"),
     Column("reason", lambda one: np.array([Reason.words(int(value)) for value in one.level.reasons]), "",
@@ -428,7 +428,7 @@ class AnalyseAnswer(Answer):
 
     @property
     def tables(self) -> dict[str, Table]:
-        """Events, frames, completeness, limits, noise; of spectra, measured quantities, pixels and throughput."""
+        """Events, frames, completeness, limits, noise; for spectra, measured quantities, pixels and throughput."""
         tables = {"events": self.events, "frames": self.frames, "completeness": self.completeness,
                   "limits": self.limits, "noise": self.noise}  # fmt: skip
         of_spectra = {"measured": self.measured, "noise-per-pixel": self.pixels, "throughput": self.throughput}

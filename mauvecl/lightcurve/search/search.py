@@ -93,7 +93,7 @@ class Search:
         self._terms = [(power, 0) for power in bank.baseline.powers] + [(0, 1 + k) for k in range(len(series) - 1)]
         self._series = np.zeros((len(series), self.n_grid))
         self._series[:, self._at] = series
-        # Of templates longer than the stare, only the part within a stare's length of the onset meets data.
+        # Only the part of a long template within a stare's length of the onset overlaps data.
         reach = min(max(t.shapes.shape[1] for t in bank.templates), self.n_grid)
         self._size = int(scipy.fft.next_fast_len(self.n_grid + reach, real=True))
 

@@ -91,7 +91,7 @@ class _Data:
         return rise, np.clip(log_k, self.model.log_k[0], self.model.log_k[-1])
 
     def _cooled(self, theta: Float) -> tuple[Float, Float, float]:
-        """Return temperatures over that at the peak, as of `Cooling`, times since the peak, and the end."""
+        """Return temperatures over that at the peak, as in `Cooling`, times since the peak, and the end."""
         since = np.maximum(self.edges.mean(axis=1) - theta[0], 0.0)
         end = min(float(np.exp(theta[4])), 1.0)
         return end + (1.0 - end) * np.exp(-since / np.exp(theta[5])), since, end

@@ -64,7 +64,7 @@ class PhotonTransfer:
     """Fit of measured variances."""
 
     noise: NoiseModel
-    # Shape (2, 2); of read variance and gain, for known dark counts; of an assumed gain by `ASSUMED_ERROR`.
+    # Shape (2, 2); of read variance and gain, for known dark counts; from `ASSUMED_ERROR` if the gain is assumed.
     covariance: Float
     read_noise_error: float  # standard error, DN, with that of the dark counts
     dark_unit: Literal["DN", "electrons"]
@@ -122,7 +122,7 @@ def measured_variance(raw_dn: Float, light_dn: Float, dark_dn: Float, usable: ND
     white = white - (white @ basis) @ basis.T
     kept = 1.0 - np.sum(basis**2, axis=1)
     n = len(steps)
-    # Of normal values the mean square of consecutive differences has this many degrees of freedom (von Neumann 1941).
+    # The mean square of consecutive differences of normal values has this many degrees of freedom (von Neumann 1941).
     return MeasuredVariance(np.mean(white**2, axis=0) / kept * scale**2 / 2, light, dark, 2 * n**2 / (3 * n - 1))
 
 

@@ -25,7 +25,7 @@ WHY = (
 def reconstruct(quiet: Expectation, flare: Expectation) -> Interval:
     """Return the median and central 95 % of the reduced statistic `paper` with a flare, for Gaussian noise.
 
-    The paper does not define its chi-squared. Of the definitions that were tried, this one is nearest to its two G2V
+    The paper does not define its chi-squared. Among the definitions that were tried, this one is nearest to its two G2V
     values: both noisy spectra are smoothed with a Gaussian of 10.5 nm FWHM, as stated in its figure, and compared as in
     `scipy.stats.chisquare`, with the flare's mean as expected values.
     """

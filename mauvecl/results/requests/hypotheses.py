@@ -137,7 +137,7 @@ class Hypotheses:
     def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Form:
         """Return a statistic's distribution for Gaussian noise; parameters as for `Detection.distribution`."""
         self._check(statistic, flare, template)
-        # Of the nulls, only those of shaped statistics depend on the template.
+        # Only the nulls of shaped statistics depend on the template.
         key = statistic, flare, template if flare is None and self.statistic(statistic).shaped else 0
         if key not in self._forms:
             self._forms[key] = self._closed_form(statistic, flare, template)
