@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import fcntl
 import hashlib
 import shutil
 import tempfile
@@ -54,11 +55,7 @@ def remove_abandoned() -> None:
 
 
 def _locked(file: IO[bytes]) -> bool:
-    """Lock a file; return False if a running server holds it, or the system has no such locks."""
-    try:
-        import fcntl
-    except ImportError:
-        return False
+    """Lock a file; return False if a running server holds it, or the file system has no locks."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
