@@ -82,12 +82,17 @@ def random_link(generator: np.random.Generator) -> str:
     return "?" + urlencode(entered)
 
 
-def possible_question(generator: np.random.Generator, folder: Path) -> tuple[str, ClosedForms]:
-    """Return a random link with its closed forms; saturated stars are drawn again."""
+def possible_question(generator: np.random.Generator, folder: Path, quick: bool = False) -> tuple[str, ClosedForms]:
+    """Return a random link with its closed forms; saturated stars are drawn again.
+
+    With `quick`, so are questions with an unknown spectrum of one's own, whose closed forms may take a minute.
+    """
     while True:
         link = random_link(generator)
         state = State()
         state.follow(link)
+        if quick and state.entered["own_unknown"]:
+            continue
         try:
             return link, ClosedForms.of(state.question(), folder)
         except InputError:

@@ -656,6 +656,7 @@ assert COMMANDS.keys() == {name for tab in TABS.values() if tab.name not in OF_F
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("short_simulations")
 def test_downloads_equal_the_files_of_the_command_line(served: Any, tmp_path: Path) -> None:
     """With a study that is taken from the page, of an uploaded star and an uploaded unknown."""
     link = "?realisations=10000&fap=0.05&statistic=chi2&magnitude=7&star=uploaded+star&own_unknown=uploaded+spectrum"
