@@ -25,6 +25,8 @@ from mauvecl.answers.campaigns.planned import (
 )
 from mauvecl.answers.campaigns.visible import VisibleAnswer, assumption_columns, visible
 from mauvecl.answers.neighbour_list import share_columns
+from mauvecl.answers.progress import reported
+from mauvecl.device.stare_engine import Stares
 from mauvecl.host.orbit.conditions import PARTICLES_SOURCE, THERMAL_SOURCE
 from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
 from mauvecl.runs.pool import map_in_order
@@ -40,7 +42,6 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
-    from mauvecl.device.stare_engine import Stares
     from mauvecl.host.expectation import Expectation
     from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use
@@ -376,13 +377,9 @@ def plan(
         of_throughput = errors_of_throughput(one, rates)
         return Planned(one, exposed, observed, its, rates, recovered, best, why, of_throughput)
 
-    planned: list[Planned] = []
     # With a pool, the noise of a target is drawn while the threshold of the next one is sampled.
-    for one in map_in_order(engine, planned_for, observations()):
-        planned.append(one)
-        if progress is not None:
-            progress(len(planned), len(stars))
-    return PlanAnswer(study, seen, tuple(planned))
+    planned = tuple(reported(map_in_order(engine, planned_for, observations()), len(stars), progress))
+    return PlanAnswer(study, seen, planned)
 
 
 def _completeness(question: PlanQuestion, engine: Stares | Pool | None) -> CompletenessOf:
@@ -391,8 +388,4 @@ def _completeness(question: PlanQuestion, engine: Stares | Pool | None) -> Compl
         return closed_form
     from mauvecl.answers.campaigns.planned_injections import inject_target
 
-    if engine is None:
-        from mauvecl.device.stare_engine import Stares as Default
-
-        engine = Default()
-    return partial(inject_target, engine=engine)
+    return partial(inject_target, engine=engine or Stares())

@@ -15,6 +15,8 @@ from mauvecl.answers.answer import Answer, InCell
 from mauvecl.answers.detection.chance_with_unknowns import chance_with_unknowns
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
 from mauvecl.answers.neighbour_list import share_columns
+from mauvecl.answers.progress import reported
+from mauvecl.device.engine import Engine
 from mauvecl.results.detection import departures
 from mauvecl.results.detection.campaign import campaign, per_test
 from mauvecl.results.detection.departures import departure_table
@@ -39,7 +41,6 @@ from mauvecl.study.weights import read_weights
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
-    from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
     from mauvecl.study.assumptions import Use
     from mauvecl.study.questions import CampaignQuestion
@@ -219,10 +220,7 @@ def detect(
     expectations = [x for case in prepared for x in case.expectations]
     campaigns = [text for case in prepared for text in _campaign(case)]
 
-    if engine is None:
-        from mauvecl.device.engine import Engine as Default
-
-        engine = Default()
+    engine = engine or Engine()
 
     def detected(case: Case) -> StarDetection:
         own = [read_weights(name, path, case.quiet.wavelength_nm) for name, path in run.weights.items()]
@@ -234,13 +232,11 @@ def detect(
         engine.expect(len(prepared) * run.realisations)
     stars: list[StarDetection] = []
     paper: list[str] = []
-    for star in map_in_order(engine, detected, prepared):
+    for star in reported(map_in_order(engine, detected, prepared), len(prepared), progress):
         if not stars:
             # Meanwhile, the devices count the next star.
             paper = _paper(prepared)
         stars.append(star)
-        if progress is not None:
-            progress(len(stars), len(prepared))
     costs = [text for case, one in zip(prepared, stars, strict=True) for text in _template_costs(case, one)]
     answer = DetectAnswer(study, stars)
     blinding = [one.about(star.title) for star in stars for one in star.detection.messages]

@@ -18,6 +18,7 @@ from scipy import special
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.detect import DetectAnswer, detect
 from mauvecl.answers.signal.snr import SnrAnswer, snr
+from mauvecl.device.engine import Engine
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.snr import steps_of
 from mauvecl.schema.calls import validated
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 
     from astropy.table import QTable, Table
 
-    from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
     from mauvecl.results.snr import SnrResult
     from mauvecl.runs.pool import Pool
@@ -269,9 +269,7 @@ def gaussian(
     progress : callable, optional
         Called as ``progress(done, total)`` in stars, each of which is drawn for its S/N and then for its flares.
     """
-    from mauvecl.device.engine import Engine as Default
-
-    engine = engine or Default()
+    engine = engine or Engine()
     if not study.sweep.axes:
         study = study.model_copy(update={"sweep": GRID})
 

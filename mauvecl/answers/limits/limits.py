@@ -13,6 +13,7 @@ from mauvecl.answers.detection.unknown_cost import Cost, cost_lines, marginal_li
 from mauvecl.answers.limits.assumptions import assumption_columns
 from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle, single_flares
 from mauvecl.answers.neighbour_list import share_columns
+from mauvecl.answers.progress import reported
 from mauvecl.results.requests.fap_checks import check_fap
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -293,11 +294,7 @@ def limit(
             # The limits of other stars are still computed.
             return error
 
-    outcomes: list[Limit | InputError] = []
-    for one in map_in_order(engine, solved, asked):
-        outcomes.append(one)
-        if progress is not None:
-            progress(len(outcomes), len(asked))
+    outcomes = list(reported(map_in_order(engine, solved, asked), len(asked), progress))
     errors = [one for one in outcomes if isinstance(one, InputError)]
     if len(errors) == len(outcomes):
         raise errors[0]

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.measurements.along import JOINT_COLUMNS, MeasuredStare, measured_stare
 from mauvecl.answers.measurements.expected import ExpectedMeasurement, expected_measurements, fit_model, matched_filter
+from mauvecl.answers.progress import reported
+from mauvecl.device.engine import Engine
 from mauvecl.lightcurve.stares.measured_bins import MeasuredBins
 from mauvecl.results.measurements.fit import LEVELS, Measurement
 from mauvecl.results.measurements.reduction import usable_variance
@@ -35,7 +37,6 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
     from mauvecl.results.shard_sums import Arrays
     from mauvecl.study.assumptions import Use
@@ -303,16 +304,11 @@ def measure(
     if any(not amplitude > 0.0 for case in prepared for amplitude in case.amplitudes):
         raise InputError("flare amplitude = 0 in a measurement", "one above 0", key="flare.amplitudes", value=0)
     expectations = [x for case in prepared for x in case.expectations]
-    if engine is None:
-        from mauvecl.device.engine import Engine as Default
-
-        engine = Default()
+    engine = engine or Engine()
     asked = [(case, *flare, engine) for case in prepared for flare in zip(case.amplitudes, case.flares, strict=True)]
     flares: list[MeasuredFlare] = []
-    for done, some in enumerate(map_in_order(engine, lambda one: _measured(*one), asked), 1):
+    for some in reported(map_in_order(engine, lambda one: _measured(*one), asked), len(asked), progress):
         flares += some
-        if progress is not None:
-            progress(done, len(asked))
     stares = [measured_stare(case, engine) for case in prepared if study.measure.along_stare]
     messages = collect_messages(expectations)
     messages += [one.drawn for one in stares if isinstance(one.drawn, str)]

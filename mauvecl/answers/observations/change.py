@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, InCell
+from mauvecl.answers.progress import reported
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.host.stars.source import Source
 from mauvecl.observations.changes.indices import INDICES, Change, IndexValue, covered_indices, flux_per_dn
@@ -279,7 +280,7 @@ def change(
     prepared = cases(study)
     times = _visits(study) if asked.periods else None
     rows, indices, along, periods = [], [], list[ChangeRow](), []
-    for done, case in enumerate(prepared, 1):
+    for case in reported(prepared, len(prepared), progress):
         own = _changes(case, file)
         rows += own
         indices += _indices(case)
@@ -294,8 +295,6 @@ def change(
             )  # fmt: skip
             # The recovery depends on the amplitude in errors alone, so that one map serves all changes.
             periods += [PeriodRow(one.label, one.at, one.change, one.error, recovery) for one in own]
-        if progress is not None:
-            progress(done, len(prepared))
     return ChangeAnswer(study, rows, indices, along, periods, [case.quiet for case in prepared])
 
 

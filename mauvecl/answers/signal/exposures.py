@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 
 from mauvecl.answers.answer import Answer
+from mauvecl.answers.progress import reported
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.messages import Message
@@ -150,14 +151,12 @@ def exposure(
         )
     answered, failed = [], []
     prepared = cases(study, swept=False)
-    for done, case in enumerate(prepared, 1):
+    for case in reported(prepared, len(prepared), progress):
         try:
             answered.append(_one(case, snr, wavelength_nm, per))
         except InputError as error:
             # The exposures of other stars are still computed.
             failed.append(error)
-        if progress is not None:
-            progress(done, len(prepared))
     if not answered:
         raise failed[0]
     exposures, seen = zip(*answered, strict=True)

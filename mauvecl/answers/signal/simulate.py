@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from mauvecl.answers.answer import Answer
+from mauvecl.answers.progress import reported
 from mauvecl.noise.components import components
 from mauvecl.schema.calls import validated
 from mauvecl.schema.physical import FirstRealisation
@@ -119,7 +120,7 @@ def simulate(
     """
     observations, everything = [], []
     prepared = cases(study, swept=False)
-    for done, case in enumerate(prepared, 1):
+    for case in reported(prepared, len(prepared), progress):
         xs = case.expectations if flaring else [case.quiet]
         for i, x in enumerate(xs):
             title = label(case.star, x) + (f", flare {100 * case.amplitudes[i - 1]:g} %" if i else "")
@@ -127,6 +128,4 @@ def simulate(
             table.meta["study"] = study.text()
             observations.append((title, x, table))
         everything += xs
-        if progress is not None:
-            progress(done, len(prepared))
     return SimulateAnswer(study, observations, collect_messages(everything, study.processes))

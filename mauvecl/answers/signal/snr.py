@@ -8,7 +8,9 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, ClassVar
 
 from mauvecl.answers.answer import Answer, InCell
+from mauvecl.answers.progress import reported
 from mauvecl.answers.signal.exposures import Per, place_of
+from mauvecl.device.engine import Engine
 from mauvecl.host.expectation import BUDGET_COLUMNS
 from mauvecl.results.snr import COLUMNS
 from mauvecl.runs.pool import Pool, map_in_order
@@ -22,7 +24,6 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
-    from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
     from mauvecl.results.snr import SnrResult
     from mauvecl.study.assumptions import Use
@@ -127,10 +128,7 @@ def snr(
         for x in quiet:
             place_of(x, asked, "element")
 
-    if engine is None:
-        from mauvecl.device.engine import Engine as Default
-
-        engine = Default()
+    engine = engine or Engine()
 
     def answered(case: Case) -> StarSnr:
         result = engine.snr(case.quiet, realisations=run.realisations, seed=run.seed, **case.draw_options)
@@ -138,11 +136,7 @@ def snr(
 
     if isinstance(engine, Pool):
         engine.expect(len(prepared) * run.realisations)
-    stars: list[StarSnr] = []
-    for one in map_in_order(engine, answered, prepared):
-        stars.append(one)
-        if progress is not None:
-            progress(len(stars), len(prepared))
+    stars = list(reported(map_in_order(engine, answered, prepared), len(prepared), progress))
     return SnrAnswer(
         study,
         stars,

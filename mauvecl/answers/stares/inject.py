@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, InCell
 from mauvecl.answers.neighbour_list import share_columns
+from mauvecl.device.stare_engine import Stares
 from mauvecl.lightcurve.search.counted_rate import CountedRate, consecutive_alarm_rate
 from mauvecl.lightcurve.search.fit_accuracy import FitAccuracy, Refit
 from mauvecl.lightcurve.search.injected_completeness import InjectedCompleteness
@@ -36,7 +37,6 @@ from mauvecl.study.surveys import Sizes, StarSurvey, injected_sizes, survey_star
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
-    from mauvecl.device.stare_engine import Stares
     from mauvecl.host.expectation import Expectation
     from mauvecl.lightcurve.stares.stare_requests import StaresRequest
     from mauvecl.study.assumptions import Use
@@ -274,10 +274,7 @@ def inject(
         raise InputError(
             f"the sweep has the quantity {idle!r}, which injections have none of", "another", key="sweep", value=idle
         )
-    if engine is None:
-        from mauvecl.device.stare_engine import Stares as Default
-
-        engine = Default()
+    engine = engine or Stares()
     prepared = cases(study)
     for case in prepared:
         # Raise InputError for energies of stars of unknown size before the first search.

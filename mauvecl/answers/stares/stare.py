@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from mauvecl.answers.answer import Answer
+from mauvecl.answers.progress import reported
 from mauvecl.answers.stares.light_curve_file import light_curve_file
 from mauvecl.answers.stares.star_stare import SearchResult, StareFlare, StarStare
 from mauvecl.lightcurve.flares.energies import Kind
@@ -344,11 +345,7 @@ def stare(
         from mauvecl.device.stare_engine import Stares as Default
 
         engine = Default()
-    drawn: list[StarStare] = []
-    for case in prepared:
-        drawn.append(_draw(case, engine, checkpoint))
-        if progress is not None:
-            progress(len(drawn), len(prepared))
+    drawn = [_draw(case, engine, checkpoint) for case in reported(prepared, len(prepared), progress)]
     messages = collect_messages(quiet) + orbit_lines(study.stare, study.orbit, prepared[0].instrument.frame_s)
     messages += dict.fromkeys(
         line for case in prepared for line in unused_lines(case.study.observation.exposure_s, case.stare, case.events)
