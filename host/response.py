@@ -88,32 +88,46 @@ def electrons_per_second(
         )
     if nodes.size <= MATRIX_NODES:
         return cast(Float, response_matrix(instrument, nodes, order) @ flux)
-    landing = _landing(instrument, _known(order))
+    by_light = _by_light(instrument, order)
+    landing = _line_landing(LineSpread.of(instrument), _knots(by_light))
     gathered = np.zeros(landing.shape[1])
-    for part in _gathering(instrument, nodes, order):
+    for part in _gathering(LineSpread.of(instrument), nodes, by_light):
         gathered += part @ flux
-    return np.asarray(landing @ gathered)
+    rate = landing @ gathered
+    return np.asarray(rate if by_light else rate * _efficiencies(instrument))
 
 
 @lru_cache(maxsize=8)
 def _response(instrument: Instrument, nodes: bytes, order: Order) -> csr_array:
+    by_light = _by_light(instrument, order)
+    matrix = _product(LineSpread.of(instrument), nodes, by_light)
+    if by_light:
+        return matrix
+    scaled = matrix.copy()
+    scaled.data *= np.repeat(_efficiencies(instrument), np.diff(matrix.indptr))
+    return _read_only(scaled)
+
+
+# Instruments that differ only in their efficiencies, such as most modes of a calibrated throughput, share these
+# matrices in the paper's order.
+@lru_cache(maxsize=8)
+def _product(line: LineSpread, nodes: bytes, by_light: Instrument | None) -> csr_array:
+    """Return the product of both factors; in the paper's order, without the efficiencies."""
     wavelength = np.frombuffer(nodes, np.float64)
-    parts = list(_gathering(instrument, wavelength, order))
-    gathering = parts[0]
-    for part in parts[1:]:
+    gathering, *more = _gathering(line, wavelength, by_light)
+    for part in more:
         gathering = gathering + part
-    return _read_only(csr_array(_landing(instrument, order) @ gathering))
+    return _read_only(csr_array(_line_landing(line, _knots(by_light)) @ gathering))
 
 
-def _landing(instrument: Instrument, order: Order) -> csr_array:
-    """Return the first factor of the matrix with all constants, shape (n_pixel, n_panel_node)."""
-    landing = _line_landing(LineSpread.of(instrument), _knots(instrument, order))
-    if order == "physical":
-        return landing
-    per_pixel = W_PER_NM_IN_FLAM * instrument.electrons_per_joule_cm2(instrument.wavelength_nm, held=True)
-    scaled = landing.copy()
-    scaled.data *= np.repeat(per_pixel, np.diff(landing.indptr))
-    return scaled
+def _by_light(instrument: Instrument, order: str) -> Instrument | None:
+    """Return the instrument whose efficiencies act at the wavelength of the light; None in the paper's order."""
+    return instrument if _known(order) == "physical" else None
+
+
+def _efficiencies(instrument: Instrument) -> Float:
+    """Return the factors of the paper's order at the wavelengths of the pixels, shape (n_pixel,)."""
+    return W_PER_NM_IN_FLAM * instrument.electrons_per_joule_cm2(instrument.wavelength_nm, held=True)
 
 
 # An answer asks for those of each mode of a fitted instrument, some 16 of 7 MB each, several times.
@@ -133,13 +147,13 @@ def _line_landing(line: LineSpread, knots: tuple[float, ...]) -> csr_array:
     return _read_only(csr_array((values, columns, indptr), shape=(centres.size, nodes.size)))
 
 
-def _gathering(instrument: Instrument, wavelength: Float, order: Order) -> Iterator[csr_array]:
+def _gathering(line: LineSpread, wavelength: Float, by_light: Instrument | None) -> Iterator[csr_array]:
     """Yield the terms of the second factor of the matrix, each of shape (n_panel_node, n_wavelength).
 
     An entry is the integral (nm) over a panel of one of its Lagrange polynomials times the hat function of a node, and
     times the efficiency in the physical order.
     """
-    panels = LineSpread.of(instrument).panel_edges(np.array(_knots(instrument, order)))
+    panels = line.panel_edges(np.array(_knots(by_light)))
     low, high = max(panels[0], wavelength[0]), min(panels[-1], wavelength[-1])
     shape = ((panels.size - 1) * PANEL_NODES, wavelength.size)
     if not low < high:
@@ -148,11 +162,11 @@ def _gathering(instrument: Instrument, wavelength: Float, order: Order) -> Itera
     inside = [edges[(edges > low) & (edges < high)] for edges in (panels, wavelength)]
     edges = np.unique(np.concatenate([[low], *inside, [high]]))
     for start in range(0, edges.size - 1, CHUNK):
-        yield _gather(instrument, wavelength, order, panels, edges[start : start + CHUNK + 1], shape)
+        yield _gather(wavelength, by_light, panels, edges[start : start + CHUNK + 1], shape)
 
 
 def _gather(
-    instrument: Instrument, wavelength: Float, order: Order, panels: Float, edges: Float, shape: tuple[int, int]
+    wavelength: Float, by_light: Instrument | None, panels: Float, edges: Float, shape: tuple[int, int]
 ) -> csr_array:
     """Return the term of `_gathering` for the cells between `edges`, each within one panel and between two nodes."""
     abscissa, weight = leggauss(CELL_NODES)
@@ -162,8 +176,8 @@ def _gather(
     node = np.searchsorted(wavelength, middle) - 1
     at = middle[:, None] + width[:, None] / 2 * abscissa  # (n_cell, CELL_NODES)
     mass = width[:, None] / 2 * weight
-    if order == "physical":
-        mass = mass * W_PER_NM_IN_FLAM * instrument.electrons_per_joule_cm2(at, held=True)
+    if by_light:
+        mass = mass * W_PER_NM_IN_FLAM * by_light.electrons_per_joule_cm2(at, held=True)
     span = (wavelength[node + 1] - wavelength[node])[:, None]
     right = (at - wavelength[node][:, None]) / span
     in_panel = (2 * at - (panels[panel] + panels[panel + 1])[:, None]) / np.diff(panels)[panel][:, None]
@@ -198,11 +212,9 @@ def _panel_nodes(edges: Float) -> Float:
     return np.asarray(edges[:-1, None] + np.diff(edges)[:, None] * (1 + x) / 2).ravel()
 
 
-def _knots(instrument: Instrument, order: Order) -> tuple[float, ...]:
+def _knots(by_light: Instrument | None) -> tuple[float, ...]:
     """Return the wavelengths at which the instrument's curves make the integrand's slope jump."""
-    if order == "paper":
-        return ()
-    return instrument.knots_nm
+    return by_light.knots_nm if by_light else ()
 
 
 def _nodes(wavelength_nm: ArrayLike) -> Float:

@@ -91,13 +91,11 @@ class SearchChoice(Section):
 
     def white_bank(self, frame_s: float) -> Bank:
         """Return the template bank of the closed form: one sum per frame and no cycle."""
-        import numpy as np
-
         from mauvecl.lightcurve.flares.shapes import shape_of
-        from mauvecl.lightcurve.search.bank import Bank, Baseline
+        from mauvecl.lightcurve.search.bank import Baseline, white_bank
 
         level = Baseline(self.offset, self.slope, False, WINDOW_S if self.window_s is None else self.window_s)
-        return Bank(self.half_widths_s, np.ones((1, 1)), shape_of(self.shape), frame_s, level)
+        return white_bank(self.half_widths_s, shape_of(self.shape), frame_s, level)
 
     def level(self, stare: Stare, orbit_s: float) -> Baseline:
         """Return the baseline model for a stare."""

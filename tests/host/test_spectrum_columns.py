@@ -25,6 +25,9 @@ from mauvecl.host.spectra.column_roles import role_of
 from mauvecl.host.stars.source import Source
 from mauvecl.schema.errors import InputError
 
+# Astropy warns of the usual units when it writes a VOTable.
+pytestmark = pytest.mark.filterwarnings("ignore:The unit .* has been deprecated in the VOUnit standard")
+
 FLAM = u.erg / (u.s * u.cm**2 * u.AA)
 NM = np.arange(170.0, 1000.0, 2.0)
 ANGSTROM = 10 * NM

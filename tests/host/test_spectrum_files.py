@@ -20,6 +20,9 @@ from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.stars.source import Source
 from mauvecl.schema.errors import InputError
 
+# Astropy warns of the usual units when it writes a VOTable.
+pytestmark = pytest.mark.filterwarnings("ignore:The unit .* has been deprecated in the VOUnit standard")
+
 FLAM = u.erg / (u.s * u.cm**2 * u.AA)
 #: Two nm apart; not straight, so that a wrong order, unit or shift shows at each point.
 NM = np.arange(170.0, 1000.0, 2.0)

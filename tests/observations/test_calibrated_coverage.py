@@ -160,6 +160,8 @@ def deviations(true: Instrument, file: Path) -> dict[str, float]:
     return found
 
 
+# A true throughput is in memory only: studies have no text for it, of which pydantic warns.
+@pytest.mark.filterwarnings("ignore:Pydantic serializer warnings")
 @pytest.mark.long
 def test_answers_with_fitted_instruments_have_their_errors(tmp_path: Path) -> None:
     """Limit, measurements and a plan through the true instrument, less those of ten fitted ones.

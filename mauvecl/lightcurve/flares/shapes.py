@@ -85,18 +85,20 @@ class Shape(ABC):
 
     def integral(self, first: ArrayLike, last: ArrayLike) -> Float:
         """Return the integral between two values of tau, elementwise, in half-widths."""
-        first, last = np.broadcast_arrays(np.asarray(first, np.float64), np.asarray(last, np.float64))
-        values = np.empty(first.shape)
-        # Differences of large integrals cancel, so each side of the peak uses the integral to its own end.
-        late = first > 0
-        early = ~late & (last <= 0)
-        across = ~(late | early)
-        values[late] = self.after(first[late]) - self.after(np.maximum(last[late], 0.0))
-        values[early] = self.before(last[early]) - self.before(first[early])
-        if across.any():
-            values[across] = self.before(0.0) - self.before(first[across]) + self.after(0.0) - self.after(last[across])
-        # Shapes are not negative; differences of equal integrals may be, by rounding.
-        return np.maximum(values, 0.0)
+        return between(self.sides(first), self.sides(last))
+
+    def integrals(self, tau: ArrayLike) -> Float:
+        """Return the integrals between consecutive values of tau along the last axis, in half-widths."""
+        sides = self.sides(tau)
+        return between(sides[..., :-1], sides[..., 1:])
+
+    def sides(self, tau: ArrayLike) -> Float:
+        """Return the integrals up to min(tau, 0) and from max(tau, 0), in half-widths, shape (2, *tau.shape).
+
+        `between` subtracts them. Differences of integrals from one end only would cancel on the other side of the peak.
+        """
+        t = np.asarray(tau, np.float64)
+        return np.stack([self.before(np.minimum(t, 0.0)), self.after(np.maximum(t, 0.0))])
 
     def mean_over(self, edges_s: ArrayLike, peak_s: ArrayLike, t_half_s: ArrayLike) -> Float:
         """Return the exact mean over each frame.
@@ -112,10 +114,19 @@ class Shape(ABC):
         -------
         ndarray, shape (n_frame,), or (n, n_frame)
         """
-        edges = np.asarray(edges_s, np.float64)
-        start, end = (edges[:, 0], edges[:, 1]) if edges.ndim == 2 else (edges[:-1], edges[1:])
-        peak, scale = np.asarray(peak_s, np.float64), np.asarray(t_half_s, np.float64)
-        return np.asarray(self.integral((start - peak) / scale, (end - peak) / scale) * scale / (end - start))
+        edges, peak, scale = (np.asarray(one, np.float64) for one in (edges_s, peak_s, t_half_s))
+        if edges.ndim == 2:
+            integrals = self.integral((edges[:, 0] - peak) / scale, (edges[:, 1] - peak) / scale)
+        else:
+            integrals = self.integrals((edges - peak) / scale)
+        lengths = np.diff(edges).reshape(-1)
+        return np.asarray(integrals * scale / lengths)
+
+
+def between(first: Float, last: Float) -> Float:
+    """Return the integrals of a shape between two values of tau from its `sides` at both."""
+    # Shapes are not negative; differences of equal integrals may be, by rounding.
+    return np.asarray(np.maximum(last[0] - first[0] + (first[1] - last[1]), 0.0))
 
 
 class Davenport2014(Shape):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -142,3 +142,9 @@ class Bank:
         half = self.baseline.window_s / 2
         lead, tail = (max(reach * half_width_s, half) / self.frame_s for reach in (LEAD, TAIL))
         return int(np.ceil(lead)), int(np.ceil(tail))
+
+
+@lru_cache(maxsize=8)
+def white_bank(half_widths_s: tuple[float, ...], shape: Shape, frame_s: float, baseline: Baseline = Baseline()) -> Bank:
+    """Return the bank of a single light curve with white noise; the same one for the same arguments."""
+    return Bank(half_widths_s, np.ones((1, 1)), shape, frame_s, baseline)

@@ -16,6 +16,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from mauvecl.lightcurve.flares.shapes import between
+
 if TYPE_CHECKING:
     from mauvecl.lightcurve.search.bank import Bank
     from mauvecl.lightcurve.search.search import Search
@@ -136,8 +138,13 @@ class StareSums:
 
     def frames(self, first_s: float, last_s: float) -> slice:
         """Return the frames that overlap a time interval."""
-        ends = np.searchsorted(self.edges[:, 0], [first_s - self.survey.stare.frame_s, last_s])
-        return slice(int(ends[0]), int(ends[1]))
+        first, stop = self._overlapping(first_s, last_s)
+        return slice(int(first), int(stop))
+
+    def _overlapping(self, first_s: Any, last_s: Any) -> tuple[Any, Any]:
+        """Return the first frame that overlaps each time interval, and the first one after it."""
+        start = self.survey.stare.start_s
+        return np.searchsorted(start, first_s - self.survey.stare.frame_s), np.searchsorted(start, last_s)
 
     def mean(self, one: Float, frames: Any) -> Float:
         """Return the mean of a flare's shape over frames, including throughput, shape (n_frame,)."""
@@ -168,13 +175,12 @@ class StareSums:
     def _shining(self, theta: Float, frames: slice) -> Iterator[tuple[Float, slice, Float]]:
         """Yield the flares that contribute to some frames, the affected frames, and the mean amplitude in them."""
         first, last, _ = frames.indices(len(self.net))
-        for one in theta:
-            width = np.exp(one[WIDTH])
-            reach = self.frames(one[PEAK] - LIGHT_BEFORE * width, one[PEAK] + LIGHT_AFTER * width)
-            there = slice(max(reach.start, first), min(reach.stop, last))
-            if there.start < there.stop:
-                mean = np.exp(one[AMPLITUDE]) * self.mean(one, there)
-                yield one, slice(there.start - first, there.stop - first), mean
+        peak, width = theta[:, PEAK], np.exp(theta[:, WIDTH])
+        starts, stops = self._overlapping(peak - LIGHT_BEFORE * width, peak + LIGHT_AFTER * width)
+        for one, start, stop in zip(theta, np.maximum(starts, first), np.minimum(stops, last), strict=True):
+            if start < stop:
+                mean = np.exp(one[AMPLITUDE]) * self.mean(one, slice(start, stop))
+                yield one, slice(start - first, stop - first), mean
 
     def window(self, one: Float) -> tuple[float, float]:
         """Return start and end of a flare's window, s."""
@@ -242,31 +248,36 @@ class Block:
     data: Float  # whitened sums less their projection on the baseline, shape (n_used * n_sum,)
 
     @cached_property
-    def _frames(self) -> tuple[Float, Float]:
-        """Start and end of each frame, s, shape (n_used, 2), and its throughput, shape (n_used,)."""
-        return self.sums.edges[self.used], self.sums.survey.stare.light[self.used]
+    def _times(self) -> tuple[Float, NDArray[np.intp]]:
+        """Distinct times at which frames start or end, s, and their indices for each frame, shape (2, n_used)."""
+        edges = self.sums.edges[self.used]
+        times, index = np.unique(edges, return_inverse=True)
+        return times, index.reshape(edges.shape).T
 
     def model(self, theta: Float) -> tuple[Float, Float]:
         """Return the whitened flux less its projection on the baseline, (n_row,), and derivatives, (n_row, n, 4)."""
-        edges, light = self._frames
+        times, (first, last) = self._times
         shape, spline = self.sums.survey.bank.shape, self.sums.templates.mean_sums.spline
-        derivatives = np.zeros((self.data.size, len(theta), 4))
-        for k, one in enumerate(theta):
-            width, amplitude = np.exp(one[WIDTH]), np.exp(one[AMPLITUDE])
-            tau = (edges - one[PEAK]) / width
-            mean = shape.integral(tau[:, 0], tau[:, 1]) / (tau[:, 1] - tau[:, 0])
-            ends = shape.at(tau) * (width / (edges[:, 1] - edges[:, 0]))[:, None]
-            later = (ends[:, 0] - ends[:, 1]) / width
-            wider = mean - (tau[:, 1] * ends[:, 1] - tau[:, 0] * ends[:, 0])
-            along = self.whiten @ spline(one[KELVIN])
-            time = amplitude * light * np.array([mean, later, wider])
-            rows = time[:, :, None] * along
-            hotter = time[0][:, None] * (self.whiten @ spline(one[KELVIN], 1))
-            derivatives[:, k] = np.stack([*rows, hotter]).reshape(4, -1).T
-        flat = derivatives.reshape(self.data.size, -1)
-        flat = flat - self.basis @ (self.basis.T @ flat)
-        derivatives = flat.reshape(derivatives.shape)
-        return derivatives[:, :, AMPLITUDE].sum(axis=1), derivatives
+        light, length = self.sums.survey.stare.light[self.used], times[last] - times[first]
+        width = np.exp(theta[:, WIDTH, None])
+        tau = (times - theta[:, PEAK, None]) / width  # (n_flare, n_time)
+        at, sides, relative = shape.at(tau), shape.sides(tau), width / length
+        mean = relative * between(sides[..., first], sides[..., last])
+        later = (at[:, first] - at[:, last]) / length
+        change = tau * at
+        wider = mean - relative * (change[:, last] - change[:, first])
+        time = np.exp(theta[:, AMPLITUDE, None]) * light * np.array([mean, later, wider])  # (3, n_flare, n_used)
+        whiten = self.whiten.reshape(self.data.size, -1).T
+        colour, hotter = (
+            (spline(theta[:, KELVIN], order) @ whiten).reshape(len(theta), *self.whiten.shape[:2]) for order in (0, 1)
+        )
+        derivatives = np.empty((4, *colour.shape))
+        derivatives[:KELVIN] = time[..., None] * colour
+        derivatives[KELVIN] = time[0][..., None] * hotter
+        rows = derivatives.reshape(-1, self.data.size)
+        rows -= (rows @ self.basis) @ self.basis.T
+        derivatives = rows.reshape(4, len(theta), -1)
+        return derivatives[AMPLITUDE].sum(axis=0), derivatives.T
 
     def chi2(self, theta: Float) -> float:
         """Return chi-squared for given parameters."""

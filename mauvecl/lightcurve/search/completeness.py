@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Self
 
 import numpy as np
@@ -13,7 +14,7 @@ from mauvecl.host.expectation import Expectation
 from mauvecl.lightcurve.defaults import HALF_WIDTHS_S as BANK_S
 from mauvecl.lightcurve.flares.energies import EnergyScale
 from mauvecl.lightcurve.flares.shapes import Shape, shape_of
-from mauvecl.lightcurve.search.bank import Bank
+from mauvecl.lightcurve.search.bank import Bank, white_bank
 from mauvecl.lightcurve.search.false_alarm_rate import TemplateGrid
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -171,7 +172,7 @@ class Completeness:
 
 def default_bank() -> Bank:
     """Return the bank of a default search with one sum per frame."""
-    return Bank(BANK_S, np.ones((1, 1)), shape_of("davenport2014"), 5.0)
+    return white_bank(BANK_S, shape_of("davenport2014"), 5.0)
 
 
 @validated
@@ -181,7 +182,13 @@ def search_threshold(false_alarms_per_day: Positive, bank: Bank | None = None) -
     The threshold follows from `TemplateGrid` and is about 1 % too high at one alarm per day, and less at lower rates.
     Raises InputError if it is not between 2 and 20 sigma.
     """
-    grid = TemplateGrid.from_bank(bank or default_bank())
+    return _search_threshold(false_alarms_per_day, bank or default_bank())
+
+
+# A plan asks for the threshold and the gains of each target and each mode of a calibrated throughput.
+@lru_cache(maxsize=8)
+def _search_threshold(false_alarms_per_day: float, bank: Bank) -> float:
+    grid = TemplateGrid.from_bank(bank)
 
     def over(threshold: float) -> float:
         return float(np.log(grid.false_alarms_per_second(threshold) * DAY_S / false_alarms_per_day))
@@ -214,6 +221,7 @@ def frame_signal(
     return float(np.sqrt(np.sum(light[used] ** 2 / variance[used])))
 
 
+@lru_cache(maxsize=32)
 def _gains(shape: Shape, window_s: float, frame_s: float) -> tuple[Float, Float]:
     """Return half-widths, (WIDTHS,), and the norm of detrended shapes by half-width and peak time, (WIDTHS, PEAKS)."""
     n = max(3, round(window_s / frame_s))
@@ -226,7 +234,10 @@ def _gains(shape: Shape, window_s: float, frame_s: float) -> tuple[Float, Float]
     gain = np.empty((WIDTHS, PEAKS))
     for i, half in enumerate(widths):
         tau = (edges[None, :] - peaks[:, None]) / half
-        frames = shape.integral(tau[:, :-1], tau[:, 1:]) * half / frame_s
+        frames = shape.integrals(tau) * half / frame_s
         rest = frames - (frames @ line.T) @ line
         gain[i] = np.linalg.norm(rest, axis=1)
-    return widths, np.maximum(gain, 1e-12)
+    gain = np.maximum(gain, 1e-12)
+    for shared in (widths, gain):
+        shared.setflags(write=False)
+    return widths, gain

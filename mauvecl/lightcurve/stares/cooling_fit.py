@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from mauvecl.statistics.nuisances import Nuisances
 
 Float = NDArray[np.float64]
+Pair = tuple[Float, Float]
 
 #: Parameters, all but the first as logarithms; the temperature at the end is relative to that at the peak.
 PARAMETERS = ("peak time", "half width", "amplitude", "temperature", "end temperature", "cooling time")
@@ -48,6 +49,16 @@ NO_STEP = 1e-9
 #: Largest number of Newton's steps to the end of an interval, their largest length and that of the last one, relative
 #: to the rise of chi-squared, and the largest condition number of the scaled information.
 NEWTON_STEPS, LONGEST, CONVERGED, WORST_CONDITION = 20, 1.5, 1e-6, 1e10
+
+
+def _remembering(function: Callable[[Float], Pair]) -> Callable[[Float], Pair]:
+    """Return a function that keeps its last results, since it is asked at the same parameters in turn."""
+
+    @lru_cache(maxsize=2)
+    def of_bytes(theta: bytes) -> Pair:
+        return function(np.frombuffer(theta))
+
+    return lambda theta: of_bytes(theta.tobytes())
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,27 +88,32 @@ class _Data:
         return scipy.interpolate.CubicSpline(self.model.log_k, added)
 
     @cached_property
-    def _latest(self) -> Callable[[bytes], tuple[Float, Float]]:
-        # Residuals, derivatives and quantities are asked for at the same parameters in turn.
-        return lru_cache(maxsize=2)(lambda theta: self._strengths(np.frombuffer(theta)))
+    def _middle(self) -> Float:
+        """Middle of each frame, s."""
+        return np.asarray(self.edges.mean(axis=1))
 
-    def strengths(self, theta: Float) -> tuple[Float, Float]:
-        """Return the amplitude and log temperature of each frame."""
-        return self._latest(theta.tobytes())
+    @cached_property
+    def strengths(self) -> Callable[[Float], Pair]:
+        """Function of the parameters that returns the amplitude and log temperature of each frame."""
+        return _remembering(self._strengths)
 
-    def _strengths(self, theta: Float) -> tuple[Float, Float]:
+    @cached_property
+    def slopes(self) -> Callable[[Float], Pair]:
+        """Function that returns the derivatives of `strengths` by the parameters, each of shape (6, n_frame)."""
+        return _remembering(self._slopes)
+
+    def _strengths(self, theta: Float) -> Pair:
         rise = np.exp(theta[2]) * self.light * self.shape.mean_over(self.edges, theta[0], np.exp(theta[1]))
         log_k = theta[3] + np.log(self._cooled(theta)[0])
         return rise, np.clip(log_k, self.model.log_k[0], self.model.log_k[-1])
 
     def _cooled(self, theta: Float) -> tuple[Float, Float, float]:
         """Return temperatures over that at the peak, as in `Cooling`, times since the peak, and the end."""
-        since = np.maximum(self.edges.mean(axis=1) - theta[0], 0.0)
+        since = np.maximum(self._middle - theta[0], 0.0)
         end = min(float(np.exp(theta[4])), 1.0)
         return end + (1.0 - end) * np.exp(-since / np.exp(theta[5])), since, end
 
-    def slopes(self, theta: Float) -> tuple[Float, Float]:
-        """Return the derivatives of `strengths` with respect to the parameters, each of shape (6, n_frame)."""
+    def _slopes(self, theta: Float) -> Pair:
         rise, log_k = self.strengths(theta)
         width, amplitude, fold = np.exp(theta[[1, 2, 5]])
         tau, span = (self.edges - theta[0]) / width, np.diff(self.edges, axis=1)[:, 0]
@@ -154,7 +170,7 @@ class _Whitening:
 
     def of(self, values: Float) -> Float:
         """Return whitened sums, shape (n, n_frame n_sum), of sums (n, n_frame, n_sum)."""
-        plain = np.einsum("tij,ntj->nti", self.inverse, values, optimize=True).reshape(len(values), -1)
+        plain = (self.inverse @ values.transpose(1, 2, 0)).transpose(2, 0, 1).reshape(len(values), -1)
         return np.asarray(plain - (self.shrink * (plain @ self.directions.T)) @ self.directions)
 
 
@@ -273,14 +289,15 @@ def fit_cooling(
     spread = slopes @ covariance @ slopes.T
     ends = np.full((2, len(levels), len(quantities)), np.nan)
     names = [one.name for one in quantities]
+    rises = [float(scipy.stats.chi2.ppf(level, 1)) for level in levels]
     for q, one in enumerate(quantities):
         if one.name.startswith("energy"):
             fluence = names.index(one.name.replace("energy", "fluence"))
             ends[:, :, q] = estimates[q] / estimates[fluence] * ends[:, :, fluence]
             continue
         for side, sign in enumerate((-1.0, 1.0)):
-            for k, level in enumerate(levels):
-                limit = best + float(scipy.stats.chi2.isf(1.0 - level, 1))
+            for k, rise in enumerate(rises):
+                limit = best + rise
                 end = _newton_end(data, whitening, theta, free, (low, high), one, sign, best, limit)
                 if end is None:
                     step = sign * float(np.sqrt(spread[q, q])) / max(abs(scale[q]), 1e-300)
