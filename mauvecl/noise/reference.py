@@ -219,17 +219,31 @@ def observed(
     """
     chosen = range(len(scene.levels)) if scenarios is None else scenarios
     total = np.zeros((len(chosen), len(scene.pixels), len(realisation)), np.int64)
-    for frame in range(number * scene.n_draws, (number + 1) * scene.n_draws):
-        first = frame if scene.frames else number * scene.n_frames
-        changes = factors(scene, realisation, first, seed, exposure=exposure)
-        for group in range(len(scene.pixels) // 4):
-            drawn = draws(scene, realisation, frame, group, seed, exposure=exposure)
-            for i, p in enumerate(range(4 * group, 4 * group + 4)):
-                for row, k in enumerate(chosen):
-                    v = analogue(scene, drawn, i, p, k, *changes)
-                    with np.errstate(invalid="ignore"):  # padded pixels
-                        total[row, p] += digitise(v, scene.edges[k, p], clip=scene.clip).astype(np.int64)
+    drawn_frames = range(number * scene.n_draws, (number + 1) * scene.n_draws)
+    index, frames, changes = _all_frames(scene, realisation, drawn_frames, seed, exposure)
+    for group in range(len(scene.pixels) // 4):
+        drawn = draws(scene, index, frames, group, seed, exposure=exposure)
+        for i, p in enumerate(range(4 * group, 4 * group + 4)):
+            for row, k in enumerate(chosen):
+                v = analogue(scene, drawn, i, p, k, *changes)
+                with np.errstate(invalid="ignore"):  # padded pixels
+                    dn = digitise(v, scene.edges[k, p], clip=scene.clip).astype(np.int64)
+                total[row, p] = dn.reshape(scene.n_draws, -1).sum(axis=0)
     return total
+
+
+def _all_frames(
+    scene: Scene, realisation: NDArray[np.uint64], frames: range, seed: int, exposure: int = 0
+) -> tuple[NDArray[np.uint64], NDArray[np.int64], NDArray[np.float32]]:
+    """Return realisation, frame and `factors` of each draw, frame by frame, since NumPy is fast for long arrays only.
+
+    Shapes are (n_draw,), (n_draw,) and (3, n_draw).
+    """
+    changes = [
+        factors(scene, realisation, frame if scene.frames else first, seed, exposure=exposure)
+        for frame, first in ((frame, frame * scene.n_frames) for frame in frames)
+    ]
+    return np.tile(realisation, len(frames)), np.repeat(frames, len(realisation)), np.concatenate(changes, axis=1)
 
 
 def clipped(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray[np.int64]:
@@ -241,14 +255,13 @@ def clipped(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray
     """
     count = np.zeros((len(realisation), len(scene.pixels), 2), np.int64)
     if scene.clip:
-        for frame in range(scene.n_draws):
-            changes = factors(scene, realisation, frame, seed)
-            for group in range(-(-scene.n_pixel // 4)):
-                drawn = draws(scene, realisation, frame, group, seed)
-                for i, p in enumerate(range(4 * group, min(4 * group + 4, len(scene.pixels)))):
-                    r = analogue(scene, drawn, i, p, 0, *changes) + MAGIC
-                    count[:, p, 0] += r < scene.edges[0, p]["low"]
-                    count[:, p, 1] += r > scene.edges[0, p]["high"]
+        index, frames, changes = _all_frames(scene, realisation, range(scene.n_draws), seed)
+        for group in range(-(-scene.n_pixel // 4)):
+            drawn = draws(scene, index, frames, group, seed)
+            for i, p in enumerate(range(4 * group, min(4 * group + 4, len(scene.pixels)))):
+                r = (analogue(scene, drawn, i, p, 0, *changes) + MAGIC).reshape(scene.n_draws, -1)
+                count[:, p, 0] = (r < scene.edges[0, p]["low"]).sum(axis=0)
+                count[:, p, 1] = (r > scene.edges[0, p]["high"]).sum(axis=0)
     return count[:, : scene.n_pixel]
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -20,6 +19,7 @@ from mauvecl.noise.scene import Scene, prepare
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
     from mauvecl.lightcurve.stares.stare import Stare
 
 Float = NDArray[np.float64]
@@ -192,27 +192,6 @@ class StareScene:
         job["seed_low"], job["seed_high"] = seed & 0xFFFFFFFF, seed >> 32
         return job.reshape(1)
 
-    def extremes(self, flares: Flares) -> Iterator[tuple[Float, float]]:
-        """Yield conditions over their range, in steps of at most a factor of 2.
-
-        Yields
-        ------
-        light : ndarray, shape (n_pixel,)
-            Photons in DN.
-        dark : float
-            Factor on the dark.
-        """
-        low, high = self._ends
-        mean = self.components.mean_dn
-        darkest = low[0] * mean[0] + low[1] * mean[1] + low[3] * mean[3]
-        brightest = high[0] * mean[0] + high[1] * mean[1] + high[3] * (mean[3] + flares.most @ mean[len(STEADY) :])
-        span = float(np.max(brightest / np.maximum(darkest, 1e-30), initial=1.0, where=brightest > 1e-9))
-        steps = 1 + int(np.ceil(np.log2(min(span, 2.0**20))))
-        for part in np.linspace(0.0, 1.0, steps + 1):
-            light = np.maximum(darkest, 1e-30) ** (1 - part) * np.maximum(brightest, 1e-30) ** part
-            for dark in np.geomspace(low[2], high[2], 2 + int(np.log2(high[2] / low[2]))):
-                yield light, float(dark)
-
     @property
     def _ends(self) -> tuple[Float, Float]:
         """Smallest and largest factors on star, sky, dark, and neighbours and flares."""
@@ -248,7 +227,7 @@ class StareScene:
                     value=float(spread[of].max()),
                 )
         x, mean = self.components.quiet, self.components.mean_dn
-        _, high = self._ends
+        low, high = self._ends
         lit = mean[3] + flares.most @ mean[len(STEADY) :]
         reach = high[0] * mean[0] + high[1] * mean[1] + high[2] * mean[2] + high[3] * lit
         if not (reach < REACH_DN).all():
@@ -259,13 +238,31 @@ class StareScene:
                 key="flare",
                 value=float(reach[pixel]),
             )
-        one = Cumulants.of(x, 1)
-        for light, dark in self.extremes(flares):
-            photons = light / x.gain_dn_per_electron
-            other = x.read_noise_dn**2 + (0.0 if self.counts else x.gain_dn_per_electron * light)
-            changed = replace(one, gaussian=other, photons=photons, dark_dn=dark * one.dark_dn)
-            if not joint_is_exact(changed).all():
-                raise _not_joint_error(x.name)
+        darkest = low[0] * mean[0] + low[1] * mean[1] + low[3] * mean[3]
+        brightest = high[0] * mean[0] + high[1] * mean[1] + high[3] * lit
+        if not _joint_between(x, darkest.tobytes(), brightest.tobytes(), float(low[2]), float(high[2])):
+            raise _not_joint_error(x.name)
+
+
+# Callers draw the pixels of a stare in many parts.
+@lru_cache(maxsize=4)
+def _joint_between(x: Expectation, darkest: bytes, brightest: bytes, least_dark: float, most_dark: float) -> bool:
+    """Return whether noise can be drawn jointly for all conditions in a range, in steps of at most a factor of 2.
+
+    The range is given by photons in DN of each pixel, float64, and by factors on the dark.
+    """
+    first, last = (np.maximum(np.frombuffer(light), 1e-30) for light in (darkest, brightest))
+    span = float(np.max(last / first, initial=1.0, where=last > 1e-9))
+    steps = 1 + int(np.ceil(np.log2(min(span, 2.0**20))))
+    one = Cumulants.of(x, 1)
+    for part in np.linspace(0.0, 1.0, steps + 1):
+        light = first ** (1 - part) * last**part
+        other = x.read_noise_dn**2 + (0.0 if x.photon_noise == "poisson" else x.gain_dn_per_electron * light)
+        changed = replace(one, gaussian=other, photons=light / x.gain_dn_per_electron)
+        for dark in np.geomspace(least_dark, most_dark, 2 + int(np.log2(most_dark / least_dark))):
+            if not joint_is_exact(replace(changed, dark_dn=dark * one.dark_dn)).all():
+                return False
+    return True
 
 
 def padded_frames(n_frames: int) -> int:
