@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Self
@@ -192,6 +193,14 @@ class StareScene:
         job["seed_low"], job["seed_high"] = seed & 0xFFFFFFFF, seed >> 32
         return job.reshape(1)
 
+    def conditions(self, flares: Flares) -> Conditions:
+        """Return the range of the frames' conditions."""
+        low, high = self._ends
+        mean = self.components.mean_dn
+        darkest = low[0] * mean[0] + low[1] * mean[1] + low[3] * mean[3]
+        brightest = high[0] * mean[0] + high[1] * mean[1] + high[3] * (mean[3] + flares.most @ mean[len(STEADY) :])
+        return Conditions(darkest.tobytes(), brightest.tobytes(), float(low[2]), float(high[2]))
+
     @property
     def _ends(self) -> tuple[Float, Float]:
         """Smallest and largest factors on star, sky, dark, and neighbours and flares."""
@@ -227,7 +236,7 @@ class StareScene:
                     value=float(spread[of].max()),
                 )
         x, mean = self.components.quiet, self.components.mean_dn
-        low, high = self._ends
+        _, high = self._ends
         lit = mean[3] + flares.most @ mean[len(STEADY) :]
         reach = high[0] * mean[0] + high[1] * mean[1] + high[2] * mean[2] + high[3] * lit
         if not (reach < REACH_DN).all():
@@ -238,30 +247,40 @@ class StareScene:
                 key="flare",
                 value=float(reach[pixel]),
             )
-        darkest = low[0] * mean[0] + low[1] * mean[1] + low[3] * mean[3]
-        brightest = high[0] * mean[0] + high[1] * mean[1] + high[3] * lit
-        if not _joint_between(x, darkest.tobytes(), brightest.tobytes(), float(low[2]), float(high[2])):
+        if not _joint_throughout(x, self.conditions(flares)):
             raise _not_joint_error(x.name)
 
 
-# Callers draw the pixels of a stare in many parts.
-@lru_cache(maxsize=4)
-def _joint_between(x: Expectation, darkest: bytes, brightest: bytes, least_dark: float, most_dark: float) -> bool:
-    """Return whether noise can be drawn jointly for all conditions in a range, in steps of at most a factor of 2.
+@dataclass(frozen=True)
+class Conditions:
+    """Range of the conditions of frames; hashable, so that what holds for all of them is computed once."""
 
-    The range is given by photons in DN of each pixel, float64, and by factors on the dark.
-    """
-    first, last = (np.maximum(np.frombuffer(light), 1e-30) for light in (darkest, brightest))
-    span = float(np.max(last / first, initial=1.0, where=last > 1e-9))
-    steps = 1 + int(np.ceil(np.log2(min(span, 2.0**20))))
-    one = Cumulants.of(x, 1)
-    for part in np.linspace(0.0, 1.0, steps + 1):
-        light = first ** (1 - part) * last**part
-        other = x.read_noise_dn**2 + (0.0 if x.photon_noise == "poisson" else x.gain_dn_per_electron * light)
-        changed = replace(one, gaussian=other, photons=light / x.gain_dn_per_electron)
-        for dark in np.geomspace(least_dark, most_dark, 2 + int(np.log2(most_dark / least_dark))):
-            if not joint_is_exact(replace(changed, dark_dn=dark * one.dark_dn)).all():
-                return False
+    darkest: bytes  # photons in DN of each pixel, float64
+    brightest: bytes
+    least_dark: float  # factor on the dark
+    most_dark: float
+
+    def __iter__(self) -> Iterator[tuple[Float, float]]:
+        """Yield photons in DN of each pixel and factors on the dark, in steps of at most a factor of 2."""
+        darkest, brightest = np.frombuffer(self.darkest), np.frombuffer(self.brightest)
+        span = float(np.max(brightest / np.maximum(darkest, 1e-30), initial=1.0, where=brightest > 1e-9))
+        steps = 1 + int(np.ceil(np.log2(min(span, 2.0**20))))
+        for part in np.linspace(0.0, 1.0, steps + 1):
+            light = np.maximum(darkest, 1e-30) ** (1 - part) * np.maximum(brightest, 1e-30) ** part
+            number = 2 + int(np.log2(self.most_dark / self.least_dark))
+            for dark in np.geomspace(self.least_dark, self.most_dark, number):
+                yield light, float(dark)
+
+
+# The pixels of a stare are drawn in many parts.
+@lru_cache(maxsize=4)
+def _joint_throughout(x: Expectation, conditions: Conditions) -> bool:
+    one, counts = Cumulants.of(x, 1), x.photon_noise == "poisson"
+    for light, dark in conditions:
+        photons = light / x.gain_dn_per_electron
+        other = x.read_noise_dn**2 + (0.0 if counts else x.gain_dn_per_electron * light)
+        if not joint_is_exact(replace(one, gaussian=other, photons=photons, dark_dn=dark * one.dark_dn)).all():
+            return False
     return True
 
 

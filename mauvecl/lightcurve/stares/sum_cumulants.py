@@ -99,7 +99,7 @@ def check_sums(scene: StareScene, flares: Flares) -> None:
         )
     x = scene.components.quiet
     used = (scene.components.weights != 0).any(axis=0)
-    for light, dark in scene.extremes(flares):
+    for light, dark in scene.conditions(flares):
         mean = x.bias_dn + light + dark * x.dark_dn
         variance = x.read_noise_dn**2 + x.gain_dn_per_electron * light + dark * x.dark_variance_dn2
         sd = np.sqrt(variance)
