@@ -52,7 +52,7 @@ INSTEAD = {
     "limit --star G2V --amplitude 0.24 --unknown": f"{_FEWER} --statistic matched --unknown 2",
     "inject --star G2V --magnitude 7.4 --sweep": f"{_CELLS} --as-list",
     "gaussian --star": f"{_FEWER} --sweep magnitude=6,8 --sweep exposure=5",
-    "detect --fap 1e-8 --tails sampled": "--no-pictures -n 10000 --star G2V -m 7.4 --statistic matched",
+    "detect --fap 1e-8 --tails sampled": "--no-pictures -n 10000 --star G2V -m 7.4 -a 0.02 --statistic matched",
     "realise --star G2V --magnitude 7.4 --amplitude 0.24 --exposure 5": "-n 10000",
     "measure --star M3V --magnitude 9 --amplitude 2 --snr-per-bin": "--no-pictures --fits 10 --duration 400",
 }
