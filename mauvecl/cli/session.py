@@ -66,15 +66,12 @@ class Session:
 
         Raises InputError if a file of the answer could not be written; the answer is printed before.
         """
-        from mauvecl.schema.errors import InputError
+        from mauvecl.schema.errors import reworded
 
         self._held.close()
         if kind is None and self._lost:
             others = f"; the same holds for {len(self._lost) - 1} more files of this answer" if self._lost[1:] else ""
-            first = self._lost[0]
-            error = InputError(f"{first}{others}", key=first.key, value=first.value)
-            error.expected = first.expected
-            raise error
+            raise reworded(self._lost[0], f"{self._lost[0]}{others}")
 
     @cached_property
     def folder(self) -> Path:

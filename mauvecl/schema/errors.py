@@ -43,9 +43,7 @@ class InputError(ValueError):
 
     def within(self, place: str) -> InputError:
         """Return the same error with a place before its sentence, such as the name of a file."""
-        found = InputError(f"{place}: {self}", key=self.key, value=self.value)
-        found.expected = self.expected
-        return found
+        return reworded(self, f"{place}: {self}")
 
     @classmethod
     def of(cls, key: str, value: Any, expected: str, *, unit: str = "", where: str = "") -> InputError:
@@ -66,3 +64,10 @@ class InputError(ValueError):
         """
         place, after = f"{where}: " if where else "", f" {unit}" if unit else ""
         return cls(f"{place}{key} = {shown(value)}{after}", expected, key=key.replace(" ", "_"), value=value)
+
+
+def reworded(error: InputError, sentence: str) -> InputError:
+    """Return the same error with another sentence."""
+    found = InputError(sentence, key=error.key, value=error.value)
+    found.expected = error.expected
+    return found

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.results.requests.hypotheses import check_shape, fall_between
-from mauvecl.schema.errors import InputError
+from mauvecl.schema.errors import InputError, reworded
 from mauvecl.schema.physical import DAY_S
+from mauvecl.statistics.bisection import smallest_integer
 from mauvecl.statistics.intervals import Interval
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.statistics.statistic import LinearStatistic
@@ -152,7 +153,9 @@ class LimitSearch:
             if self.theory(nearer) >= self.power:
                 if self.of == "exposure":
                     # Whole frames: the closed form is a staircase.
-                    return _bisect_frames(lambda v: self.theory(v) >= self.power, value, nearer, self.frame_s)
+                    few, many = (round(end / self.frame_s) for end in (value, nearer))
+                    reached = smallest_integer(lambda n: self.theory(n * self.frame_s) >= self.power, few, many)
+                    return reached * self.frame_s
                 low, high = sorted((value, nearer))
                 return float(brentq(lambda v: self.theory(v) - self.power, low, high, xtol=1e-6 * abs(high - low)))
             value = nearer
@@ -266,15 +269,6 @@ def _value(of: str, coordinate: float) -> float:
     return -coordinate if of == "magnitude" else float(10 ** (0.4 * coordinate))
 
 
-def _bisect_frames(seen: Callable[[float], bool], low: float, high: float, frame_s: float) -> float:
-    """Return the shortest exposure of whole frames that is seen, between one that is not and one that is."""
-    few, many = round(low / frame_s), round(high / frame_s)
-    while many - few > 1:
-        middle = (few + many) // 2
-        few, many = (few, middle) if seen(middle * frame_s) else (middle, many)
-    return many * frame_s
-
-
 def settle(question: LimitSearch, start: float) -> Interval:
     """Return the value at which the simulation reaches the power, with its interval, searched from a start near it.
 
@@ -285,9 +279,7 @@ def settle(question: LimitSearch, start: float) -> Interval:
     except InputError as error:
         outside = question.prior_clause(start)
         if outside:
-            longer = InputError(f"{error}{outside}", key=error.key, value=error.value)
-            longer.expected = error.expected
-            raise longer from error
+            raise reworded(error, f"{error}{outside}") from error
         raise
 
 
@@ -346,10 +338,7 @@ def _settle_frames(question: LimitSearch, start: float) -> Interval:
         step = 1
         while reaches(few):
             few, many, step = max(few - step, 0), few, 2 * step
-        while many - few > 1:
-            middle = (few + many) // 2
-            few, many = (few, middle) if reaches(middle) else (middle, many)
-        return many
+        return smallest_integer(reaches, few, many)
 
     value, low, high = (fewest(which) * frame_s for which in ("value", "high", "low"))
     return Interval(value, low, high)

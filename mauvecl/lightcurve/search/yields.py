@@ -14,6 +14,7 @@ from mauvecl.lightcurve.search.completeness import Completeness
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import NotNegative, Positive
+from mauvecl.statistics.bisection import smallest_integer
 
 Float = NDArray[np.float64]
 
@@ -57,22 +58,13 @@ class Yield:
         # Many quantiles are needed, since the Poisson distribution may be narrower than the scatter.
         nodes = stats.norm.ppf((np.arange(NODES) + 0.5) / NODES) if scatter_dex > 0 else np.zeros(1)
         means = expected * 10.0 ** (scatter_dex * nodes)
+        largest = float(means.max())
+        most = int(largest + 20 * np.sqrt(largest) + 20)
 
         def quantile(probability: float) -> int:
-            return smallest_integer(
-                lambda n: float(np.mean(stats.poisson.cdf(n, means))) >= probability, float(means.max())
-            )
+            return smallest_integer(lambda n: float(np.mean(stats.poisson.cdf(n, means))) >= probability, -1, most)
 
         return cls(expected, quantile(0.025), quantile(0.975), float(np.abs(np.expm1(-means)).mean()))
-
-
-def smallest_integer(reached: Callable[[int], bool], most: float) -> int:
-    """Return the smallest n >= 0 for which a monotone predicate holds."""
-    low, high = -1, int(most + 20 * np.sqrt(most) + 20)
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if reached(middle) else (middle, high)
-    return high
 
 
 def recovered_per_day(rates: Rates, completeness: Completeness) -> float:
