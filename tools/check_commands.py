@@ -29,7 +29,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.web.closed_forms import ClosedForms
 from mauvecl.web.downloads import taken_along
-from mauvecl.web.fields import FIELDS, Choice, Number
+from mauvecl.web.fields import FIELDS, UPLOADED_FILE, Choice, Number
 from mauvecl.web.question import Question
 from mauvecl.web.simulations import SIMULATIONS
 from mauvecl.web.state import State
@@ -58,7 +58,6 @@ TEXTS: dict[str, tuple[str, ...]] = {
     "exposure_s": ("7.5", "50", "333.3", "1800"),
     "seed": ("1", "7", "123456789"),
     "joint_fit": ("no",),
-    "flare_file": ("",),
 }
 
 
@@ -69,7 +68,8 @@ def random_link(generator: np.random.Generator) -> str:
         if name in TEXTS:
             entered[name] = str(generator.choice(TEXTS[name]))
         elif isinstance(field.read, Choice):
-            entered[name] = str(generator.choice(field.read.options))
+            # Links do not hold a visitor's files.
+            entered[name] = str(generator.choice([text for text in field.read.options if text != UPLOADED_FILE]))
         elif isinstance(field.read, Number) and field.slider is not None:
             value = generator.uniform(field.slider.low, field.slider.high)
             entered[name] = f"{value:.0f}" if field.read.whole else f"{value:.4g}"

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Self
+from typing import TYPE_CHECKING, Annotated, Self
 
 from pydantic import Field, model_validator
 
+from mauvecl.host.stars.band_names import ALIASES
 from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, Widget
 from mauvecl.schema.physical import Positive
 from mauvecl.schema.section import Section
 
+if TYPE_CHECKING:
+    from mauvecl.host.stars.source import Source
+
 #: Changes by default: the indices of the four lines, the Balmer jump, two bands and the colour.
 DEFAULT_CHANGES = ("Mg II", "Ca II", "H beta", "H alpha", "balmer jump", "200-320", "320-700", "colour")
+#: Name of the change that adds the light of `change.file`.
+SPECTRUM = "spectrum"
 Days = Annotated[Positive, Unit("d")]
 
 
@@ -39,8 +45,65 @@ class ChangeQuestion(Section):
         Path | None,
         Help("Spectrum that the change adds", "as an accretion excess or a companion"),
         Flag("--change-file"),
+        Widget(
+            label="Added spectrum",
+            hint="Light that a change adds to the star, such as an accretion excess or a companion: the change "
+            "“spectrum”.",
+            group="Change",
+            name="change_file",
+            place=1,
+            kind="file",
+        ),
     ] = None
-    band: Annotated[str, Help("Band in which the light of that spectrum is measured")] = "V"
+    band: Annotated[
+        str,
+        Help("Band in which the light of that spectrum is measured", choices=", ".join(ALIASES)),
+        Flag("--change-band"),
+        Widget(
+            label="Band of the added light",
+            hint="The smallest change is the light of the added spectrum in this band over that of the star.",
+            group="Added spectrum",
+            name="change_band",
+            choices=tuple(ALIASES),
+        ),
+    ] = "V"
+    wavelength_unit: Annotated[
+        str | None,
+        Help("Unit of the wavelengths of that spectrum"),
+        Flag("--change-wavelength-unit"),
+        Widget(
+            label="Added: unit of wavelengths",
+            hint="Such as Angstrom or Angstrom air. Nothing: what the file says.",
+            group="Added spectrum",
+            name="change_wavelength_unit",
+            suggestions=("nm", "Angstrom", "um", "nm air", "Angstrom air"),
+        ),
+    ] = None
+    flux_unit: Annotated[
+        str | None,
+        Help("Unit of the fluxes of that spectrum"),
+        Flag("--change-flux-unit"),
+        Widget(
+            label="Added: unit of fluxes",
+            hint="Such as W m-2 nm-1 or Jy. Nothing: what the file says.",
+            group="Added spectrum",
+            name="change_flux_unit",
+            suggestions=("erg s-1 cm-2 Angstrom-1", "W m-2 nm-1", "Jy"),
+        ),
+    ] = None
+    extend: Annotated[
+        str | None,
+        Help("Library spectrum that continues that spectrum beyond its end"),
+        Flag("--change-extend"),
+        Widget(
+            label="Added: continue with",
+            hint="Library spectrum that continues the added one beyond its end, such as M3V, scaled to match at the "
+            "join. Nothing: it must cover what the instrument sees.",
+            group="Added spectrum",
+            name="change_extend",
+            kind="library",
+        ),
+    ] = None
     visits: Annotated[
         int,
         Range(2, 10_000),
@@ -87,10 +150,26 @@ class ChangeQuestion(Section):
         50
     )
 
+    def light(self) -> Source | None:
+        """Read the spectrum that the change adds; None without a file."""
+        from mauvecl.host.stars.source import Source
+
+        if self.file is None:
+            return None
+        return Source.read(
+            self.file, wavelength_unit=self.wavelength_unit, flux_unit=self.flux_unit, extend=self.extend
+        )
+
     @model_validator(mode="after")
     def _possible(self) -> Self:
         if not self.shortest_d < self.longest_d:
             raise InputError.of("change.longest_d", self.longest_d, f"more than {self.shortest_d:g} d", unit="d")
-        if "spectrum" in self.of and self.file is None:
-            raise InputError("the change 'spectrum' has no file", "`change.file`", key="change.file")
+        if self.file is None:
+            if SPECTRUM in self.of:
+                raise InputError("the change 'spectrum' has no file", "`change.file`", key="change.file")
+            for key in ("wavelength_unit", "flux_unit", "extend"):
+                if value := getattr(self, key):
+                    raise InputError.of(f"change.{key}", value, "change.file as well")
+        elif SPECTRUM not in self.of:
+            raise InputError.of("change.file", str(self.file), "the change 'spectrum' in change.of as well")
         return self

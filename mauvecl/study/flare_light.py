@@ -102,6 +102,15 @@ class FlareLight(Section):
         Path | None,
         Help("Spectrum file of its star without the flare, which is subtracted"),
         Flag("--flare-quiescent"),
+        Widget(
+            label="Star without the flare",
+            hint="Spectrum of the same star without the flare, on the same scale and in the same units. It is "
+            "subtracted. Nothing: the file holds the flare alone.",
+            group="Own flare",
+            name="flare_quiescent",
+            place=1,
+            kind="file",
+        ),
     ] = None
     wavelength_unit: Annotated[
         str | None,
@@ -142,6 +151,12 @@ class FlareLight(Section):
         bool,
         Help("Take the flare for as bright at the telescope as its file states, in place of amplitudes"),
         Flag("--as-observed"),
+        Widget(
+            label="As bright as observed",
+            hint="Whether the flare has the flux of its file at the telescope, in place of the amplitude above.",
+            group="Own flare",
+            place=2,
+        ),
     ] = False
 
     @model_validator(mode="after")

@@ -15,7 +15,6 @@ from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, u
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.distributions import Gaussian, Mixture
 from mauvecl.statistics.registry import STATISTICS
-from mauvecl.study.cases import Case, Loader
 from mauvecl.study.messages import collect_messages
 from mauvecl.web.fields import UNKNOWN, star_words
 from mauvecl.web.interpolated_form import InterpolatedForm
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.host.stars.source import Source
     from mauvecl.statistics.statistic import DetectionForms
+    from mauvecl.study.cases import Case
     from mauvecl.study.study import Study
     from mauvecl.web.question import Question
 
@@ -56,10 +56,11 @@ class ClosedForms:
         given : mapping, optional
             What was read of the visitor's files.
         """
-        uploaded = question.uploaded
-        # An uploaded spectrum is not read from its file at every change.
-        scaled = None if uploaded is None else lambda star: star.applied(uploaded)
-        closed = cls(question, Case(question.study(folder), loader=Loader(scaled)), given or {})
+        case = question.case(folder)
+        if question.as_bright_as_observed:
+            values = {**question.values, "amplitude_percent": 100 * case.amplitudes[0]}
+            question = replace(question, values=values)
+        closed = cls(question, case, given or {})
         if headline:
             _ = closed.odds
         return closed

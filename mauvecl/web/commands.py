@@ -125,7 +125,7 @@ def _flag_words(name: str, value: Any, verb: Verb) -> list[str]:
         if flag.read is parsing.axis and "start" in value:
             spaced = [value["quantity"], *(_text(value[key]) for key in ("start", "stop", "steps"))]
             return [flag.names[0], ":".join(spaced + ["log"] * value.get("log", False))]
-        if flag.read in (None, parsing.words) and flag.kind in (None, str):
+        if flag.read in (None, parsing.words) and flag.kind in (None, str, list[str]):
             values = value if isinstance(value, list) else [value]
             if all(isinstance(one, str | int | float) for one in values):
                 return [word for one in values for word in (flag.names[0], _text(one))]

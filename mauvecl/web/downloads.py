@@ -44,9 +44,10 @@ def study_file(study: Study, name: str) -> tuple[str, bytes]:
 
 def visitor_files(study: Study) -> dict[tuple[str, ...], Path]:
     """Return the files of the visitor's that a study names, by the path of sections and key."""
-    star, data = study.star[0], study.data
+    star, light, data = study.star[0], study.flare.spectrum, study.data
     every = {("star", "file"): star.file, ("star", "neighbours"): star.neighbours,
-             ("flare", "spectrum", "file"): study.flare.spectrum.file, ("data", "file"): data.file,
+             ("flare", "spectrum", "file"): light.file, ("flare", "spectrum", "quiescent"): light.quiescent,
+             ("change", "file"): study.change.file, ("data", "file"): data.file,
              ("data", "mapping"): data.mapping}  # fmt: skip
     return {place: file for place, file in every.items() if file is not None}
 

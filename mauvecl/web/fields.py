@@ -22,9 +22,8 @@ from mauvecl.statistics.registry import STATISTICS
 from mauvecl.study.keys import study_keys
 from mauvecl.web.simulations import SIMULATIONS
 
-UPLOADED, UPLOADED_UNKNOWN, UPLOADED_FLARE = "uploaded star", "uploaded spectrum", "uploaded flare"
-#: Text of a field whose file is kept as it is.
-UPLOADED_FILE = "uploaded file"
+#: Texts of fields that hold a file: of those that also take a name or numbers, and of all others.
+UPLOADED, UPLOADED_UNKNOWN, UPLOADED_FILE = "uploaded star", "uploaded spectrum", "uploaded file"
 #: Realisations that a visitor may ask for, and with a tail by importance sampling.
 REALISATIONS, SAMPLED = (10_000, 100_000, 1_000_000, 4_000_000), (100_000, 1_000_000)
 
@@ -334,14 +333,12 @@ def _reader(field: FieldInfo, widget: Widget, unit: str, *, optional: bool) -> C
         return Choice(choices)
     if widget.kind == "day":
         return day
-    if widget.kind == "file":
-        return Choice(("", UPLOADED_FLARE), lambda text: text or None)
+    if widget.kind in ("file", "upload"):
+        return Choice(("", UPLOADED_FILE), lambda text: text or None)
     if widget.kind == "library":
         return lambda text: spectrum_name(text, own=False) if text.strip() else None
     if widget.kind == "table":
         return neighbours
-    if widget.kind == "upload":
-        return Choice(("", UPLOADED_FILE))
     if field.annotation is bool:
         return Choice(("no", "yes"), lambda text: text == "yes")
     flag = first(field, Flag)
@@ -439,12 +436,21 @@ ADVANCED = {
 }
 #: Fields of the card.
 SOLVED = _group("Limit")
-#: Fields that say how the file of another field is read.
-READ_WITH = {"star": _group("Own spectrum"), "flare_file": _group("Own flare")}
+#: Fields that apply only with the file of another field, below which they stand.
+WITH_FILE = {
+    "star": _group("Own spectrum"),
+    "flare_file": _group("Own flare"),
+    "change_file": _group("Added spectrum"),
+}
 #: Fields of forms of their own, which stand in the panels of the tabs that read them.
 FORMS = {"campaign": _group("Campaign"), "frames": _group("Frames"), "standards": _group("Standards")}
-#: Fields that ask for something under one sky only.
-ASKED_UNDER = {"sky_brightness": "brightness", "target": "target and time", "time": "target and time"}
+#: Fields that apply only with one text of another field.
+ASKED_UNDER = {
+    "sky_brightness": ("sky", "brightness"),
+    "target": ("sky", "target and time"),
+    "time": ("sky", "target and time"),
+    "amplitude_percent": ("as_observed", "no"),
+}
 #: Questions to begin with; the amplitudes of the first two are the paper's smallest, the others are examples (assumed).
 PRESETS: dict[str, dict[str, str]] = {
     "Edge of detection": {},

@@ -9,22 +9,32 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.schema.errors import InputError
+from mauvecl.study.cases import Case, Loader
+from mauvecl.study.changes import SPECTRUM
 from mauvecl.study.study import Study
-from mauvecl.web.fields import FIELDS, READ_WITH, Draws, Field
+from mauvecl.web.fields import FIELDS, WITH_FILE, Draws, Field
 from mauvecl.web.folders import content_folder
 
 if TYPE_CHECKING:
     from mauvecl.host.spectra.conversion import ReadSpectrum
     from mauvecl.host.stars.source import Source
 
-#: Fields whose values only apply together with those of others, and those that an upload was read with.
+#: Fields that set their keys together with the file of another field; files are written in nm, so that units do not.
+SET_WITH_FILE = {"flare_file": ("continue_at_k", "flare_quiescent", "as_observed"), "change_file": ("change_band",)}
+#: Fields whose values only apply together with those of others.
 CONDITIONAL = (
-    "sky_brightness", "target", "time", "second_area", "hours", "flare_file", "pointing_rate", "pointing_duration",
-    "pointing_depth", *itertools.chain(*READ_WITH.values()),
+    "sky_brightness", "target", "time", "second_area", "hours", "pointing_rate", "pointing_duration",
+    "pointing_depth", *itertools.chain(*WITH_FILE.values()),
 )  # fmt: skip
 Points = tuple[tuple[float, float], ...]
-#: Names of the files of an uploaded star and flare, and of a table of neighbours, in the folder of their study.
-STAR_FILE, FLARE_FILE, NEIGHBOURS_FILE = "star.ecsv", "flare.ecsv", "neighbours.csv"
+#: Names of uploaded spectra by field, and of a table of neighbours, in the folder of their study.
+SPECTRA = {
+    "star": "star.ecsv",
+    "flare_file": "flare.ecsv",
+    "flare_quiescent": "quiescent.ecsv",
+    "change_file": "added.ecsv",
+}
+NEIGHBOURS_FILE = "neighbours.csv"
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +55,22 @@ class Question:
             return self.values[name]
         raise AttributeError(name)
 
+    @property
+    def as_bright_as_observed(self) -> bool:
+        """Whether the flare has the brightness of the visitor's file, in place of the amplitude."""
+        return "flare_file" in self.uploads and bool(self.values["as_observed"])
+
     def study(self, folder: Path | None = None) -> Study:
-        """Return the question as a study.
+        """Return the question as a study; parameters and errors as for `case`."""
+        return self.case(folder).study
+
+    def case(self, folder: Path | None = None) -> Case:
+        """Return the question as a case; a flare that is as bright as observed has the amplitude of its brightness.
 
         Parameters
         ----------
         folder : Path, optional
-            Where an uploaded spectrum and a table of neighbours are written for the study to find.
+            Where uploaded spectra and a table of neighbours are written for the study to find.
 
         Raises
         ------
@@ -60,25 +79,24 @@ class Question:
         """
         if folder is None and (self.uploads.keys() - {"own_unknown"} or self.neighbours is not None):
             raise InputError("no folder for the visitor's files", "a folder", key="folder")
-        return Study.build(self._data(folder), "page")
+        uploaded = self.uploaded
+        # An uploaded spectrum is not read from its file at every change.
+        loader = Loader(None if uploaded is None else lambda star: star.applied(uploaded))
+        case = Case(Study.build(self._data(folder), "page"), loader=loader)
+        return case.at_observed_brightness() if self.as_bright_as_observed else case
 
     def _data(self, folder: Path | None) -> dict[str, Any]:
         """Return the question as the data of a study, whose files are written to a folder."""
         values = self.values
         data: dict[str, Any] = {}
         for name, one in FIELDS.items():
-            if not one.path or name in CONDITIONAL or values[name] is None:
-                continue
-            if one.kind != "upload":
-                self._set(data, one, values[name])
-            elif folder is not None and name in self.uploads:
-                written = self.uploads[name].written(folder)
-                self._set(data, one, str(written) if isinstance(written, Path) else written)
+            if one.path and name not in CONDITIONAL:
+                self._set_valid(data, name, folder)
         star = data["star"]
         if folder is not None and self.neighbours is not None:
             star["neighbours"] = str(write_table(self.neighbours, folder))
         if folder is not None and self.uploaded is not None:
-            star["file"] = str(write_spectrum(self.uploaded, folder, STAR_FILE))
+            star["file"] = str(write_spectrum(self.uploaded, folder, SPECTRA["star"]))
         else:
             star["library"] = values["star"]
         data["star"] = [star]
@@ -94,11 +112,11 @@ class Question:
                 self._set(data, FIELDS[name], values[name])
         if values["lines"]:
             data["flare"].setdefault("spectrum", {})["lines"] = dict(values["lines"])
-        if folder is not None and "flare_file" in self.uploads:
-            file = write_spectrum(self.uploads["flare_file"], folder, FLARE_FILE)
-            self._set(data, FIELDS["flare_file"], str(file))
-            if values["continue_at_k"] is not None:
-                self._set(data, FIELDS["continue_at_k"], values["continue_at_k"])
+        for name in SET_WITH_FILE.keys() & self.uploads.keys():
+            for other in SET_WITH_FILE[name]:
+                self._set_valid(data, other, folder)
+        if "change_file" in self.uploads and SPECTRUM not in values["changes"]:
+            self._set(data, FIELDS["changes"], (*values["changes"], SPECTRUM))
         points = self.uploads.get("own_unknown", values["own_unknown"])
         own = {"own": {"points": points}} if points else {}
         data["nuisances"] = {"usual": values["unknown"] == "the usual", "own": own}
@@ -111,6 +129,18 @@ class Question:
         if values["targets"]:
             data["plan"] = {"targets": list(values["targets"]), "hours": values["hours"]}
         return data
+
+    def _set_valid(self, data: dict[str, Any], name: str, folder: Path | None) -> None:
+        """Set the key of a field in the data of a study, in place, unless it is empty; its file goes to a folder."""
+        one, value = FIELDS[name], self.values[name]
+        if one.kind in ("file", "upload"):
+            if folder is None or name not in self.uploads:
+                return
+            upload = self.uploads[name]
+            written = write_spectrum(upload, folder, SPECTRA[name]) if one.kind == "file" else upload.written(folder)
+            value = str(written) if isinstance(written, Path) else written
+        if value is not None:
+            self._set(data, one, value)
 
     @staticmethod
     def _set(data: dict[str, Any], one: Field, value: Any) -> None:

@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from mauvecl.host.spectra.conversion import ReadSpectrum
 from mauvecl.host.stars.flare_spectra import ObservedFlare
 from mauvecl.host.stars.source import Source
 from mauvecl.observations.frames import Frames
@@ -37,15 +38,20 @@ _REFUSED, _NO_ROOM = 2, 3
 READERS = {
     "spectrum": ("mauvecl.host.stars.source", "Source.read"),
     "flare": ("mauvecl.host.stars.flare_spectra", "ObservedFlare.read"),
+    "plain": ("mauvecl.host.spectra.formats", "read_spectrum"),
     "frames": ("mauvecl.observations.reading", "read_frames"),
 }
 #: Expected content of an upload, by the function that reads it.
 EXPECTED = {
-    "spectrum": ("a spectrum of some thousand points", "a spectrum as text, ECSV, VOTable or FITS"),
-    "flare": ("a spectrum of some thousand points", "a spectrum as text, ECSV, VOTable or FITS"),
+    **dict.fromkeys(
+        ("spectrum", "flare", "plain"),
+        ("a spectrum of some thousand points", "a spectrum as text, ECSV, VOTable or FITS"),
+    ),
     "frames": ("fewer frames", "frames as FITS, ECSV or CSV"),
 }
-Spectrum = TypeVar("Spectrum", Source, ObservedFlare)
+Spectrum = TypeVar("Spectrum", Source, ObservedFlare, ReadSpectrum)
+#: Reader of each kind of spectrum.
+KINDS: Mapping[type, str] = {Source: "spectrum", ObservedFlare: "flare", ReadSpectrum: "plain"}
 _turns = threading.BoundedSemaphore(TOGETHER)
 
 
@@ -60,11 +66,11 @@ def read_limited(content: bytes, kind: type[Spectrum], options: Mapping[str, Any
     content : bytes
         What it is shows in itself: a name says nothing.
     kind : type
-        `Source` or `ObservedFlare`.
+        `Source`, `ObservedFlare` or `ReadSpectrum`.
     options : mapping, optional
         Further arguments of its `read`.
     """
-    return kind(**_read("spectrum" if kind is Source else "flare", {"upload": content}, options or {}))
+    return kind(**_read(KINDS[kind], {"upload": content}, options or {}))
 
 
 def read_frames_limited(files: Mapping[str, bytes], mapping: str | None = None) -> Frames:

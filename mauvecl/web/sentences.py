@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from functools import cache
+from types import MappingProxyType
 
 from mauvecl.schema.errors import InputError
 from mauvecl.study.keys import keys_with_flags
 from mauvecl.web.fields import FIELDS
 
+NO_KEYS: Mapping[str, str] = MappingProxyType({})
 #: A remedy in a message, such as `magnitude=7.4`.
 _REMEDY = re.compile(r"`(?P<key>[a-z][\w.]*)(?:=(?P<quote>'?)(?P<value>[^`]*?)(?P=quote))?`")
 #: A value at the beginning of a message, such as fap = 0.001.
@@ -40,32 +43,35 @@ def field_of(key: str | None) -> str | None:
     return _fields().get(key or "")
 
 
-def sentence(error: InputError) -> str:
-    """Return the message of an error as the page says it."""
-    text = _VALUE.sub(lambda found: f"{_label(found['key'])} {'is empty' if found['empty'] else '= '}", str(error))
-    return note(text.removeprefix("page: "))
+def sentence(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> str:
+    """Return the message of an error as the page says it; `keys` has other names of its keys."""
+    text = _VALUE.sub(
+        lambda found: f"{_label(found['key'], keys)} {'is empty' if found['empty'] else '= '}", str(error)
+    )
+    return note(text.removeprefix("page: "), keys)
 
 
-def note(text: str) -> str:
+def note(text: str, keys: Mapping[str, str] = NO_KEYS) -> str:
     """Return a message with the labels of fields in place of keys and flags."""
     text = _FLAG.sub(lambda found: f"“{FIELDS[_flags()[found[0]]].label}”" if found[0] in _flags() else found[0], text)
-    text = _REMEDY.sub(_remedy, text)
-    return _KEY.sub(lambda found: _label(found[0]), text)
+    text = _REMEDY.sub(lambda found: _remedy(found, keys), text)
+    return _KEY.sub(lambda found: _label(found[0], keys), text)
 
 
-def _remedy(found: re.Match[str]) -> str:
-    label = _label(found["key"])
+def _remedy(found: re.Match[str], keys: Mapping[str, str]) -> str:
+    label = _label(found["key"], keys)
     if label == found["key"]:
         return label
     return f"{label} {found['value']}" if found["value"] else f"“{label}”"
 
 
-def remedies(error: InputError) -> list[tuple[str, str]]:
+def remedies(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> list[tuple[str, str]]:
     """Return the values that a message proposes for fields, as pairs of field and text."""
-    named = ((field_of(found["key"]), found["value"]) for found in _REMEDY.finditer(str(error)))
+    each = _REMEDY.finditer(str(error))
+    named = ((field_of(keys.get(found["key"], found["key"])), found["value"]) for found in each)
     return [(name, value) for name, value in named if name is not None and value]
 
 
-def _label(key: str) -> str:
-    name = field_of(key)
+def _label(key: str, keys: Mapping[str, str]) -> str:
+    name = field_of(keys.get(key, key))
     return key if name is None else FIELDS[name].label

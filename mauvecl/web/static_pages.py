@@ -95,6 +95,7 @@ def front() -> bytes:
             name: {"entered": one.entered, "options": list(one.options), "most": one.most}
             for name, one in UPLOADS.items()
         },
+        "withFile": fields.WITH_FILE,
         "columns": sorted({*KNOWN}),
         "needs": {name: one.needs for name, one in SIMULATIONS.items() if one.needs},
         "under": fields.ASKED_UNDER,

@@ -6,6 +6,8 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
+from inspect import Parameter, signature
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ from mauvecl.host.stars.source import Source
 from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
-from mauvecl.web.fields import FIELDS, READ_WITH, UPLOADED, UPLOADED_FILE, UPLOADED_FLARE, UPLOADED_UNKNOWN
+from mauvecl.web.fields import FIELDS, UPLOADED, UPLOADED_FILE, UPLOADED_UNKNOWN
 from mauvecl.web.folders import content_folder
 from mauvecl.web.question import Points
 from mauvecl.web.sandboxed_reader import Spectrum, read_frames_limited, read_limited
@@ -35,7 +37,14 @@ MOST_VALUES = 2**24
 MOST_PAIRS_BYTES, MOST_PAIRS = 2**18, 4000
 
 
-def read_upload(name: str, content: bytes, **options: str | None) -> Source:
+def read_upload(
+    name: str,
+    content: bytes,
+    *,
+    wavelength_unit: str | None = None,
+    flux_unit: str | None = None,
+    extend: str | None = None,
+) -> Source:
     """Read an untrusted spectrum from a visitor.
 
     Parameters
@@ -44,8 +53,8 @@ def read_upload(name: str, content: bytes, **options: str | None) -> Source:
         Name on the visitor's computer; the format follows from the content.
     content : bytes
         Packed or not.
-    **options : str, optional
-        Those of `Source.read`.
+    wavelength_unit, flux_unit, extend : str, optional
+        As for `Source.read`.
 
     Raises
     ------
@@ -53,20 +62,51 @@ def read_upload(name: str, content: bytes, **options: str | None) -> Source:
         If it is too large or holds no usable spectrum. Called on a thread of its own; any other
         exception is reported to the visitor too.
     """
+    options = {"wavelength_unit": wavelength_unit, "flux_unit": flux_unit, "extend": extend}
     return replace(_spectrum(content, Source, options), name=UPLOADED, origin="upload")
 
 
-def read_flare(name: str, content: bytes, **options: Any) -> ReadSpectrum:
-    """Read an untrusted spectrum of a flare, like `read_upload`, with the options of `ObservedFlare.read`.
+def read_added(
+    name: str,
+    content: bytes,
+    *,
+    change_wavelength_unit: str | None = None,
+    change_flux_unit: str | None = None,
+    change_extend: str | None = None,
+) -> Source:
+    """Read an untrusted spectrum of light that a change adds, like `read_upload`."""
+    source = read_upload(
+        name, content, wavelength_unit=change_wavelength_unit, flux_unit=change_flux_unit, extend=change_extend
+    )
+    return replace(source, name="added spectrum")
 
-    It holds what was measured: the study that reads it continues it.
+
+def read_flare(
+    name: str,
+    content: bytes,
+    *,
+    flare_wavelength_unit: str | None = None,
+    flare_flux_unit: str | None = None,
+    continue_at_k: float | None = None,
+) -> ReadSpectrum:
+    """Read an untrusted spectrum of a flare, like `read_upload`.
+
+    The result holds what was measured: the study that reads it continues it.
     """
-    of_read = {key.removeprefix("flare_"): value for key, value in options.items()}
-    flare = _spectrum(content, ObservedFlare, of_read)
+    options = {"wavelength_unit": flare_wavelength_unit, "flux_unit": flare_flux_unit, "continue_at_k": continue_at_k}
+    flare = _spectrum(content, ObservedFlare, options)
     low, high = flare.measured_nm
     inside = (flare.wavelength_nm >= low) & (flare.wavelength_nm <= high)
     own = tuple(text for text in flare.messages if text.startswith(f"{flare.name}: "))
-    return ReadSpectrum(flare.wavelength_nm[inside], flare.flux_flam[inside], UPLOADED_FLARE, "upload", messages=own)
+    return ReadSpectrum(flare.wavelength_nm[inside], flare.flux_flam[inside], "uploaded flare", "upload", messages=own)
+
+
+def read_quiescent(
+    name: str, content: bytes, *, flare_wavelength_unit: str | None = None, flare_flux_unit: str | None = None
+) -> ReadSpectrum:
+    """Read an untrusted spectrum of a star without its flare, which may cover any range."""
+    options = {"wavelength_unit": flare_wavelength_unit, "flux_unit": flare_flux_unit}
+    return replace(_spectrum(content, ReadSpectrum, options), name="uploaded star without the flare", origin="upload")
 
 
 def _spectrum(content: bytes, kind: type[Spectrum], options: Mapping[str, Any]) -> Spectrum:
@@ -149,29 +189,40 @@ class Upload:
         Reads a file from its name and content, and from the values of `options` by name.
     entered : str
         Text of the field that stands for the file.
-    options : tuple of str
-        Fields that say how the file is read.
     most : int
         Largest number of bytes.
     """
 
     read: Callable[..., Any]
-    entered: str
-    options: tuple[str, ...] = ()
+    entered: str = UPLOADED_FILE
     most: int = MOST_UPLOADED
+
+    @cached_property
+    def options(self) -> tuple[str, ...]:
+        """Fields that say how the file is read: the keyword-only parameters of the function that reads it."""
+        parameters = signature(self.read).parameters.values()
+        return tuple(one.name for one in parameters if one.kind is Parameter.KEYWORD_ONLY)
+
+    @cached_property
+    def keys(self) -> dict[str, str]:
+        """Names of `options` by the names that the messages of readers have for them."""
+        return {
+            key: name
+            for name in self.options
+            for key in ("wavelength_unit", "flux_unit", "extend")
+            if name.endswith(key)
+        }
 
 
 #: Files by the field that takes them.
 UPLOADS: Mapping[str, Upload] = {
-    "star": Upload(read_upload, UPLOADED, READ_WITH["star"]),
-    "flare_file": Upload(read_flare, UPLOADED_FLARE, READ_WITH["flare_file"]),
+    "star": Upload(read_upload, UPLOADED),
+    "flare_file": Upload(read_flare),
+    "flare_quiescent": Upload(read_quiescent),
+    "change_file": Upload(read_added),
     "own_unknown": Upload(read_pairs, UPLOADED_UNKNOWN, most=MOST_PAIRS_BYTES),
-    **{
-        name: Upload(VisitorFile.of, UPLOADED_FILE, most=MOST_KEPT_BYTES)
-        for name, field in FIELDS.items()
-        if field.kind == "upload"
-    },
-    "observations": Upload(Observations.of, UPLOADED_FILE, most=MOST_KEPT_BYTES),
+    **{name: Upload(VisitorFile.of, most=MOST_KEPT_BYTES) for name, field in FIELDS.items() if field.kind == "upload"},
+    "observations": Upload(Observations.of, most=MOST_KEPT_BYTES),
 }
 
 

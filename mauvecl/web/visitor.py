@@ -350,9 +350,8 @@ class Visitor(WebSocketHandler):
             try:
                 self._uploads[field] = future.result()
             except InputError as error:
-                # Keys of the flare's files are those of the star's.
-                proposed = [(one if one in upload.options else f"flare_{one}", text) for one, text in remedies(error)]
-                self.send(n=n, field=field, lacks=sentence(error), remedies=proposed)
+                proposed = [one for one in remedies(error, upload.keys) if one[0] in upload.options]
+                self.send(n=n, field=field, lacks=sentence(error, upload.keys), remedies=proposed)
             except Exception as error:
                 log.exception("an upload failed")
                 self.send(

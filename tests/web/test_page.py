@@ -497,6 +497,35 @@ def test_units_are_chosen_where_they_are_advised_and_files_outlive_a_reload(brow
         other.close()
 
 
+def test_added_spectrum_is_a_change(page: Page) -> None:
+    """A companion's spectrum in Angstrom: advised units stand below its file, and it is removed with them."""
+    tab(page, "Change")
+    enter(page, "Changes", "Mg II")
+    text = "\n".join(f"{angstrom} 1e-12" for angstrom in range(1700, 10001, 10))
+    file = {"name": "companion.txt", "mimeType": "text/plain", "buffer": text.encode()}
+    page.locator("[data-upload=change_file]").set_input_files(file)
+    page.locator("#w-change_file", has_text="Added: unit of wavelengths Angstrom").wait_for()
+    page.get_by_role("button", name="Added: unit of wavelengths: Angstrom", exact=True).click()
+    until(page, lambda: "change_file=uploaded" in page.url)
+    assert page.get_by_label("Added: unit of wavelengths", exact=True).input_value() == "Angstrom"
+    assert page.locator("[data-uploaded=change_file]").inner_text() == "companion.txt"
+    enter(page, "Band of the added light", "B")
+    simulate(page, "Change")
+    page.locator("#panel-change .rows", has_text="spectrum").wait_for()
+    page.get_by_role("button", name="Share, export, cite", exact=True).click()
+    page.get_by_text("--change-file added.ecsv --change-band B").wait_for()
+    page.keyboard.press("Escape")
+    page.locator("[data-remove=change_file]").click()
+    until(
+        page,
+        lambda: (
+            "change_file" not in page.url and not page.get_by_label("Band of the added light", exact=True).is_visible()
+        ),
+    )
+    assert "change_band=B" not in page.url
+    settled(page)
+
+
 def test_dropped_file_is_named_and_not_in_the_link(page: Page) -> None:
     text = "\n".join(f"{nm} 1e-12" for nm in range(170, 1001))
     page.evaluate(

@@ -19,9 +19,11 @@ pytest.importorskip("bokeh")
 
 from typer.testing import CliRunner
 
+from mauvecl.answers.observations.change import change
 from mauvecl.answers.verbs import VERBS
 from mauvecl.cli import session
 from mauvecl.cli.app import app
+from mauvecl.runs.pool import LocalWorkers, Pool
 from mauvecl.schema.errors import InputError
 from mauvecl.study.cases import cases
 from mauvecl.study.study import Study
@@ -29,11 +31,11 @@ from mauvecl.web.closed_forms import ClosedForms
 from mauvecl.web.commands import differing, keys_used
 from mauvecl.web.downloads import study_file, taken_along
 from mauvecl.web.fields import UPLOADED
-from mauvecl.web.simulations import asked
+from mauvecl.web.simulations import SIMULATIONS, asked
 from mauvecl.web.state import State
 from mauvecl.web.static_pages import BIBTEX
 from mauvecl.web.tabs import TABS
-from mauvecl.web.upload import read_flare, read_upload
+from mauvecl.web.upload import read_added, read_flare, read_quiescent, read_upload
 
 ROOT = Path(__file__).parents[2]
 #: Links with fields that the random ones do not reach.
@@ -140,7 +142,7 @@ def test_own_flare_answers_as_its_file(tmp_path: Path, monkeypatch: pytest.Monke
     (tmp_path / "own.txt").write_text(text)
     options = {"flare_wavelength_unit": "Angstrom", "flare_flux_unit": None, "continue_at_k": 9000.0}
     state = State({"flare_file": read_flare("own.txt", text.encode(), **options)})
-    state.follow("?flare_file=uploaded+flare&flare_wavelength_unit=Angstrom&continue_at_k=9000")
+    state.follow("?flare_file=uploaded+file&flare_wavelength_unit=Angstrom&continue_at_k=9000")
     question = state.question()
     page = ClosedForms.of(question, kept)
     taken = {one["question"]: one for one in taken_along(TABS["detection"], question, kept)}
@@ -156,6 +158,84 @@ def test_own_flare_answers_as_its_file(tmp_path: Path, monkeypatch: pytest.Monke
     # The flare is another one than without the file.
     other = ClosedForms.of(State().question(), kept)
     assert abs(page.chance - other.chance) > 0.01
+
+
+@pytest.mark.parametrize("tab", ["detection", "measure"])
+def test_observed_flare_without_its_star_answers_as_its_files(
+    tab: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As bright as observed, in Angstrom: as the command line subtracts the star, and as the study of the page."""
+    monkeypatch.chdir(tmp_path)
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    ranges = {"flare_file": np.linspace(300.0, 690.0, 800), "flare_quiescent": np.linspace(290.0, 680.0, 500)}
+    texts = {}
+    for field, nm in ranges.items():
+        flux = 1e-12 * np.ones(nm.size)
+        if field == "flare_file":
+            flux += 1e-13 * (350 / nm) ** 2
+        texts[field] = "\n".join(f"{10 * x:.4f} {y:.9e}" for x, y in zip(nm, flux, strict=True))
+        (tmp_path / f"{field}.txt").write_text(texts[field])
+    units = {"flare_wavelength_unit": "Angstrom", "flare_flux_unit": "erg s-1 cm-2 Angstrom-1"}
+    state = State({
+        "flare_file": read_flare("a.txt", texts["flare_file"].encode(), continue_at_k=9000.0, **units),
+        "flare_quiescent": read_quiescent("b.txt", texts["flare_quiescent"].encode(), **units),
+    })  # fmt: skip
+    link = "&".join(f"{name}={text}" for name, text in units.items()).replace(" ", "+")
+    both = f"?{link}&continue_at_k=9000&flare_file=uploaded+file&flare_quiescent=uploaded+file"
+    state.follow(f"{both}&as_observed=yes&amplitude_percent=77")
+    question = state.question(TABS[tab].reads)
+    page = ClosedForms.of(question, kept)
+    assert page.question.amplitude_percent == pytest.approx(100 * page.study.flare.amplitudes[0])
+    (taken,) = taken_along(TABS[tab], question, kept)
+    verb = {"detection": "detect"}.get(tab, tab)
+    assert taken["command"] == f"mauvecl {verb} study.toml"
+    _, content = study_file(page.study, "study")
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        archive.extractall(tmp_path)
+    direct = f"mauvecl {verb} --star G2V --magnitude 8.5 --temperature 21 --flare-file flare_file.txt --as-observed "
+    direct += "--flare-quiescent flare_quiescent.txt --continue-at 9000 --flare-wavelength-unit Angstrom "
+    direct += "--flare-flux-unit 'erg s-1 cm-2 Angstrom-1'"
+    for command in (taken["command"], direct):
+        (case,) = cases(_study_of(command, monkeypatch))
+        assert case.amplitudes == pytest.approx(page.study.flare.amplitudes, rel=1e-9)
+        np.testing.assert_allclose(case.flares[0].source_electrons, page.flare.source_electrons, rtol=1e-9)
+    # Without the subtraction the flare is another one, and so it is with an amplitude.
+    for other in (f"{both}&as_observed=no".replace("&flare_quiescent=uploaded+file", ""), f"{both}&as_observed=no"):
+        state.follow(other)
+        found = ClosedForms.of(state.question(TABS[tab].reads), kept)
+        assert np.abs(found.flare.source_electrons / page.flare.source_electrons - 1).max() > 0.01
+
+
+def test_own_added_spectrum_answers_as_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In Angstrom, for a band: as the command line reads it itself, and as the command that the page prints."""
+    monkeypatch.chdir(tmp_path)
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    nm = np.linspace(170.0, 1000.0, 800)
+    text = "\n".join(f"{10 * x:.4f} {np.exp(-(((x - 300) / 80) ** 2)):.9e}" for x in nm)
+    (tmp_path / "own.txt").write_text(text)
+    state = State({"change_file": read_added("own.txt", text.encode(), change_wavelength_unit="Angstrom")})
+    state.follow("?change_file=uploaded+file&change_wavelength_unit=Angstrom&change_band=B&changes=Mg+II&magnitude=7")
+    tab = TABS["change"]
+    question = state.question(tab.reads)
+    page = SIMULATIONS["change"](question.study(kept), Pool(LocalWorkers([None])))["change"].table
+    assert page["change"].tolist() == ["Mg II", "spectrum"]
+    (taken,) = taken_along(tab, question, kept)
+    assert "--change-file added.ecsv --change-band B" in taken["command"]
+    _, content = study_file(asked("change", question.study(kept))[1], "study")
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        archive.extractall(tmp_path)
+    direct = "mauvecl change --star G2V --magnitude 7 --temperature 21 --sky 22.1 --visits 20 --change 'Mg II'"
+    direct += " --change spectrum --change-file own.txt --change-wavelength-unit Angstrom --change-band B"
+    for command in (taken["command"], "mauvecl change study.toml", direct):
+        table = change(_study_of(command, monkeypatch)).table
+        for name in ("error", "smallest"):
+            np.testing.assert_allclose(np.asarray(table[name]), np.asarray(page[name]), rtol=1e-9, err_msg=command)
+    # Another band is another answer: that of the light in V.
+    state.enter({"change_band": "V"})
+    other = change(state.question(tab.reads).study(kept)).table
+    assert abs(other["smallest"][1] / page["smallest"][1] - 1) > 0.01
 
 
 @pytest.mark.long

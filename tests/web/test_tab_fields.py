@@ -10,21 +10,24 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 pytest.importorskip("tornado")
 pytest.importorskip("bokeh")
 
 from mauvecl.answers.verbs import VERBS
+from mauvecl.host.spectra.conversion import ReadSpectrum
+from mauvecl.host.stars.source import Source
 from mauvecl.web.card import card
 from mauvecl.web.closed_forms import ClosedForms
-from mauvecl.web.fields import FIELDS, READ_WITH, UPLOADED_FILE
+from mauvecl.web.fields import FIELDS, UPLOADED_FILE, WITH_FILE
 from mauvecl.web.simulations import SIMULATIONS, asked, verbs_of
 from mauvecl.web.standards import Observations
 from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS, reads_of
 from mauvecl.web.tabs.tab import Tab
-from mauvecl.web.upload import VisitorFile
+from mauvecl.web.upload import UPLOADS, VisitorFile
 from mauvecl.web.visitor import shown
 
 pytestmark = pytest.mark.long
@@ -41,7 +44,19 @@ def archive() -> Observations:
     return Observations.of("standards.zip", out.getvalue())
 
 
-FILES = {"frames": VisitorFile("a.csv", b"1"), "mapping": VisitorFile("a.toml", b"2"), "observations": archive()}
+ADDED = Source.from_library("A0V")
+FLARE, QUIET = (
+    ReadSpectrum(ADDED.wavelength_nm, share * ADDED.flux_flam, name, "upload")
+    for name, share in (("flare", 1e-4), ("quiescent", 5e-5 * np.linspace(0.1, 1, ADDED.wavelength_nm.size)))
+)
+FILES = {
+    "change_file": ADDED,
+    "flare_file": FLARE,
+    "flare_quiescent": QUIET,
+    "frames": VisitorFile("a.csv", b"1"),
+    "mapping": VisitorFile("a.toml", b"2"),
+    "observations": archive(),
+}
 Given = tuple[tuple[str, str], ...]
 
 #: A table of neighbours, and the same with positions from which separations are measured.
@@ -58,14 +73,18 @@ OTHER = {
     "shortest_d": "2", "longest_d": "20", "distance_pc": "7", "false_alarms": "2",
     "per": "day", "neighbours": NEAR, "neighbours_of": "0 0", "neighbour_share": "0.5", "pointing_rate": "2",
     "pointing_duration": "100", "pointing_depth": "10", "frames": UPLOADED_FILE, "mapping": UPLOADED_FILE,
+    "change_file": UPLOADED_FILE, "change_band": "B", "flare_file": UPLOADED_FILE, "flare_quiescent": UPLOADED_FILE,
+    "as_observed": "yes",
     "observations": UPLOADED_FILE, "knots": "50", "light_error": "1", "spectrum_error": "2",
 }  # fmt: skip
-#: A file, and fields that say how an upload is read, which change nothing without one.
-READS = set().union(*READ_WITH.values()) | {"flare_file"}
+#: Fields that say how an upload is read, which change nothing without one.
+READS = {name for one in UPLOADS.values() for name in one.options}
 #: What must be entered first for a field to apply.
 SKY = {"sky": "target and time", "target": "eps Eri", "time": "2027-01-15"}
 BEFORE = {"target": SKY, "time": SKY, "second_area": {"second_temperature_k": "20000"},
           "neighbours_of": {"neighbours": PLACES, "neighbours_of": "0 0.001"}, "neighbour_share": {"neighbours": NEAR},
+          "change_band": {"change_file": UPLOADED_FILE},
+          **{name: {"flare_file": UPLOADED_FILE} for name in ("flare_quiescent", "as_observed")},
           "pointing_duration": {"pointing_rate": "1"}, "pointing_depth": {"pointing_rate": "1"},
           **{name: {"targets": "eps Eri"} for name in ("start", "days", "hours")}}  # fmt: skip
 #: Fields of the headline that the tabs of pictures show with it.
@@ -158,7 +177,8 @@ def test_fields_are_shown_where_they_matter() -> None:
     assert {"exposure_s", "fap", "statistic"}.isdisjoint(TABS["completeness"].reads)
     assert TABS["visibility"].reads == {"targets", "start", "days"}
     spectrum = {"flare_temperature_k", "balmer_jump", "lines", "second_temperature_k", "second_area", "flare_file"}
-    spectrum |= set(READ_WITH["flare_file"])
+    spectrum |= set(WITH_FILE["flare_file"])
+    spectrum -= {"as_observed"}
     assert TABS["plan"].reads == {"targets", "start", "days", "hours", "instrument", "temperature_c", "per"} | spectrum
     assert "visits" in TABS["change"].reads
     assert "visits" not in HEADLINE

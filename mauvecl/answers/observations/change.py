@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from mauvecl.answers.answer import Answer, InCell
 from mauvecl.answers.progress import reported
 from mauvecl.host.orbit.visibility import Visibility
-from mauvecl.host.stars.source import Source
 from mauvecl.observations.changes.indices import INDICES, Change, IndexValue, covered_indices, flux_per_dn
 from mauvecl.observations.changes.periods import Recovery, recover_periods, visit_times_d
 from mauvecl.observations.changes.smallest import Smallest, error_of_change, error_of_index, smallest_change
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
 
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
+    from mauvecl.host.stars.source import Source
     from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use
     from mauvecl.study.study import Study
@@ -276,7 +276,7 @@ def change(
     ['200-320']
     """
     asked = study.change
-    file = None if asked.file is None else Source.read(asked.file)
+    file = asked.light()
     prepared = cases(study)
     times = _visits(study) if asked.periods else None
     rows, indices, along, periods = [], [], list[ChangeRow](), []

@@ -45,6 +45,8 @@ export class Fields {
         const [one] = event.dataTransfer.files
         if (!one) return
         event.preventDefault()
+        // A field may stand within that of another file.
+        event.stopPropagation()
         chosen(button.dataset.choose, one)
       })
       file.addEventListener("change", () => {
@@ -157,7 +159,7 @@ export class Fields {
     if (this.entered.realisations !== this.raised) this.wish = this.entered.realisations
   }
 
-  /** Elements that accompany a field: its slider, and fields that apply to one choice of sky only.
+  /** Elements that accompany a field: its slider, and fields that apply only with one text of it.
    * @param {string} name */
   aside(name) {
     const [slider] = every(`[data-slider="${name}"]`)
@@ -171,7 +173,7 @@ export class Fields {
       const spoken = name === "magnitude" ? `${this.entered.band} = ${this.entered[name]}` : `${this.entered[name]} ${unit?.textContent ?? ""}`
       slider.setAttribute("aria-valuetext", spoken.trim())
     }
-    if (name === "sky") this.hide()
+    if (Object.values(this.words.under).some(([other]) => other === name)) this.hide()
   }
 
   /** Show the fields on which a tab depends.
@@ -181,14 +183,14 @@ export class Fields {
     this.hide()
   }
 
-  // Hide fields on which the tab does not depend, those that apply to another choice of sky, and those of absent files.
+  // Hide fields on which the tab does not depend, those that apply with another choice, and those of absent files.
   hide() {
-    const options = Object.entries(this.words.uploads).flatMap(([field, one]) => this.filed.has(field) ? [] : one.options)
-    const fileless = new Set(options)
+    const fileless = new Set(Object.entries(this.words.withFile).flatMap(([field, names]) => this.filed.has(field) ? [] : names))
     for (const name of Object.keys(this.words.fields)) {
-      const sky = this.words.under[name]
+      const [other, text] = this.words.under[name] ?? []
       const [box] = every(`[data-field="${name}"]`)
-      if (box) box.hidden = !this.reads.has(name) || fileless.has(name) || (sky !== undefined && this.entered.sky !== sky)
+      const excluded = this.reads.has(other) && !fileless.has(other) && this.entered[other] !== text
+      if (box) box.hidden = !this.reads.has(name) || fileless.has(name) || excluded
     }
     for (const group of every("#advanced fieldset")) group.hidden = !every("[data-field]:not([hidden])", group).length
     byId("advanced").hidden = !every("#advanced fieldset:not([hidden])").length

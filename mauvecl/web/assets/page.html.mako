@@ -24,10 +24,14 @@
 <%def name="upload(name, title, about, kinds)">
 <div class="file"><button type="button" class="plain" data-choose="${name}">${title}</button>
 <input type="file" data-upload="${name}" aria-label="${about}" tabindex="-1" hidden><span class="hint">${kinds}</span>
-<span data-uploaded="${name}"></span> <span data-remedies="${name}"></span></div>
-% if uploads[name].options:
+<span data-uploaded="${name}"></span>
+% if fields.FIELDS[name].kind == "file":
+<button type="button" class="plain" data-remove="${name}" hidden>Remove it</button>
+% endif
+<span data-remedies="${name}"></span></div>
+% if name in fields.WITH_FILE:
 <div class="options">
-% for option in uploads[name].options:
+% for option in fields.WITH_FILE[name]:
 ${control(option)}
 % endfor
 </div>
@@ -51,7 +55,6 @@ ${upload("own_unknown", "Use a file of nm and DN", "File of the unknown spectrum
 % elif field.kind == "file":
 <input id="f-${name}" name="${name}" type="text" aria-label="${field.label}" hidden>
 ${upload(name, "Use a file", field.label, "text, ECSV, VOTable or FITS; or drop it here")}
-<button type="button" class="plain" data-remove="${name}" hidden>Remove it</button>
 % elif field.kind == "targets":
 <textarea id="f-targets" name="targets" hidden></textarea>
 <div class="wide"><table id="targets"><caption class="quiet">Targets</caption><thead><tr></tr></thead><tbody></tbody></table></div>

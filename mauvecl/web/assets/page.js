@@ -344,9 +344,6 @@ class Page {
     for (const number of every("#numbers [data-unknown]")) {
       number.onclick = () => this.enter({unknown: number.dataset.unknown})
     }
-    for (const button of every("[data-remove]")) {
-      button.onclick = () => this.enter({[button.dataset.remove]: ""})
-    }
     byId("afresh").onclick = () => this.enter({...words.fields})
     byId("preset").onchange = () => {
       const given = words.presets[byId("preset").value]

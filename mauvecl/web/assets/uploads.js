@@ -40,20 +40,26 @@ export class Uploads {
     this.serials = {}
     for (const button of every("[data-remove]")) {
       button.onclick = () => {
-        const field = button.dataset.remove
-        this.forget([field])
-        this.fields.put({[field]: ""})
+        const nothing = this.without(button.dataset.remove)
+        this.forget(Object.keys(nothing))
+        this.fields.put(nothing)
         this.then.changed(true)
       }
     }
     this.before = kept().then(files => { this.files = {...files, ...this.files} })
   }
 
-  /** The field whose file a field says how to read, if any.
-   * @param {string} name
-   * @returns {string | undefined} */
-  owner(name) {
-    return Object.keys(this.words.uploads).find(field => this.words.uploads[field].options.includes(name))
+  /** Fields whose files are here and are read as a field says.
+   * @param {string} name */
+  owners(name) {
+    return Object.keys(this.words.uploads).filter(field => this.words.uploads[field].options.includes(name) && this.holds(field))
+  }
+
+  /** The first texts of a field and of those that apply only with its file.
+   * @param {string} field
+   * @returns {Entered} */
+  without(field) {
+    return Object.fromEntries([field, ...this.words.withFile[field] ?? []].map(name => [name, this.words.fields[name]]))
   }
 
   /** Whether a field's file stands in it, is being read, or was refused.
@@ -73,9 +79,10 @@ export class Uploads {
    * @param {File} file
    */
   async choose(field, file) {
-    const options = this.words.uploads[field].options
     // Another file may have other units.
-    this.fields.put({[field]: "", ...Object.fromEntries(options.map(name => [name, this.words.fields[name]]))})
+    const nothing = {...this.without(field), [field]: ""}
+    this.forget(Object.keys(nothing))
+    this.fields.put(nothing)
     delete this.files[field]
     this.lacks[field] = `${file.name} is being read`
     this.propose(field, [])
@@ -95,14 +102,17 @@ export class Uploads {
    * @param {string} name
    * @param {boolean} last */
   changed(name, last) {
-    const field = this.owner(name)
-    if (field === undefined || !this.holds(field)) return
-    this.lacks[field] = `${this.files[field].name} is being read again`
-    // A reading that is under way is of no use.
-    this.serials[field] = (this.serials[field] ?? 0) + 1
+    const fields = this.owners(name)
+    if (!fields.length) return
+    for (const field of fields) {
+      this.lacks[field] = `${this.files[field].name} is being read again`
+      // A reading that is under way is of no use.
+      this.serials[field] = (this.serials[field] ?? 0) + 1
+    }
+    const send = () => fields.forEach(field => this.send(field))
     clearTimeout(this.soon)
-    if (last) this.send(field)
-    else this.soon = setTimeout(() => this.send(field), AGAIN_MS)
+    if (last) send()
+    else this.soon = setTimeout(send, AGAIN_MS)
   }
 
   /** @param {string} field */

@@ -74,6 +74,8 @@ class Completeness(Tab):
     )
     pictures = (Shares(),)
     headline = False
+    # Flares of many sizes are injected.
+    never = ("as_observed",)
     # The picture reads off the share of flares of this size.
     also = ("amplitude_percent",)
     simulations = {"completeness": "Inject flares"}  # noqa: RUF012

@@ -112,8 +112,8 @@ class Plan(Tab):
         "each target's type; completeness is in closed form, and assumptions have a table."
     )
     headline = False
-    # The page has no star-time of a campaign's false alarms: one a month.
-    never = ("false_alarms",)
+    # The page has no star-time of a campaign's false alarms: one a month. Flares of all sizes are expected.
+    never = ("false_alarms", "as_observed")
     pictures = (Recovered(), Expected())
     files = dict.fromkeys(("plan", "stars", "energies", "assumptions"), "plan")
 
