@@ -176,7 +176,7 @@ VERBS: dict[str, Verb] = {
     Example: mauvecl limit --star G2V --amplitude 0.24 --exposure 50
     """,
             ("limit", "flare", *DRAWS, *DETECTION, *NUISANCES, *UNKNOWN, "sweep"),
-            counts="limits",
+            counts="steps",
             older=("limiting_magnitude",),
             tab=True,
         ),

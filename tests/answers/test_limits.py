@@ -11,9 +11,10 @@ from astropy.table import QTable
 from refusals import refused
 
 from mauvecl.answers.limits.assumptions import what_matters
-from mauvecl.answers.limits.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
+from mauvecl.answers.limits.limits import STEPS, limiting_magnitude, shortest_exposure, smallest_amplitude
 from mauvecl.answers.limits.search import LimitSearch
 from mauvecl.device.engine import Engine
+from mauvecl.runs.pool import LocalWorkers, Pool
 from mauvecl.schema.messages import of_kind
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.cases import Case
@@ -172,3 +173,18 @@ def test_assumptions_move_the_limit_as_predicted() -> None:
     root = LimitSearch(Case(lossy.at("amplitude", 0.24)), "matched").root()
     assert rows["light loss"]["at_high_end"] == pytest.approx(root, abs=1e-3)
     assert Study.build(lossy.model_dump(), "again") == lossy
+
+
+def test_progress_has_one_total_and_moves_with_each_simulation() -> None:
+    """Three limits, of which several are computed at the same time: never back, and at the end all of it."""
+    study = Study().with_settings(
+        ["star=[{library='G2V'}]", "flare.amplitudes=[0.24]", "run.realisations=20000", "run.fap=0.01"]
+    )
+    seen: list[tuple[int, int]] = []
+    found = limiting_magnitude(study, Pool(LocalWorkers([None])), lambda done, total: seen.append((done, total)))
+    parts = [done for done, _ in seen]
+    assert {total for _, total in seen} == {STEPS * len(found.limits)}
+    assert parts == sorted(parts)
+    assert parts[-1] == STEPS * len(found.limits)
+    # Each simulation and each end of a limit, its check among the simulations.
+    assert len(parts) == sum(len(one.points) + 2 for one in found.limits)

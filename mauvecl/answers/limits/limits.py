@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from operator import attrgetter
+from threading import Lock
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from mauvecl.answers.answer import Answer
@@ -13,7 +14,6 @@ from mauvecl.answers.detection.unknown_cost import Cost, cost_lines, marginal_li
 from mauvecl.answers.limits.assumptions import assumption_columns
 from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle, single_flares
 from mauvecl.answers.neighbour_list import share_columns
-from mauvecl.answers.progress import reported
 from mauvecl.results.requests.fap_checks import check_fap
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -34,6 +34,10 @@ if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use
+
+
+#: Steps in which the progress of a limit is reported, since its number of simulations is not known beforehand.
+STEPS = 100
 
 
 @dataclass(frozen=True)
@@ -210,16 +214,17 @@ class LimitAnswer(Answer):
         return super().as_json() | more
 
 
-def solve(case: Case, statistic: str, engine: Engine | Pool) -> Limit:
+def solve(case: Case, statistic: str, engine: Engine | Pool, report: Callable[[int], None] | None = None) -> Limit:
     """Return the limit of a case's first flare, or of its amplitude, and simulate it again with another seed.
 
     Averages over draws of unknown instrument values if the study has some. Raises InputError if the power is not
-    crossed in the searched range, or too few realisations lie beyond the threshold.
+    crossed in the searched range, or too few realisations lie beyond the threshold. Calls `report` with the number of
+    simulations after each of them.
     """
     study = case.study
     check_fap(study.run.fap, study.run.realisations, study.run.tails)
     kind = MarginalLimitSearch if study.unknowns.draws else LimitSearch
-    question = kind(case, statistic, engine)
+    question = kind(case, statistic, engine, report)
     # The root of the nominal instrument is near and found quickly.
     theory = question.root(near=LimitSearch(case, statistic).root() if study.unknowns.draws else None)
     value = settle(question, theory)
@@ -264,7 +269,7 @@ def limit(
         Its ``limit`` defines the quantity (magnitude, amplitude or exposure) and the power.
     engine : Engine or Pool, optional
     progress : callable, optional
-        Called as ``progress(done, total)`` in limits.
+        Called as ``progress(done, total)`` in steps, `STEPS` for each limit.
 
     Raises
     ------
@@ -287,14 +292,26 @@ def limit(
         (one, statistic) for case in cases(study) for one in single_flares(case) for statistic in study.run.statistics
     ]
 
-    def solved(item: tuple[Case, str]) -> Limit | InputError:
+    steps, lock = [0] * len(asked), Lock()
+
+    def report(number: int, done: int) -> None:
+        with lock:
+            steps[number] = done
+            if progress is not None:
+                progress(sum(steps), STEPS * len(asked))
+
+    def solved(number: int) -> Limit | InputError:
+        outcome: Limit | InputError
         try:
-            return solve(*item, engine)
+            # At least one more simulation follows each, until the limit is found.
+            outcome = solve(*asked[number], engine, lambda count: report(number, STEPS * count // (count + 1)))
         except InputError as error:
             # The limits of other stars are still computed.
-            return error
+            outcome = error
+        report(number, STEPS)
+        return outcome
 
-    outcomes = list(reported(map_in_order(engine, solved, asked), len(asked), progress))
+    outcomes = list(map_in_order(engine, solved, range(len(asked))))
     errors = [one for one in outcomes if isinstance(one, InputError)]
     if len(errors) == len(outcomes):
         raise errors[0]

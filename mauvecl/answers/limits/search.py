@@ -61,10 +61,17 @@ class Unknown:
 class LimitSearch:
     """Detection probability of a case's first flare by one statistic, as a function of the limit's quantity."""
 
-    def __init__(self, case: Case, statistic: str, engine: Engine | Pool | None = None) -> None:
+    def __init__(
+        self,
+        case: Case,
+        statistic: str,
+        engine: Engine | Pool | None = None,
+        report: Callable[[int], None] | None = None,
+    ) -> None:
         self.case, self.statistic, self.engine = case.with_value("amplitude", case.amplitudes[0]), statistic, engine
         self.of, self.power, self.fap = case.study.limit.of, case.study.limit.power, case.study.run.fap
         self.points: list[Point] = []
+        self._report = report
         self._base: tuple[float, Expectation, Expectation] | None = None
 
     def pair(self, value: float) -> tuple[Expectation, Expectation]:
@@ -119,8 +126,14 @@ class LimitSearch:
         # Raises InputError where no threshold has the false-alarm probability.
         detection.threshold(self.fap, self.statistic)
         (probability,) = detection.detection_probability(self.fap, self.statistic)
-        self.points.append(Point(value, probability, seed))
+        self._keep(Point(value, probability, seed))
         return probability
+
+    def _keep(self, point: Point) -> None:
+        """Keep a simulated point, and report the number of points."""
+        self.points.append(point)
+        if self._report is not None:
+            self._report(len(self.points))
 
     def curve(self, value: float) -> tuple[tuple[float, float], ...]:
         """Return the closed form around a value; exposures are whole frames."""
@@ -216,8 +229,14 @@ class LimitSearch:
 class MarginalLimitSearch(LimitSearch):
     """Detection probability averaged over draws of unknown instrument values."""
 
-    def __init__(self, case: Case, statistic: str, engine: Engine | Pool | None = None) -> None:
-        super().__init__(case, statistic, engine)
+    def __init__(
+        self,
+        case: Case,
+        statistic: str,
+        engine: Engine | Pool | None = None,
+        report: Callable[[int], None] | None = None,
+    ) -> None:
+        super().__init__(case, statistic, engine, report)
         self.draws = drawn(case.study)
         self.each = [LimitSearch(replace(case, study=study), statistic, engine) for study in self.draws.studies]
 
@@ -228,7 +247,7 @@ class MarginalLimitSearch(LimitSearch):
     def simulated(self, value: float, seed: int) -> Interval:
         """Return the mean over draws, each with its own reference and threshold."""
         probability = average([one.simulated(value, seed) for one in self.each])
-        self.points.append(Point(value, probability, seed))
+        self._keep(Point(value, probability, seed))
         return probability
 
     def unknown(self, near: float) -> Unknown:

@@ -74,8 +74,6 @@ class Completeness(Tab):
     )
     pictures = (Shares(),)
     headline = False
-    # Flares of many sizes are injected.
-    never = ("as_observed",)
     # The picture reads off the share of flares of this size.
     also = ("amplitude_percent",)
     simulations = {"completeness": "Inject flares"}  # noqa: RUF012
