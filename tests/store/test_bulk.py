@@ -205,14 +205,22 @@ def test_second_writer_raises(path: Path, engine: Engine) -> None:
     assert bulk.verify(path) == []
 
 
+def described_once(asked: Study, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Describe a store once for all its runs, which then begin to write at once."""
+    described, seen = Store(path, asked).description(), stored_scenes.scenes(cases(asked))
+    monkeypatch.setattr(Store, "description", lambda self: described)
+    monkeypatch.setattr(layout, "scenes", lambda asked: seen)
+
+
 @pytest.mark.long
-def test_random_kills_lose_nothing(tmp_path: Path, painted: dict[str, bytes]) -> None:
-    """Kill a run at random moments and resume it; all files have the same bits."""
+def test_random_kills_lose_nothing(tmp_path: Path, painted: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kill a run at random moments, within about the time that it takes, and resume it; files have the same bits."""
+    described_once(study(1000), tmp_path, monkeypatch)
     path, kills, stores = tmp_path / "frames.zarr", 0, 0
     moments = random.Random(5)
     while kills < 50:
         child = forked(lambda: bulk.realise(study(1000), path, Painter()))  # type: ignore[arg-type]
-        time.sleep(moments.uniform(0.0, 0.4))
+        time.sleep(moments.uniform(0.0, 0.1))
         os.kill(child, signal.SIGKILL)
         if killed(child):
             kills += 1
@@ -229,9 +237,8 @@ def test_random_kills_lose_nothing(tmp_path: Path, painted: dict[str, bytes]) ->
 @pytest.mark.long
 def test_kill_at_every_step_of_writing_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Kill before each fsync, rename and line of digests."""
-    described, seen, step = Store(tmp_path, study(200)).description(), stored_scenes.scenes(cases(study(200))), 0
-    monkeypatch.setattr(Store, "description", lambda self: described)
-    monkeypatch.setattr(layout, "scenes", lambda asked: seen)
+    described_once(study(200), tmp_path, monkeypatch)
+    step = 0
     while True:
         path, counted = tmp_path / f"{step}.zarr", iter(range(step + 1))
 
