@@ -174,8 +174,9 @@ def fit(
     """Fit one flare to each exposure.
 
     The likelihood is Gaussian with the variance of the fitted flare and star. Intervals are from the profile likelihood
-    with Wilks' thresholds, scaled where a quantity bends within the error of the temperature. Light is at least 0 and a
-    jump at least 1. An interval that reaches this bound, or an end of the model's temperatures, is a one-sided limit.
+    with Wilks' thresholds, or simulated ones where a quantity bends within the error of the temperature. Light is at
+    least 0 and a jump at least 1. An interval that reaches this bound, or an end of the model's temperatures, is a
+    one-sided limit.
 
     Parameters
     ----------

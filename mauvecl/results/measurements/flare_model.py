@@ -221,6 +221,23 @@ class FlareModel:
         return tuple(None if value is None else scipy.interpolate.CubicSpline(self.log_k, value) for value in values)
 
     @cached_property
+    def multiples(self) -> tuple[tuple[int, float], ...]:
+        """For each derived quantity, the first one that it is a constant multiple of, maybe itself, and the multiple.
+
+        A luminosity is a multiple of a flux, so that their intervals are computed once.
+        """
+        found: list[tuple[int, float]] = []
+        for k, one in enumerate(self.derived):
+            found.append((k, 1.0))
+            for first, other in enumerate(self.derived[:k]):
+                if one.factors is None or other.factors is None or found[first][0] != first:
+                    continue
+                times = float(np.sum(one.factors * other.factors) / np.sum(other.factors**2))
+                if times > 0.0 and np.allclose(one.factors, times * other.factors, rtol=1e-12, atol=0.0):
+                    found[k] = first, times
+        return tuple(found)
+
+    @cached_property
     def sums(self) -> tuple[NDArray[np.bool_], scipy.interpolate.CubicSpline]:
         """Which derived quantities are sums of amplitudes, and the spline of their factors, (n_sums, n_linear)."""
         factors = [one.factors for one in self.derived]

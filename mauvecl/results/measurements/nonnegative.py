@@ -17,10 +17,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.results.measurements.profile import BestFit, Profile, extreme, temperature_samples
+from mauvecl.results.measurements.profile import BestFit, Profile, ends_of_quantities, extreme, temperature_samples
 
 if TYPE_CHECKING:
-    from mauvecl.results.measurements.flare_model import FlareModel
+    from scipy.interpolate import CubicSpline
+
+    from mauvecl.results.measurements.flare_model import Derived, FlareModel
     from mauvecl.results.measurements.reduction import Reduction
 
 Float = NDArray[np.float64]
@@ -206,19 +208,18 @@ def bounded_intervals(
     x = temperature_samples(profile, low, high)
     products, faces = profile.products(x), list(profile.solutions(x))
     least = best.gain[:, None] - allowed
-    columns = []
-    for one, spline in zip(model.derived, model.splines, strict=True):
+
+    def ends(one: Derived, spline: CubicSpline | None) -> tuple[Float, Float]:
         if spline is None:
-            ends = np.where(np.isnan(low), -np.inf, np.exp(low)), np.where(np.isnan(high), np.inf, np.exp(high))
-        elif one.ratio is None:
-            ends = _linear_ends(faces, np.moveaxis(spline(x), -1, 0), least)
-        else:
-            ends = _ratio_ends(products, faces, spline(x), least)
-            ends = one.offset + ends[0], one.offset + ends[1]
-        columns.append(ends)
+            return np.where(np.isnan(low), -np.inf, np.exp(low)), np.where(np.isnan(high), np.inf, np.exp(high))
+        if one.ratio is None:
+            return _linear_ends(faces, np.moveaxis(spline(x), -1, 0), least)
+        lowest, highest = _ratio_ends(products, faces, spline(x), least)
+        return one.offset + lowest, one.offset + highest
+
+    lows, highs = ends_of_quantities(model, ends)
     # A parabola through the outermost samples may exceed a bound.
-    lows = np.maximum(np.column_stack([c[0] for c in columns]), model.bounds)
-    return lows, np.column_stack([c[1] for c in columns])
+    return np.maximum(lows, model.bounds), highs
 
 
 def _linear_ends(faces: list[Face], factors: Float, least: Float) -> tuple[Float, Float]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-    from mauvecl.results.measurements.flare_model import FlareModel
+    from mauvecl.results.measurements.flare_model import Derived, FlareModel
     from mauvecl.results.measurements.reduction import MeanSums
 
 Float = NDArray[np.float64]
@@ -30,12 +30,17 @@ STEPS = 12
 #: Temperatures within an interval at which derived quantities are computed.
 SAMPLES = 33
 #: Second over first order of a quantity's change within the standard error of the temperature, above which Wilks'
-#: thresholds are scaled: where it is 0.1, 95 % intervals with the thresholds as they are cover up to 96 %.
+#: thresholds are replaced: where it is 0.1, 95 % intervals with the thresholds as they are cover up to 96 %.
 CURVED = 0.03
-#: Number of scalings of a threshold, draws of half of the noise, and ends that are simulated at once.
-CORRECTIONS, DRAWS, ENDS_AT_ONCE = 2, 64, 32
+#: Number of ends that are simulated at once.
+ENDS_AT_ONCE = 32
+#: Steps of simulated sums along the gradient of a quantity, their reach beyond the threshold, and the width over which
+#: ratios are smoothed, in standard errors.
+ALONG, BEYOND, SMOOTH = 0.8, 2.0, 0.3
 #: Number of temperatures that simulated fits try, and their reach in standard errors.
-TRIED, REACH = 33, 5.0
+TRIED, REACH = 25, 6.0
+#: Steps of Newton's method for a threshold.
+NEWTON = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +73,14 @@ class Profile:
     def parts(self, log_k: Float) -> tuple[Float, Float, Float]:
         """Return the blackbody's amplitude without bounds, its variance, and its sums, at temperatures (n, ...)."""
         hot = self.hot(log_k)
-        basis = self._basis
-        free = hot - (hot @ basis.T) @ basis
+        free = self.free(hot)
         power = np.einsum("...k,...k->...", free, free)
         rest = self.rest.reshape(self.rest.shape[:1] + (1,) * (log_k.ndim - 1) + self.rest.shape[1:])
         return np.einsum("...k,...k->...", free, rest) / power, 1.0 / power, hot
+
+    def free(self, hot: Float) -> Float:
+        """Return sums less their projections on the fixed components."""
+        return np.asarray(hot - (hot @ self._basis.T) @ self._basis)
 
     def gain(self, log_k: Float) -> Float:
         """Return the decrease of chi-squared by a flare of temperatures (n, ...) with a positive blackbody."""
@@ -175,22 +183,31 @@ def intervals(
     Ends are infinite if the data give no limit within the model's temperatures.
     """
     low, high = profile.ends(best, at_nodes, allowed)
-    x = temperature_samples(profile, low, high)
+    x, closed = temperature_samples(profile, low, high), ~np.isnan(low) & ~np.isnan(high)
     amplitude, variance, hot = profile.parts(x)
     linear = profile.linear(x, amplitude, hot)
     spent = best.gain[:, None] - np.einsum("nk,nk->n", profile.along, profile.along)[:, None] - amplitude**2 / variance
     left = allowed - spent
-    columns: list[tuple[Float, Float]] = []
-    for one, spline in zip(model.derived, model.splines, strict=True):
+
+    def ends(one: Derived, spline: CubicSpline | None) -> tuple[Float, Float]:
         if spline is None:
-            columns.append(
-                (np.where(np.isnan(low), -np.inf, np.exp(low)), np.where(np.isnan(high), np.inf, np.exp(high)))
-            )
-        elif one.ratio is None:
-            columns.append(_linear_interval(profile, spline, x, linear, variance, hot, left, allowed))
-        else:
-            columns.append(_ratio_interval(profile, spline(x), hot, best.gain - allowed))
-    return np.column_stack([c[0] for c in columns]), np.column_stack([c[1] for c in columns])
+            return np.where(np.isnan(low), -np.inf, np.exp(low)), np.where(np.isnan(high), np.inf, np.exp(high))
+        if one.ratio is None:
+            return _linear_interval(profile, spline, x, linear, variance, hot, left, allowed, closed)
+        return _ratio_interval(profile, spline(x), hot, best.gain - allowed)
+
+    return ends_of_quantities(model, ends)
+
+
+def ends_of_quantities(
+    model: FlareModel, ends: Callable[[Derived, CubicSpline | None], tuple[Float, Float]]
+) -> tuple[Float, Float]:
+    """Return the ends of intervals of a model's quantities, low and high, (n, n_derived); multiples share theirs."""
+    columns: list[tuple[Float, Float]] = []
+    for one, spline, (first, times) in zip(model.derived, model.splines, model.multiples, strict=True):
+        low, high = columns[first] if first < len(columns) else ends(one, spline)
+        columns.append((times * low, times * high))
+    return np.column_stack([low for low, _ in columns]), np.column_stack([high for _, high in columns])
 
 
 def temperature_samples(profile: Profile, low: Float, high: Float) -> Float:
@@ -211,6 +228,7 @@ def _linear_interval(
     hot: Float,
     left: Float,
     allowed: float,
+    closed: NDArray[np.bool_],
 ) -> tuple[Float, Float]:
     factors = spline(x)
     value = np.einsum("nsl,nsl->ns", factors, linear)
@@ -225,17 +243,16 @@ def _linear_interval(
     outside[:, [0, -1]] = False  # rounding decides at the ends themselves
     ends = [_hull(value, spread, left, outside, sign)[0] for sign in (-1.0, 1.0)]
     bend = np.abs(value[:, 0] + value[:, -1] - 2 * value[:, SAMPLES // 2])
-    bent = np.flatnonzero(bend > CURVED * np.sqrt(allowed) * (ends[1] - ends[0]))
-    for end, sign in zip(ends, (-1.0, 1.0), strict=True) if bent.size else ():
-        each = value[bent], spread[bent]
+    # Simulated fits need the error of the temperature, which its interval gives if it has both ends.
+    bent = np.flatnonzero(closed & (bend > CURVED * np.sqrt(allowed) * (ends[1] - ends[0])))
+    if bent.size:
+        thresholds = _Thresholds(profile, spline)
         room, error = left[bent], (x[bent, -1] - x[bent, 0]) / np.sqrt(4 * allowed)
-        for _ in range(CORRECTIONS):
-            end[bent], k = _hull(*each, room, room < 0.0, sign)
-            place = np.arange(bent.size), k
+        for end, sign in zip(ends, (-1.0, 1.0), strict=True):
+            place = np.arange(bent.size), _hull(value[bent], spread[bent], room, room < 0.0, sign)[1]
             moved = sign * np.sqrt(np.maximum(room[place], 0.0))
-            rise = _expected_rise(profile, bent, spline, x[bent][place], moved, error)
-            room = left[bent] + allowed * (rise[:, None] - 1.0)
-        end[bent] = _hull(*each, room, room < 0.0, sign)[0]
+            own = room + thresholds.at(bent, x[bent][place], moved, error, allowed)[:, None] - allowed
+            end[bent] = _hull(value[bent], spread[bent], own, own < 0.0, sign)[0]
     return ends[0], ends[1]
 
 
@@ -248,71 +265,129 @@ def _hull(
     return extreme(reached, which), np.argmax(sign * reached, axis=1)
 
 
-def _expected_rise(
-    profile: Profile, rows: NDArray[np.intp], spline: CubicSpline, x: Float, moved: Float, error: Float
-) -> Float:
-    """Return the mean of the likelihood ratio of a quantity at the best fits with the quantity held at an end, (n,).
+class _Thresholds:
+    """Thresholds of the likelihood ratio of a quantity that bends within the error of the temperature.
 
-    With one degree of freedom it is 1, but another number where the quantity bends within the error of the temperature.
-    Fits are simulated with the same noise for all ends, of which the means and covariances are exact.
-
-    Parameters
-    ----------
-    profile : Profile
-    rows : ndarray, shape (n,)
-        Numbers of the frames.
-    spline : CubicSpline
-        Factors of the quantity.
-    x, moved : ndarray, shape (n,)
-        Log temperature at the end, and its distance from the best value there in standard errors.
-    error : ndarray, shape (n,)
-        Standard error of the log temperature.
+    The ratio has one degree of freedom only where the quantity is straight. Elsewhere a threshold is the quantile of
+    the ratio in fits to simulated sums, with the quantity held at an end of its interval and free.
     """
-    reduction = profile.reduction
-    body, there = _directions(reduction, spline, x)
-    # The fitted sums at the end, with the quantity moved there.
-    amplitude = np.einsum("nk,nk->n", profile.rest[rows], body) / np.einsum("nk,nk->n", body, body)
-    mean = profile.along[rows] @ reduction.basis[0] + amplitude[:, None] * body
-    mean += (moved / np.linalg.norm(there, axis=1))[:, None] * there
-    held = np.einsum("nk,nk->n", mean, there)
-    # Noise along the changes of the mean sums, to second order of the temperature: other noise has little effect.
-    fixed = np.broadcast_to(reduction.fixed[:, None], (len(reduction.fixed), *there.shape))
-    changes = np.linalg.qr(np.dstack([there, reduction.spline(x, 1), *fixed, reduction.spline(x, 2)]))[0]
-    noise = _noise(changes.shape[2]) @ changes.transpose(0, 2, 1)
-    first, last = (np.clip(x + side * REACH * error, *profile.nodes[[0, -1]]) for side in (-1.0, 1.0))
-    grid = first[:, None] + (last - first)[:, None] * np.linspace(0.0, 1.0, TRIED)
-    rises = []
-    for start in range(0, rows.size, ENDS_AT_ONCE):
-        some = slice(start, start + ENDS_AT_ONCE)
-        sums = mean[some, None] + noise[some]
-        bodies, along = (each.transpose(0, 2, 1) for each in _directions(reduction, spline, grid[some]))
-        gain = np.maximum(sums @ bodies, 0.0) ** 2 / np.sum(bodies**2, axis=1)[:, None]
-        away = (held[some, None, None] - sums @ along) ** 2 / np.sum(along**2, axis=1)[:, None]
-        free, bound = (extreme(each.reshape(-1, TRIED), np.maximum) for each in (gain, gain - away))
-        rises.append(np.mean((free - bound).reshape(len(sums), -1), axis=1))
-    return np.concatenate(rises)
+
+    def __init__(self, profile: Profile, spline: CubicSpline) -> None:
+        self._profile, self._spline = profile, spline
+        self._units = profile.reduction.directions[0]
+        there = _held_direction(profile.reduction, spline, profile.nodes)
+        length = np.linalg.norm(there, axis=1)
+        self._held, self._scale = there / length[:, None], 1.0 / length
+
+    def at(self, rows: NDArray[np.intp], x: Float, moved: Float, error: Float, allowed: float) -> Float:
+        """Return the thresholds at ends, (n,), below which ratios are as probable as below Wilks' `allowed`.
+
+        Simulated sums have even distances along the gradient of the quantity, weighted by their probability, and the
+        same noise for all ends in the other directions in which the mean sums change.
+
+        Parameters
+        ----------
+        rows : ndarray, shape (n,)
+            Numbers of the frames.
+        x, moved : ndarray, shape (n,)
+            Log temperature at the end, and its distance from the best value there in standard errors.
+        error : ndarray, shape (n,)
+            Standard error of the log temperature.
+        allowed : float
+        """
+        profile, reduction = self._profile, self._profile.reduction
+        there, (basis, inverse) = _held_direction(reduction, self._spline, x), reduction.basis
+        # The fitted sums at the end, with the quantity moved there.
+        hot = profile.hot(x)
+        body = profile.free(hot)
+        body /= np.linalg.norm(body, axis=1)[:, None]
+        mean = profile.along[rows] @ basis + _dot(profile.rest[rows], body)[:, None] * body
+        mean += (moved / np.linalg.norm(there, axis=1))[:, None] * there
+        amplitude = _dot(mean, body) / _dot(hot, body)
+        others = (mean @ basis.T - amplitude[:, None] * (hot @ basis.T)) @ inverse.T
+        # The gradient of the quantity: that at this temperature, and along the change of the mean with temperature.
+        slope = reduction.spline(x, 1)
+        change = profile.free(slope)
+        change -= _dot(change, body)[:, None] * body
+        steeper = _dot(self._spline(x, 1), np.column_stack([amplitude, others])) - amplitude * _dot(there, slope)
+        power = amplitude * _dot(change, change)
+        normal = there + np.divide(steeper, power, out=np.zeros_like(power), where=power > 0.0)[:, None] * change
+        normal /= np.linalg.norm(normal, axis=1)[:, None]
+        value = _dot(mean, there)
+        fixed = np.broadcast_to(reduction.fixed[:, None], (len(reduction.fixed), *there.shape))
+        changes = np.linalg.qr(np.dstack([normal, slope, hot, *fixed, reduction.spline(x, 2)]))[0][:, :, 1:]
+        sums = np.concatenate([mean[:, None], normal[:, None], changes.transpose(0, 2, 1)], axis=1)
+        noise, z = _noise(changes.shape[2]), np.sqrt(allowed)
+        distances = ALONG * np.arange(0.5, (z + BEYOND) / ALONG)
+        distances = np.concatenate([-distances, distances])
+        out = np.repeat(distances, len(noise))
+        draws = np.column_stack([np.ones(out.size), out, np.tile(noise, (distances.size, 1))])
+        # Temperatures around the end, evenly spaced nodes of the model.
+        last = profile.nodes.size - 1
+        step = (profile.nodes[-1] - profile.nodes[0]) / last
+        stride = np.clip(2 * REACH * error / step / (TRIED - 1), 1, last // (TRIED - 1)).astype(np.intp)
+        first = np.rint((x - profile.nodes[0]) / step).astype(np.intp) - stride * (TRIED // 2)
+        tried = np.clip(first, 0, last - stride * (TRIED - 1))[:, None] + stride[:, None] * np.arange(TRIED)
+        root = np.empty((rows.size, out.size))
+        for start in range(0, rows.size, ENDS_AT_ONCE):
+            some = slice(start, start + ENDS_AT_ONCE)
+            own, node = sums[some], tried[some]
+            light = np.maximum(draws @ (own @ self._units[node].transpose(0, 2, 1)), 0.0)
+            away = own @ self._held[node].transpose(0, 2, 1)
+            away[:, 0] -= value[some, None] * self._scale[node]
+            root[some] = np.sqrt(_likelihood_ratio(light, draws @ away))
+        # Shares of fits with a smaller ratio, smoothed alike for the simulated fits and where the quantity is straight.
+        weights = np.exp(-(out**2) / 2)
+        level = weights @ scipy.special.ndtr((z - np.abs(out)) / SMOOTH)
+        end = np.full(rows.size, z)
+        for _ in range(NEWTON):
+            below = (end[:, None] - root) / SMOOTH
+            density = np.exp(-(below**2) / 2) @ weights / (SMOOTH * np.sqrt(2 * np.pi))
+            end += np.clip((level - scipy.special.ndtr(below) @ weights) / density, -SMOOTH, SMOOTH)
+        return np.asarray(end**2)
 
 
-def _directions(reduction: MeanSums, spline: CubicSpline, log_k: Float) -> tuple[Float, Float]:
-    """Return directions of sums at temperatures (...,), each of shape (..., n_sum).
+def _parabola(samples: Float, middle: NDArray[np.intp]) -> tuple[Float, Float, Float]:
+    """Return value, slope and second derivative of a parabola through three samples, per step, at the middle one."""
+    before, here, after = (samples.ravel().take(middle + side) for side in (-1, 0, 1))
+    return here, (after - before) / 2, before + after - 2 * here
 
-    Of the blackbody less its projections on the fixed components, and those whose product with the sums is the best
-    value of a quantity.
-    """
+
+def _likelihood_ratio(light: Float, away: Float) -> Float:
+    """Return the maximum of light^2 less that of light^2 - away^2 over samples (..., n_sample)."""
+    n = light.shape[-1]
+    first = np.arange(0, light.size, n).reshape(light.shape[:-1])
+    at_best, held = (np.clip(one.argmax(axis=-1), 1, n - 2) + first for one in (light, light**2 - away**2))
+    value, slope, bend = _parabola(light, at_best)
+    t = np.clip(np.divide(-slope, bend, out=np.zeros_like(slope), where=bend < 0.0), -1.0, 1.0)
+    free = value + t * (slope + t * bend / 2)
+    # One step of Newton's method from the best sample.
+    (p0, p1, p2), (h0, h1, h2) = _parabola(light, held), _parabola(away, held)
+    bend = h1**2 + h0 * h2 - p1**2 - p0 * p2
+    t = np.clip(np.divide(p0 * p1 - h0 * h1, bend, out=np.zeros_like(bend), where=bend > 0.0), -1.0, 1.0)
+    p0, h0 = p0 + t * (p1 + t * p2 / 2), h0 + t * (h1 + t * h2 / 2)
+    return np.asarray(np.maximum(free**2 - p0**2 + h0**2, 0.0))
+
+
+def _dot(a: Float, b: Float) -> Float:
+    """Return the products of vectors (n, k)."""
+    return np.asarray(np.einsum("nk,nk->n", a, b))
+
+
+def _held_direction(reduction: MeanSums, spline: CubicSpline, log_k: Float) -> Float:
+    """Return directions at temperatures (n,) whose product with the sums is a quantity's best value, (n, n_sum)."""
     (basis, inverse), hot, factors = reduction.basis, reduction.spline(log_k), spline(log_k)
     along = hot @ basis.T
     body = hot - along @ basis
-    others = factors[..., 1:] @ inverse
-    slope = factors[..., 0] - np.einsum("...k,...k->...", others, along)
-    return body, (slope / np.einsum("...k,...k->...", body, body))[..., None] * body + others @ basis
+    others = factors[:, 1:] @ inverse
+    slope = factors[:, 0] - np.einsum("nk,nk->n", others, along)
+    return np.asarray((slope / np.einsum("nk,nk->n", body, body))[:, None] * body + others @ basis)
 
 
 @cache
 def _noise(n: int) -> Float:
-    """Return normal noise in n dimensions, shape (n_draw, n), with odd moments of zero and unit covariance."""
-    even = scipy.stats.qmc.Sobol(n, rng=28).random(DRAWS)
-    half = scipy.special.ndtri(even)
-    half = half @ np.linalg.inv(np.linalg.cholesky(half.T @ half / DRAWS)).T
+    """Return a cubature of normal noise in n dimensions, shape (2 n, n), exact for polynomials of third degree."""
+    half = np.sqrt(n) * scipy.stats.ortho_group.rvs(n, random_state=28)
     return np.concatenate([half, -half])
 
 
