@@ -21,6 +21,7 @@ import types
 import weakref
 import zipfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,16 +48,18 @@ from mauvecl.runs.pool import LocalWorkers, Pool
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.study.study import Study
-from mauvecl.web import access, closed_forms, server, static_pages, tabs, visitor
+from mauvecl.web import access, closed_forms, server, static_pages, tabs, visitor, work
 from mauvecl.web.closed_forms import ClosedForms, percent
 from mauvecl.web.fields import FIELDS, PRESETS, UPLOADED_UNKNOWN, Number, star_words
 from mauvecl.web.figures import INKS
 from mauvecl.web.plain_log import Plain
+from mauvecl.web.sentences import remedies, sentence
 from mauvecl.web.simulations import SIMULATIONS, asked, campaign_plan
 from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS, limit
 from mauvecl.web.tabs.tab import FIXED
 from mauvecl.web.upload import UPLOADS, Upload, read_pairs, read_upload
+from mauvecl.web.work import Job
 
 NUMBERS = [name for name, field in FIELDS.items() if isinstance(field.read, Number)]
 HOSTILE = "![x](http://127.0.0.1:1/x.png) <img src=http://127.0.0.1:1/y.png>"
@@ -212,8 +215,9 @@ def test_sky_of_a_target_needs_target_and_time() -> None:
     assert state.faults.keys() == {"target", "time"}
     assert state.faults["target"].startswith("Sky target = 'bogus', expected a name such as")
     assert state.faults["time"].startswith("Time, UTC = 'tomorrow', expected a UTC time")
-    state.enter({"target": "290.68 +11.12"})
-    assert state.faults.keys() == {"time"}
+    for target in ("Proxima", "HD 1835", "290.68 +11.12"):
+        state.enter({"target": target})
+        assert state.faults.keys() == {"time"}, target
     state.enter({"time": ""})
     assert state.faults["time"].startswith("Time, UTC is empty, expected a UTC time")
     state.enter({"time": "2026-09-01T12:00"})
@@ -438,6 +442,18 @@ def test_uploaded_spectrum_answers_as_on_the_command_line() -> None:
     assert "its file again" in state.faults["own_unknown"]
 
 
+@pytest.mark.parametrize("field", ["star", "flare_file", "flare_quiescent", "change_file"])
+def test_message_on_a_file_names_the_fields_of_this_file(field: str) -> None:
+    upload = UPLOADS[field]
+    text = "\n".join(f"{angstrom} 1e-12" for angstrom in range(1700, 10_001, 10))
+    with pytest.raises(InputError) as error:
+        upload.read("a.txt", text.encode())
+    (option,) = (name for name in upload.options if name.endswith("wavelength_unit"))
+    assert remedies(error.value, upload.keys) == [(option, "Angstrom")]
+    assert f"{FIELDS[option].label} Angstrom" in sentence(error.value, upload.keys)
+    assert upload.read("a.txt", text.encode(), **{option: "Angstrom"}).wavelength_nm[0] == pytest.approx(170.0)
+
+
 # The connection
 
 
@@ -624,6 +640,39 @@ def test_cancel_ends_every_computation(served: Any, kind: str) -> None:
     # Processor time, for others may be at work; a tile may be under way on both processors.
     assert spent < (2.0 if kind in ("completeness", "visible") else 8.0)
     assert idle < 0.25, "nothing goes on behind it"
+
+
+def test_estimate_of_the_time_left_never_rises(monkeypatch: pytest.MonkeyPatch) -> None:
+    job = Job(lambda pool, count: None, unit="steps")
+    job.future.result(60.0)
+    job._started, shown = 0.0, []
+    for now, done in ((1.0, 10), (2.0, 15), (40.0, 20), (50.0, 90)):
+        monkeypatch.setattr(work, "time", types.SimpleNamespace(monotonic=partial(float, now)))
+        job._count(done, 100)
+        (left,) = re.findall(rf"^{done} of 100 steps, about (\d+) s left$", job.words)
+        shown.append(int(left))
+    assert shown == [9, 9, 9, 6]
+
+
+def test_progress_of_the_limit_has_one_total(served: Any) -> None:
+    """The bar moves within each of the three limits, and never back."""
+    link = "?realisations=100000&fap=0.01"
+
+    async def work(host: str) -> list[dict[str, Any]]:
+        talk = await Talk.begin(host)
+        await talk.answer(link, "limit")
+        await talk._connection.write_message(json.dumps({"ask": "simulate", "n": 99, "kind": "limit", "link": link}))
+        seen: list[dict[str, Any]] = []
+        while "ended" not in (reported := await talk.next()):
+            seen += [reported] if "progress" in reported else []
+        talk.end()
+        return [*seen, reported]
+
+    *seen, last = served(work)
+    assert re.fullmatch(r"Done: 300 of 300 steps, \d+ s\.", last["ended"])
+    shares = [one["progress"] for one in seen]
+    assert shares == sorted(shares)
+    assert {one["message"].split()[2] for one in seen if " of " in one["message"]} <= {"300"}
 
 
 #: For each table of a tab: verb, flags in addition to the study, file.
