@@ -31,7 +31,7 @@ PLAN = [
     "search.half_widths_s=[30, 120]",
 ]
 MEASURE = ("measure", "--star", "M3V", "-m", "9", "--sweep", "amplitude=0.1,0.3,0.5,1", "--no-pictures",
-           "--nuisance", "dark=free")  # fmt: skip
+           "--fits", "300", "--nuisance", "dark=free")  # fmt: skip
 
 
 class StoppedError(Exception):
