@@ -117,8 +117,9 @@ export class Card {
       const made = element("li", "", {className: kind}), away = element("button", "×", {type: "button", className: "plain"})
       away.setAttribute("aria-label", `Put away: ${text.slice(0, 60)}`)
       away.onclick = () => { this.dismissed.add(text); made.remove() }
-      made.append(element("span", text), away)
-      if (kind === "danger") made.setAttribute("role", "alert")
+      const said = element("span", text)
+      if (kind === "danger") said.setAttribute("role", "alert")
+      made.append(said, away)
       return made
     }
     const grave = shown.filter(([, kind]) => kind !== "info")
