@@ -372,7 +372,7 @@ def _faint(flares: Sequence[MeasuredFlare]) -> list[str]:
     found = {f"{one.title}, flare of {100 * one.amplitude:g} %": one.snr[1] for one in flares}
     return [
         f"{title}: of an S/N of {snr:.2g} with unknowns marginalised over; below {WILKS_SNR:g} intervals of 95 % cover "
-        "94 to 99 %: the table counts how often they do."
+        "93 to 99 %: the table counts how often they do."
         for title, snr in found.items()
         if snr < WILKS_SNR
     ]
