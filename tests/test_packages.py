@@ -93,6 +93,7 @@ def unpacked(packages: Packages, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return folder / f"mauvecl-{VERSION}"
 
 
+@pytest.mark.long
 def test_same_files_give_the_same_packages(packages: Packages, tmp_path: Path) -> None:
     """Build in another folder, with other times and permissions of the files."""
     tree = copied(tmp_path / "elsewhere")
@@ -110,6 +111,7 @@ def test_sdist_holds_every_file_and_no_link(packages: Packages, unpacked: Path) 
     assert not [path for path in unpacked.rglob("*") if path.is_symlink()]
 
 
+@pytest.mark.long
 def test_wheel_from_the_sdist_equals_that_from_the_checkout(packages: Packages, unpacked: Path, tmp_path: Path) -> None:
     assert built(unpacked, tmp_path).wheel == packages.wheel
 

@@ -43,6 +43,7 @@ def found(stares):
     return inject(study(), stares)
 
 
+@pytest.mark.long
 def test_tables_are_consistent(found):
     (star,) = found.stars
     cells = found.completeness
@@ -152,6 +153,7 @@ def test_temperature_drift_hides_no_flare(stares):
     assert drifting.threshold.value == pytest.approx(plain.threshold.value, abs=0.05)
 
 
+@pytest.mark.long
 def test_cosmic_rays_and_saturation_are_reported(stares):
     """Check that cosmic rays of the study hide flares, and that saturating flares are reported."""
     quick = {"count": 10, "positions": 2, "fitted": 0, "widths": 1, "sizes": 2, "low": 1e33, "high": 1e39}

@@ -32,6 +32,7 @@ def jump(engine: Engine) -> MeasureAnswer:
     return measure(study_of(spectrum={"balmer_jump": 2.5}), engine)
 
 
+@pytest.mark.long
 def test_correct_model_covers_and_simple_model_is_rejected(jump: MeasureAnswer) -> None:
     """Fit 400 drawn exposures. 11 quantities may have a coverage of 93 to 97 %: each fails in 2e-6 of seeds."""
     simple, right = jump.flares
@@ -70,6 +71,7 @@ def test_true_values_equal_those_of_the_added_light(jump: MeasureAnswer) -> None
     assert photons(lit.wavelength_nm, lit.flux_flam, "Kepler") > 0
 
 
+@pytest.mark.long
 def test_detected_flares_near_the_threshold_are_too_bright(engine: Engine) -> None:
     """At a detection probability near one half; the median of detected flares exceeds that of all (false: < 1e-6)."""
     answer = measure(study_of("run.fap=1e-4", "flare.amplitudes=[0.045]", "measure.fits=2000"), engine)
@@ -152,6 +154,7 @@ def test_joint_fits_need_one_flare(engine: Engine) -> None:
         measure(study, engine)
 
 
+@pytest.mark.long
 def test_two_temperatures_are_fitted_where_the_flare_has_two(engine: Engine, tmp_path: Path) -> None:
     """Check that the hotter blackbody is always the second, and that pictures have a column per model."""
     spectrum = {"second_temperature_k": 8000.0, "second_area": 20.0}

@@ -302,6 +302,7 @@ def test_long_stares_with_gaps_are_drawn(stares):
     assert long.plot() is not None
 
 
+@pytest.mark.long
 def test_light_curves_state_the_light_lost_in_pointing_drifts(stares):
     study = SHORT.with_settings(["stare.pointing={rate_per_h=100.0, duration_s=60.0, depth=1.0}", "stare.number=4"])
     answer = stare(study, stares)

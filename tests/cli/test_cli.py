@@ -214,6 +214,7 @@ def test_study_has_processes(tmp_path: Path, engine: Engine) -> None:
     assert "cosmic_rays" in simulate(study).observations[0][2].colnames
 
 
+@pytest.mark.long
 def test_simulate_writes_components(tmp_path: Path) -> None:
     run("simulate", "--star", "G2V", "-m", "7.4", "-a", "0.24", "-t", "10", "-o", "out", folder=tmp_path)
     table = QTable.read(tmp_path / "out" / "observation-2.ecsv")
@@ -259,6 +260,7 @@ def test_components_of_a_simulation_have_their_variances() -> None:
     assert abs((photon * read).sum()) < 5 * np.sqrt(n)
 
 
+@pytest.mark.long
 def test_snr_writes_its_tables(tmp_path: Path) -> None:
     done = run("snr", "--star", "B2IV", "-m", "3.03", "-t", "5", "-n", "5000", "-o", "out", folder=tmp_path)
     assert "S/N per 10.5 nm element" in done.stdout

@@ -169,6 +169,7 @@ def _reference_raw(name: str) -> tuple[np.ndarray, np.ndarray]:
     return reference.realise(scene, INDEX, SEED), reference.clipped(scene, INDEX, SEED).sum(axis=(1, 2))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", long_but(COMPARED, *SHORT))
 def test_statistics_equal_reference(engine: Engine, name: str) -> None:
     check_statistics(engine, name)
@@ -204,6 +205,7 @@ def check_statistics(engine: Engine, name: str) -> None:
         assert ours.far.equals(expected.far)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "comparison"),
     long_but(
@@ -236,6 +238,7 @@ def check_comparison(engine: Engine, name: str, comparison: Comparison) -> None:
         np.testing.assert_allclose(values[0], values[2], rtol=1e-5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name", long_but(["stack", "at the rail", "apart, electrons, frames", "priors", "cosmic rays"], "stack")
 )

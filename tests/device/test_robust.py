@@ -45,6 +45,7 @@ def test_error_names_missing_linker(tmp_path) -> None:
     assert "binutils" in run.stdout
 
 
+@pytest.mark.long
 def test_kernels_are_linked_without_a_compiler(tmp_path) -> None:
     """Link with a linker that knows none of the folders where compilers install their libraries."""
     imports = "from mauvecl import Engine; from mauvecl.device.toy_exposure import toy"

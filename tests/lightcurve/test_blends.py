@@ -50,6 +50,7 @@ def check(alarm: Alarm, event: Event) -> None:
     assert abs(np.log(fit.equivalent_duration_s[0] / event.equivalent_duration_s)) < 5 * error
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("apart", [30.0, 60.0, 120.0, 300.0, 900.0])
 def test_two_equal_flares_are_separated(known, apart):
     # S/N 83 each. Fitted one after another, those 120 s apart came back as four, one of ten times the energy.

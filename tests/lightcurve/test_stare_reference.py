@@ -72,6 +72,7 @@ def stares(request: pytest.FixtureRequest, engine: Engine) -> Stares:
     return Stares(engine.open_device) if request.param == "vectors" else Stares(width=1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", long_but(CASES, "plain", "all that wobbles", "neighbours", "pointing drifts"))
 @pytest.mark.parametrize("method", ["pixels", "cumulants"])
 def test_stares_equal_the_reference(stares: Stares, name: str, method: Any) -> None:
@@ -133,6 +134,7 @@ class Beside:
         return {"values": values.copy(), "glow": glow.copy()}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["pixels", "cumulants"])
 @pytest.mark.parametrize("name", ["plain", "all that wobbles", "unknown alone"])
 def test_sums_for_flares_equal_the_reference(stares: Stares, name: str, method: Any) -> None:

@@ -87,6 +87,7 @@ def _rows(file, form) -> None:  # type: ignore[no-untyped-def]
     file.write(b"\0" * (-size % 2880))
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs the size of a process as Linux states it")
 @pytest.mark.parametrize("write", [_image, _table])
 def test_a_file_larger_than_memory_is_reduced_in_pieces(write, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]

@@ -95,6 +95,7 @@ def test_frames_of_other_wavelengths_or_units_are_searched_in_white_light() -> N
                       model().quiet, model().flare, np.ones(1))  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("unit", ["erg / (s cm2 Angstrom)", "W / (m2 um)", "Jy"])
 def test_flux_densities_are_searched_by_their_spectrum_as_counts_are(unit: str) -> None:
     """Calibrated by a hot standard star: counts over its counts, times its flux.
@@ -239,6 +240,7 @@ def test_counts_with_and_without_bias_and_dark_current_are_distinguished() -> No
     assert levels[0] == pytest.approx(quiet.light_dn.sum(), rel=0.06)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "spectrum", "size"),
     [("throughput", "light", 0.3), ("dark current", "dark", 1.5), ("flare", "", 0.5)],
@@ -352,6 +354,7 @@ def test_drifts_are_measured_next_to_a_short_event() -> None:
         assert with_event[name] == pytest.approx(without[name], rel=0.3)
 
 
+@pytest.mark.long
 def test_answer_states_measurements_or_why_there_are_none() -> None:
     frames = drawn(np.random.default_rng(311), flare(1800.0, 60.0, 1.0))
     answer = analyse(STUDY, frames=frames)
@@ -379,6 +382,7 @@ def verdicts(rise: float, **search: Any) -> tuple[dict[float, str], list[str]]:
     return found, answer.messages
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rise", [0.0, 0.3])
 def test_the_light_of_each_frame_is_free_by_default(rise: float) -> None:
     found, messages = verdicts(rise)
@@ -388,6 +392,7 @@ def test_the_light_of_each_frame_is_free_by_default(rise: float) -> None:
     assert "search.frame.light" in line
 
 
+@pytest.mark.long
 def test_study_keeps_the_light_and_finds_cool_flares_with_it() -> None:
     found, messages = verdicts(0.0, frame={"light": 1e-6})
     assert found == {1800.0: "detected", 2900.0: "detected"}

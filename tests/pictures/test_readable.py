@@ -82,6 +82,7 @@ def shown_ticks(axis: Any) -> list[Text]:
 SHORT = ("detect, one statistic", "limit of exposure", "map", "snr", "exposure")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", long_but(CASES, *SHORT))
 def test_texts_are_inside_figure_and_do_not_overlap(case: str, engine: Engine) -> None:
     ask, settings, column = CASES[case]
