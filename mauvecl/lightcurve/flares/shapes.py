@@ -85,20 +85,7 @@ class Shape(ABC):
 
     def integral(self, first: ArrayLike, last: ArrayLike) -> Float:
         """Return the integral between two values of tau, elementwise, in half-widths."""
-        return between(self.sides(first), self.sides(last))
-
-    def integrals(self, tau: ArrayLike) -> Float:
-        """Return the integrals between consecutive values of tau along the last axis, in half-widths."""
-        sides = self.sides(tau)
-        return between(sides[..., :-1], sides[..., 1:])
-
-    def sides(self, tau: ArrayLike) -> Float:
-        """Return the integrals up to min(tau, 0) and from max(tau, 0), in half-widths, shape (2, *tau.shape).
-
-        `between` subtracts them. Differences of integrals from one end only would cancel on the other side of the peak.
-        """
-        t = np.asarray(tau, np.float64)
-        return np.stack([self.before(np.minimum(t, 0.0)), self.after(np.maximum(t, 0.0))])
+        return between(sides(self, first), sides(self, last))
 
     def mean_over(self, edges_s: ArrayLike, peak_s: ArrayLike, t_half_s: ArrayLike) -> Float:
         """Return the exact mean over each frame.
@@ -118,15 +105,30 @@ class Shape(ABC):
         if edges.ndim == 2:
             integrals = self.integral((edges[:, 0] - peak) / scale, (edges[:, 1] - peak) / scale)
         else:
-            integrals = self.integrals((edges - peak) / scale)
+            integrals = consecutive_integrals(self, (edges - peak) / scale)
         lengths = np.diff(edges).reshape(-1)
         return np.asarray(integrals * scale / lengths)
 
 
+def sides(shape: Shape, tau: ArrayLike) -> Float:
+    """Return the integrals up to min(tau, 0) and from max(tau, 0), in half-widths, shape (2, *tau.shape).
+
+    `between` subtracts them. Differences of integrals from one end only would cancel on the other side of the peak.
+    """
+    t = np.asarray(tau, np.float64)
+    return np.stack([shape.before(np.minimum(t, 0.0)), shape.after(np.maximum(t, 0.0))])
+
+
 def between(first: Float, last: Float) -> Float:
-    """Return the integrals of a shape between two values of tau from its `sides` at both."""
+    """Return the integrals of a shape between two values of tau from `sides` at both."""
     # Shapes are not negative; differences of equal integrals may be, by rounding.
     return np.asarray(np.maximum(last[0] - first[0] + (first[1] - last[1]), 0.0))
+
+
+def consecutive_integrals(shape: Shape, tau: ArrayLike) -> Float:
+    """Return the integrals between consecutive values of tau along the last axis, in half-widths."""
+    both = sides(shape, tau)
+    return between(both[..., :-1], both[..., 1:])
 
 
 class Davenport2014(Shape):

@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.flares.shapes import between
+from mauvecl.lightcurve.flares.shapes import between, sides
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.search.bank import Bank
@@ -261,8 +261,8 @@ class Block:
         light, length = self.sums.survey.stare.light[self.used], times[last] - times[first]
         width = np.exp(theta[:, WIDTH, None])
         tau = (times - theta[:, PEAK, None]) / width  # (n_flare, n_time)
-        at, sides, relative = shape.at(tau), shape.sides(tau), width / length
-        mean = relative * between(sides[..., first], sides[..., last])
+        at, integrals, relative = shape.at(tau), sides(shape, tau), width / length
+        mean = relative * between(integrals[..., first], integrals[..., last])
         later = (at[:, first] - at[:, last]) / length
         change = tau * at
         wider = mean - relative * (change[:, last] - change[:, first])

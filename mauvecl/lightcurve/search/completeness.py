@@ -13,7 +13,7 @@ from scipy import optimize, stats
 from mauvecl.host.expectation import Expectation
 from mauvecl.lightcurve.defaults import HALF_WIDTHS_S as BANK_S
 from mauvecl.lightcurve.flares.energies import EnergyScale
-from mauvecl.lightcurve.flares.shapes import Shape, shape_of
+from mauvecl.lightcurve.flares.shapes import Shape, consecutive_integrals, shape_of
 from mauvecl.lightcurve.search.bank import Bank, white_bank
 from mauvecl.lightcurve.search.false_alarm_rate import TemplateGrid
 from mauvecl.schema.calls import validated
@@ -234,7 +234,7 @@ def _gains(shape: Shape, window_s: float, frame_s: float) -> tuple[Float, Float]
     gain = np.empty((WIDTHS, PEAKS))
     for i, half in enumerate(widths):
         tau = (edges[None, :] - peaks[:, None]) / half
-        frames = shape.integrals(tau) * half / frame_s
+        frames = consecutive_integrals(shape, tau) * half / frame_s
         rest = frames - (frames @ line.T) @ line
         gain[i] = np.linalg.norm(rest, axis=1)
     gain = np.maximum(gain, 1e-12)
