@@ -116,14 +116,25 @@ def command_tables(tab: Tab, question: Question, folder: Path) -> dict[str, Tabl
             assert program == "mauvecl", one["command"]
             ended = CliRunner().invoke(app, [*words, "--no-pictures", "--quiet", "--output", f"out-{number}"])
             if ended.exit_code:
-                raise RuntimeError(f"{one['command']}\n{ended.output}")
+                raise RuntimeError(f"{one['command']}\n{ended.output}{ended.exception}")
     paths = sorted(folder.glob("out-*/*.ecsv"))
     return {path.stem: Table.read(path, format="ascii.ecsv") for path in paths}
 
 
 def differences(tab: Tab, closed: ClosedForms, folder: Path) -> list[str]:
-    """Return the columns of a tab in which page and command differ, as ``table: column``."""
-    page, written = page_tables(tab, closed), command_tables(tab, closed.question, folder)
+    """Return the columns of a tab in which page and command differ, as ``table: column``.
+
+    A question without an answer, such as a limit beyond its range, is to be refused in the same words by both.
+    """
+    try:
+        page = page_tables(tab, closed)
+    except InputError as error:
+        try:
+            command_tables(tab, closed.question, folder)
+        except RuntimeError as refused:
+            return [] if " ".join(str(error).split()) in " ".join(str(refused).split()) else [f"{error}: {refused}"]
+        return [f"only the page refuses: {error}"]
+    written = command_tables(tab, closed.question, folder)
     found = []
     for name, unwritten in page.items():
         # Files hold what is empty in another way.
