@@ -181,13 +181,22 @@ def observed_noise() -> None:
     hdu.writeto("light-curve.fits")
 
 
+def standards() -> None:
+    """Write the study, the mapping and the frames of the page on standard stars."""
+    names: dict[str, object] = {}
+    for kind, snippet in snippets(ROOT / "docs" / "standard-star.md"):
+        if kind == "command":
+            return
+        read_snippet(kind, snippet, names)
+
+
 def files_of_the_checkout() -> None:
     """Provide the files that commands of the gallery name by their place in a checkout."""
     Path("tests").symlink_to(ROOT / "tests")
 
 
 BROUGHT: dict[str, tuple[Callable[[], None], ...]] = {
-    "README.md": (targets, observed_frames),
+    "README.md": (targets, observed_frames, standards),
     "gallery.md": (files_of_the_checkout,),
     "cluster.md": (study_of_ones_own,),
     "mapping.md": (observed_noise, lambda: documented_files(Path())),
@@ -227,12 +236,18 @@ def test_snippets_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         if kind == "command":
             if not not_run(snippet):
                 run(*reduced(snippet), folder=tmp_path)
-        elif kind == "toml":
-            Path(snippet.partition("\n")[0].removeprefix("# ")).write_text(snippet)
-        elif not any(word in snippet for word in NOT_EXECUTED):
-            for many, few in FEWER.items():
-                snippet = snippet.replace(many, few)
-            exec(compile(snippet, page.name, "exec"), names)
+        else:
+            read_snippet(kind, snippet, names)
+
+
+def read_snippet(kind: str, snippet: str, names: dict[str, object]) -> None:
+    """Write the file of a TOML block, or run a Python block in a namespace."""
+    if kind == "toml":
+        Path(snippet.partition("\n")[0].removeprefix("# ")).write_text(snippet)
+    elif not any(word in snippet for word in NOT_EXECUTED):
+        for many, few in FEWER.items():
+            snippet = snippet.replace(many, few)
+        exec(compile(snippet, "snippet", "exec"), names)
 
 
 def test_skipped_snippets_exist_on_pages() -> None:

@@ -127,6 +127,8 @@ class LocalWorkers:
         return self._threads.submit(self._count, task)
 
     def _count(self, task: Task) -> Arrays:
+        if self._stopping:
+            raise Stopped
         with self._lock:
             place = self._free.pop(0)
         self._ticks[place] = task.tick
@@ -160,8 +162,10 @@ class LocalWorkers:
         self._stopping = True
 
     def close(self) -> None:
-        """Stop the threads."""
-        self._threads.shutdown(wait=True, cancel_futures=True)
+        """Stop work in progress, and the threads."""
+        self.stop()
+        # A future that the executor cancels would not wake those who wait for it; `_count` ends them instead.
+        self._threads.shutdown(wait=True)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import pickle
 import random
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +22,7 @@ from scenes import instrument, star
 from mauvecl.answers.detection.detect import detect
 from mauvecl.answers.detection.maps import detection_map
 from mauvecl.answers.limits.limits import limiting_magnitude
+from mauvecl.answers.progress import reported
 from mauvecl.answers.signal.snr import snr
 from mauvecl.device.engine import DeviceError, Engine
 from mauvecl.host.expectation import Expectation
@@ -156,6 +157,61 @@ def test_failed_launch_is_repeated(engine: Engine, scene: list[Expectation]) -> 
     same(pool.detect(quiet, flares, realisations=N, seed=5), engine.detect(quiet, flares, realisations=N, seed=5))
     assert pool.standing.retries == 3
     assert len(made) == 4, "each time with a new context"
+
+
+def test_closed_workers_end_every_wait(engine: Engine, scene: list[Expectation]) -> None:
+    """Close workers while a pool waits for a shard that is counted and for another behind it, its last."""
+    quiet, *flares = scene
+    begun, free = threading.Event(), threading.Event()
+
+    class Held(Failing):
+        def count(self, request: Any, shard: Shard, **more: Any) -> Arrays:
+            begun.set()
+            assert free.wait(60)
+            return engine.count(request, shard, **more)
+
+    workers = LocalWorkers([None], make=lambda device, progress: Held(engine, set(), []))  # type: ignore[return-value, arg-type]
+    ends: list[BaseException] = []
+
+    def ask() -> None:
+        try:
+            Pool(workers).detect(quiet, flares, realisations=8192, seed=5)
+        except (Stopped, RuntimeError) as end:
+            ends.append(end)
+
+    # Daemon threads: one that waits for ever fails the test instead of holding it.
+    asking, closing = (threading.Thread(target=one, daemon=True) for one in (ask, workers.close))
+    asking.start()
+    assert begun.wait(60)
+    closing.start()
+    while not workers._stopping:
+        time.sleep(0.01)
+    free.set()
+    asking.join(60)
+    closing.join(60)
+    assert not asking.is_alive()
+    assert not closing.is_alive()
+    assert len(ends) == 1
+
+
+def test_progress_that_raises_closes_its_items() -> None:
+    """Check that work ahead of a verb's progress is stopped before its workers are closed."""
+    ended: list[str] = []
+
+    def items() -> Iterator[int]:
+        try:
+            yield from range(3)
+        finally:
+            ended.append("items")
+
+    def progress(done: int, total: int) -> None:
+        raise Stopped
+
+    try:
+        list(reported(items(), 3, progress))
+    except Stopped:
+        ended.append("verb")
+    assert ended == ["items", "verb"]
 
 
 def test_device_that_always_fails_raises(engine: Engine, scene: list[Expectation]) -> None:

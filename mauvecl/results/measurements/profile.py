@@ -343,7 +343,10 @@ class _Thresholds:
         for _ in range(NEWTON):
             below = (end[:, None] - root) / SMOOTH
             density = np.exp(-(below**2) / 2) @ weights / (SMOOTH * np.sqrt(2 * np.pi))
-            end += np.clip((level - scipy.special.ndtr(below) @ weights) / density, -SMOOTH, SMOOTH)
+            missing = level - scipy.special.ndtr(below) @ weights
+            # Without a ratio nearby the threshold moves by the longest step.
+            far = SMOOTH * np.sign(missing)
+            end += np.clip(np.divide(missing, density, out=far, where=density > 1e-9), -SMOOTH, SMOOTH)
         return np.asarray(end**2)
 
 
