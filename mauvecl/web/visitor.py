@@ -101,8 +101,8 @@ class Visitor(WebSocketHandler):
         self._folder.cleanup()
 
     def send(self, content: bytes | None = None, **message: Any) -> None:
-        """Send a message, followed by bytes."""
-        if self.ws_connection is None:
+        """Send a message, followed by bytes; a visitor who has left gets none."""
+        if self.ws_connection is None or self not in self.here:
             return
         try:
             self.write_message(json.dumps(message, allow_nan=False))
@@ -281,7 +281,7 @@ class Visitor(WebSocketHandler):
             answers = self.answers(state) | {"draw": future.result()}
             self.send(n=asked["n"], **shown(tab.name, closed, answers))
 
-        self._when_done(self._drawing, came)
+        self._when_done(self._drawing.future, came)
 
     def _ask_simulate(self, asked: dict[str, Any]) -> None:
         """Simulate, report progress, and send the answer."""
@@ -322,9 +322,16 @@ class Visitor(WebSocketHandler):
         if self.job is not None:
             self.job.cancel()
 
-    def _when_done(self, job: Job, then: Callable[[Future[Any]], None]) -> None:
+    @staticmethod
+    def _when_done(work: Future[Any], then: Callable[[Future[Any]], None]) -> None:
+        """Call a function in the event loop when some work is done, unless the server has ended by then."""
         loop = asyncio.get_running_loop()
-        job.future.add_done_callback(lambda future: loop.call_soon_threadsafe(then, future))
+
+        def tell(work: Future[Any]) -> None:
+            if not loop.is_closed():
+                loop.call_soon_threadsafe(then, work)
+
+        work.add_done_callback(tell)
 
     # Files from and to the visitor
 
@@ -361,9 +368,7 @@ class Visitor(WebSocketHandler):
             else:
                 self.send(n=n, field=field, entered=upload.entered)
 
-        loop = asyncio.get_running_loop()
-        future = reading(lambda: upload.read(name, content, **state.values_of(upload.options)))
-        future.add_done_callback(lambda future: loop.call_soon_threadsafe(came, future))
+        self._when_done(reading(lambda: upload.read(name, content, **state.values_of(upload.options))), came)
 
     def _ask_file(self, asked: dict[str, Any]) -> None:
         n = asked["n"]

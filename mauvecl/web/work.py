@@ -17,6 +17,8 @@ from mauvecl.runs.pool import LocalWorkers, Pool, Stopped
 
 #: Simulations that a server computes at the same time; others wait.
 TOGETHER = 2
+#: Simulations that take longer, s, leave memory to release; that of a short one would stop all visitors for longer.
+LONG_S = 1.0
 _threads = ThreadPoolExecutor(TOGETHER, thread_name_prefix="mauvecl-page")
 _own = threading.local()
 #: Uploads are read one after the other, outside the event loop.
@@ -88,7 +90,8 @@ class Job:
         try:
             return self._run_cancellable()
         finally:
-            release_memory()
+            if time.monotonic() - (self._started or math.inf) > LONG_S:
+                release_memory()
 
     def _run_cancellable(self) -> Any:
         if not self.drawing:

@@ -17,13 +17,16 @@ import resource
 import socket
 import tempfile
 import threading
+import time
 import types
 import weakref
 import zipfile
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -652,6 +655,40 @@ def test_estimate_of_the_time_left_never_rises(monkeypatch: pytest.MonkeyPatch) 
         (left,) = re.findall(rf"^{done} of 100 steps, about (\d+) s left$", job.words)
         shown.append(int(left))
     assert shown == [9, 9, 9, 6]
+
+
+def test_short_simulations_release_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Collecting garbage stops all visitors, for as long as their answers take: drawing an exposure must not do so."""
+    released: list[float] = []
+    monkeypatch.setattr(work, "release_memory", lambda: released.append(work.LONG_S))
+    monkeypatch.setattr(work, "LONG_S", 60.0)
+    Job(lambda pool: None).future.result(60.0)
+    assert not released
+    monkeypatch.setattr(work, "LONG_S", 0.0)
+    Job(lambda pool: time.sleep(0.01)).future.result(60.0)
+    assert released == [0.0]
+
+
+def test_work_that_ends_after_the_server_is_no_error(caplog: pytest.LogCaptureFixture) -> None:
+    ended: Future[str] = Future()
+    told: list[str] = []
+
+    async def wait_for(work: Future[str]) -> None:
+        visitor.Visitor._when_done(work, lambda work: told.append(work.result()))
+
+    asyncio.run(wait_for(ended))
+    ended.set_result("late")
+    assert not told
+    assert not caplog.records
+
+
+def test_visitors_who_have_left_are_sent_nothing() -> None:
+    sent: list[str] = []
+    left = Mock(ws_connection=object(), here=set(), write_message=sent.append)
+    visitor.Visitor.send(left, ended="Cancelled.")
+    left.here.add(left)
+    visitor.Visitor.send(left, ended="Cancelled.")
+    assert sent == ['{"ended": "Cancelled."}']
 
 
 def test_progress_of_the_limit_has_one_total(served: Any) -> None:

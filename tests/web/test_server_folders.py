@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -25,7 +27,7 @@ pytestmark = pytest.mark.long
 
 
 def test_folders_end_with_their_server(tmp_path: Path) -> None:
-    """By Ctrl-C and SIGTERM at once; those of a killed server with the start of the next one."""
+    """Ctrl-C and SIGTERM remove them amid a simulation, without errors; the next start, those of a killed server."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -36,17 +38,28 @@ def test_folders_end_with_their_server(tmp_path: Path) -> None:
         """Serve a visitor who stays, end the server by a signal, and return the number of folders that are left."""
 
         async def visit() -> None:
-            asked = HTTPRequest(f"ws://127.0.0.1:{port}/live", headers={"Origin": f"http://127.0.0.1:{port}"})
-            connection = await websocket_connect(asked)
+            request = HTTPRequest(f"ws://127.0.0.1:{port}/live", headers={"Origin": f"http://127.0.0.1:{port}"})
+            connection = await websocket_connect(request)
             assert await connection.read_message() is not None
             assert len(list(tmp_path.glob(f"{folders.PREFIX}*/*/"))) == 1
+            asked = {"n": 1, "link": "?realisations=4000000"}
+            await connection.write_message(json.dumps(asked | {"ask": "simulate", "kind": "detection"}))
+            started = json.loads(await asyncio.wait_for(connection.read_message(), 60))
+            assert "progress" in started, started
+            for magnitude in range(6, 12):
+                link = f"?magnitude={magnitude}"
+                await connection.write_message(json.dumps({"ask": "answer", "n": 2, "link": link, "tab": "detection"}))
             server.send_signal(end)
             await asyncio.to_thread(server.wait, 60)
 
-        with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as server:
+        pipe = subprocess.PIPE
+        with subprocess.Popen(command, env=environment, stdout=pipe, stderr=pipe, text=True) as server:
             assert server.stdout is not None
+            assert server.stderr is not None
             assert "serves at" in server.stdout.readline()
             asyncio.run(visit())
+            log = server.stderr.read()
+        assert not re.search("ERROR|Traceback|note:", log), log
         return len(list(tmp_path.glob(f"{folders.PREFIX}*")))
 
     assert left(signal.SIGTERM) == 0
