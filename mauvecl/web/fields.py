@@ -244,51 +244,23 @@ def star_words(name: str) -> str:
 
 @dataclass(frozen=True)
 class Field:
-    """Field of the page.
-
-    Attributes
-    ----------
-    label : str
-    first : str
-        Text of a new page.
-    read : callable
-        Converts text to the value; raises InputError with what is accepted.
-    hint : str
-        Explanation for visitors.
-    unit : str
-    slider : Slider, optional
-    group : str
-        Heading; empty for fields that show at once.
-    place : int
-        Order within the group.
-    path : tuple of str
-        Key of the study that takes the value; empty if `Question` converts it.
-    scale : float
-        Factor from the value of the key to that of the page.
-    most : int
-        Largest number of characters.
-    kind : str
-        Kind of the widget if not that of what is read: "day", "file", "library", "targets", "table" or "upload".
-    suggestions : tuple of str
-        Texts that the page offers.
-    own_keys : tuple of str
-        Keys and sections of the study that it sets without a path.
-    """
+    """Field of the page."""
 
     label: str
-    first: str
-    read: Callable[[str], Any]
-    hint: str = ""
+    first: str  # text of a new page
+    read: Callable[[str], Any]  # converts text to the value; raises InputError with what is accepted
+    hint: str = ""  # explanation for visitors
     unit: str = ""
     slider: Slider | None = None
-    group: str = ""
-    place: int = 0
-    path: tuple[str, ...] = ()
-    scale: float = 1.0
-    most: int = MOST_CHARACTERS
+    group: str = ""  # heading; empty for fields that are always shown
+    place: int = 0  # order within the group
+    path: tuple[str, ...] = ()  # key of the study that takes the value; empty if `Question` converts it
+    scale: float = 1.0  # factor from the value of the key to that of the page
+    most: int = MOST_CHARACTERS  # largest number of characters
+    #: Kind of the widget if the parser does not imply it: "day", "file", "library", "targets", "table" or "upload".
     kind: str = ""
-    suggestions: tuple[str, ...] = ()
-    own_keys: tuple[str, ...] = ()
+    suggestions: tuple[str, ...] = ()  # texts that the page offers
+    own_keys: tuple[str, ...] = ()  # keys and sections of the study that it sets without a path
 
     @property
     def keys(self) -> tuple[str, ...]:

@@ -152,16 +152,9 @@ def read_pairs(name: str, content: bytes) -> Points:
 
 @dataclass(frozen=True)
 class VisitorFile:
-    """File of a visitor as it came, until an answer needs it.
+    """File of a visitor as it came, until an answer needs it."""
 
-    Attributes
-    ----------
-    name : str
-        Name on the visitor's computer, without folders and odd characters.
-    content : bytes
-    """
-
-    name: str
+    name: str  # name on the visitor's computer, without folders and odd characters
     content: bytes
 
     @classmethod
@@ -181,21 +174,11 @@ class VisitorFile:
 
 @dataclass(frozen=True)
 class Upload:
-    """Kind of file that a field takes.
+    """Kind of file that a field takes."""
 
-    Attributes
-    ----------
-    read : callable
-        Reads a file from its name and content, and from the values of `options` by name.
-    entered : str
-        Text of the field that stands for the file.
-    most : int
-        Largest number of bytes.
-    """
-
-    read: Callable[..., Any]
-    entered: str = UPLOADED_FILE
-    most: int = MOST_UPLOADED
+    read: Callable[..., Any]  # reads a file from its name and content, and from the values of `options` by name
+    entered: str = UPLOADED_FILE  # text of the field that stands for the file
+    most: int = MOST_UPLOADED  # largest number of bytes
 
     @cached_property
     def options(self) -> tuple[str, ...]:

@@ -41,44 +41,33 @@ BATCH = 2048
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """Fitted flares of n frames; quantities are those of the model, in its order.
+    """Fitted flares of n frames; quantities are those of the model, in its order."""
 
-    Attributes
-    ----------
-    names, units : tuple of str
-    bounds : tuple of float
-        Smallest possible values: 1 of a jump, 0 of light.
-    estimates : ndarray, shape (n, n_derived)
-        Maximum-likelihood estimates.
-    covariance : ndarray, shape (n, n_derived, n_derived)
-        Covariance from the Fisher information at the fit.
-    levels : tuple of float
-        Nominal coverage of the intervals.
-    low, high : ndarray, shape (n_level, n, n_derived)
-        Ends of the intervals. If one is infinite or at a bound, the other is a one-sided limit.
-    chi2, p_value : ndarray, shape (n,)
-        Goodness of fit, and the probability of a larger chi-squared if the model is correct.
-    dof : int
-    snr : ndarray, shape (n,)
-        Root of the decrease of chi-squared by the flare.
-    log_k : ndarray, shape (n,), or (n, 2) of two temperatures
-    amplitudes : ndarray, shape (n, n_linear)
-        Parameters of the model's `counts`.
-    """
-
+    #: Names of the quantities, in the order of the last axis of estimates and intervals.
     names: tuple[str, ...]
     units: tuple[str, ...]
+    #: Smallest possible values: 1 of a jump, 0 of light.
     bounds: tuple[float, ...]
+    #: Maximum-likelihood estimates, shape (n, n_derived).
     estimates: Float
+    #: Covariance from the Fisher information at the fit, shape (n, n_derived, n_derived).
     covariance: Float
+    #: Nominal coverage of the intervals.
     levels: tuple[float, ...]
+    #: Lower ends of the intervals, shape (n_level, n, n_derived); if infinite or a bound, `high` is an upper limit.
     low: Float
+    #: Upper ends of the intervals, shape (n_level, n, n_derived); if infinite, `low` is a lower limit.
     high: Float
+    #: Goodness of fit, shape (n,).
     chi2: Float
+    #: Probability of a larger chi-squared if the model is correct, shape (n,).
     p_value: Float
     dof: int
+    #: Root of the decrease of chi-squared by the flare, shape (n,).
     snr: Float
+    #: Natural logarithm of the temperature, shape (n,), or (n, 2) of two temperatures.
     log_k: Float
+    #: Parameters of the model's `counts`, shape (n, n_linear).
     amplitudes: Float
 
     @property
@@ -363,22 +352,17 @@ def fit_sums(sums: Float, model: FlareModel, reduction: Reduction) -> tuple[Floa
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """Expected errors of a measurement, from the Fisher information.
-
-    Attributes
-    ----------
-    names, units : tuple of str
-    values, errors : ndarray, shape (n_derived,)
-    covariance : ndarray, shape (n_derived, n_derived)
-    snr : float
-        S/N of the flare.
-    """
+    """Expected errors of a measurement, from the Fisher information."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
+    #: Quantities of the flare, shape (n_derived,).
     values: Float
+    #: Standard errors, shape (n_derived,).
     errors: Float
+    #: Covariance of the estimates, shape (n_derived, n_derived).
     covariance: Float
+    #: S/N of the flare.
     snr: float
 
     @property
