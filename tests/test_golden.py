@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 from commands import run
+from marks import long_but
 
 from mauvecl.study.study import Study
 from mauvecl.web.state import State
@@ -70,8 +71,7 @@ def thinned(path: Path) -> Table:
     return table[:: max(1, len(table) // MAX_ROWS)]
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", QUESTIONS)
+@pytest.mark.parametrize("name", long_but(QUESTIONS, "exposure", "limit-of-amplitude", "map", "visible"))
 def test_tables_of_default_questions_are_unchanged(name: str, tmp_path: Path) -> None:
     found = answer(name, tmp_path)
     expected = sorted((GOLDEN / name).glob("*.ecsv"))

@@ -106,6 +106,7 @@ def test_same_files_give_the_same_packages(packages: Packages, tmp_path: Path) -
     assert again.sdist == packages.sdist
 
 
+@pytest.mark.long
 def test_sdist_holds_every_file_and_no_link(packages: Packages, unpacked: Path) -> None:
     assert files_below(unpacked) - {"PKG-INFO"} == files_below(packages.tree)
     assert not [path for path in unpacked.rglob("*") if path.is_symlink()]

@@ -10,6 +10,7 @@ from typing import Any
 import astropy.units as u
 import numpy as np
 import pytest
+from marks import long_but
 from refusals import refused
 
 import mauvecl
@@ -163,7 +164,7 @@ def test_tables_have_units() -> None:
     np.testing.assert_allclose(again.flux_flam, Source.from_library("G2V").flux_flam)
 
 
-@pytest.mark.parametrize("name", ["Source", "Expectation", *ANSWERS])
+@pytest.mark.parametrize("name", long_but(["Source", "Expectation", *ANSWERS], "Source", "Expectation", "snr", "limit"))
 def test_pictures_are_drawn_into_given_axes(engine: Engine, name: str) -> None:
     """Draw into the second of three axes; nothing outside of them changes."""
     import matplotlib.pyplot as plt

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import cache
 from typing import Any, Self
 
 from pydantic import BaseModel, ValidationInfo, field_validator
@@ -51,11 +52,16 @@ class Section(Record):
     def _in_its_unit(cls, given: Any, info: ValidationInfo) -> Any:
         """Convert a Quantity to the unit of the key, and times and coordinates to text."""
         key = str(info.field_name)
-        unit = first(cls.model_fields[key], Unit)
+        unit = _unit_of(cls, key)
         if unit is not None and not getattr(given, "ndim", 0):
             # The annotation converts it.
             return given
         return plain(key, given, "" if unit is None else unit.name)
+
+
+@cache
+def _unit_of(section: type[Section], key: str) -> Unit | None:
+    return first(section.model_fields[key], Unit)
 
 
 def fields_of(section: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], FieldInfo]]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.table import QTable
+from marks import long_but
 from refusals import refused
 
 from mauvecl.answers.limits.assumptions import what_matters
@@ -77,18 +78,22 @@ def test_limit_inverts_detect(engine: Engine) -> None:
 
 @pytest.mark.parametrize(
     "harder",
-    [
-        {"observation": {"exposure_s": 25.0}},
-        {"observation": {"temperature_c": 25.0}},
+    long_but(
+        [
+            {"observation": {"exposure_s": 25.0}},
+            {"observation": {"temperature_c": 25.0}},
+            {"flare": {"amplitudes": [0.12]}},
+            {"sky": {"surface_brightness": 14.0}},
+        ],
         {"flare": {"amplitudes": [0.12]}},
-        {"sky": {"surface_brightness": 14.0}},
-    ],
+    ),
 )
 def test_limits_are_monotone(engine: Engine, harder: dict[str, Any]) -> None:
     (plain,), (worse,) = (limiting_magnitude(study(run=FEW, **c), engine).limits for c in ({}, harder))
     assert worse.value.value < plain.value.value
 
 
+@pytest.mark.long
 def test_cooler_detector_gains_as_predicted(engine: Engine) -> None:
     """Compare 13 and 21 deg C, whose dark currents have a ratio of 0.58, with the closed form."""
     few = {"statistics": ("matched",)}
@@ -175,6 +180,7 @@ def test_assumptions_move_the_limit_as_predicted() -> None:
     assert Study.build(lossy.model_dump(), "again") == lossy
 
 
+@pytest.mark.long
 def test_progress_has_one_total_and_moves_with_each_simulation() -> None:
     """Three limits, of which several are computed at the same time: never back, and at the end all of it."""
     study = Study().with_settings(

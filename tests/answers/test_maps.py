@@ -72,6 +72,7 @@ def test_probability_decreases_with_magnitude(engine: Engine) -> None:
     assert (np.abs(found.probability - found.closed_form) < 5 * (error + 0.4 * 0.03) + 1e-3).all()
 
 
+@pytest.mark.long
 def test_map_writes_table_and_picture(engine: Engine, tmp_path: Path) -> None:
     found = detection_map(study(MAGNITUDE, AMPLITUDE), engine)
     assert {path.name for path in found.write(tmp_path)} == {"map.ecsv", "map.fits", "study.toml"}

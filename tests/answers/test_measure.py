@@ -202,6 +202,7 @@ def test_flare_from_a_file_has_fluxes_and_no_temperature(engine: Engine) -> None
     assert truth["flux 200-320 nm"] > 0
 
 
+@pytest.mark.long
 def test_sweep_and_seed_change_the_tables(engine: Engine, tmp_path: Path) -> None:
     study = study_of("measure.fits=30").with_settings(['sweep.axes=[{quantity="exposure", values=[50, 300]}]'])
     answer = measure(study, engine)
@@ -216,6 +217,7 @@ def test_sweep_and_seed_change_the_tables(engine: Engine, tmp_path: Path) -> Non
     assert (tmp_path / "fit.png").stat().st_size > 10_000
 
 
+@pytest.mark.long
 def test_measure_command_writes_its_files(tmp_path: Path) -> None:
     words = ("--star", "M3V", "--magnitude", "9", "--amplitude", "0.5", "--balmer-jump", "2", "--fits", "40")
     done = run("measure", *words, "--nuisance", "dark=free", "-o", "out", folder=tmp_path)

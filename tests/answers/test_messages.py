@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
+from marks import long_but
 
 from mauvecl.answers.signal.simulate import simulate
 from mauvecl.host.files.json_text import json_text
@@ -29,7 +30,10 @@ def test_json_has_no_nan_and_no_infinity() -> None:
     }
 
 
-@pytest.mark.parametrize(("magnitude", "dark"), [(7.4, False), (20.0, False), (24.0, True), (25.0, True)])
+@pytest.mark.parametrize(
+    ("magnitude", "dark"),
+    long_but([(7.4, False), (20.0, False), (24.0, True), (25.0, True)], (20.0, False), (24.0, True)),
+)
 def test_star_without_light_is_reported(magnitude: float, dark: bool) -> None:
     """Report a star that makes less than one electron in an exposure, since its S/N is 0."""
     study = Study().with_settings([f"star=[{{library = 'G2V', magnitude = {magnitude}}}]"])

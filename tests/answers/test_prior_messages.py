@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from answers import small
+from marks import long_but
 from typer.testing import CliRunner
 
 from mauvecl.answers.detection.detect import detect
@@ -52,7 +53,14 @@ def test_every_prior_is_tested() -> None:
 
 
 # Far from the expectation no limit settles, which is refused: one prior near it.
-@pytest.mark.parametrize(("verb", "name"), [(v, n) for v in VERBS for n in PRIORS if v != "limit" or n == "light_loss"])
+@pytest.mark.parametrize(
+    ("verb", "name"),
+    long_but(
+        ((v, n) for v in VERBS for n in PRIORS if v != "limit" or n == "light_loss"),
+        *(("detect", n) for n in PRIORS),
+        *((v, "light_loss") for v in VERBS if v not in ("detect", "limit")),
+    ),
+)
 def test_prior_that_excludes_the_expectation_is_reported(engine: Engine, verb: str, name: str) -> None:
     holds, misses = ({"processes": {name: {"uniform": ends}}} for ends in PRIORS[name])
     assert said(verb, engine, **holds) == []

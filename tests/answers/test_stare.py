@@ -167,6 +167,7 @@ def test_stare_too_short_for_a_search_is_reported(stares):
     assert short.table["found"][0] == -1
 
 
+@pytest.mark.long
 def test_stare_command_writes_its_files(tmp_path):
     words = [
         "stare",

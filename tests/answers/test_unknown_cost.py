@@ -73,6 +73,7 @@ def test_cost_equals_that_of_the_methods(
     assert not marginal_lines(none)
 
 
+@pytest.mark.long
 def test_every_answer_reports_the_cost_of_unknowns(engine: Engine) -> None:
     small = study().with_settings(
         ["run.fap=0.01", "run.realisations=20000", "map.x={quantity='magnitude', values=[6, 8]}",
@@ -196,6 +197,7 @@ def test_documentation_lists_the_usual_unknowns() -> None:
             assert text in page
 
 
+@pytest.mark.long
 def test_priors_are_drawn_jointly_on_both_instruments() -> None:
     """Check that no usual setting needs noise to be drawn separately, which priors do not allow."""
     payloads, temperatures = ("mauve", "mauve-electrons"), (-20.0, 0.0, 13.0, 21.0, 25.0)

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import typer.main
 from answers import FEW, QUICK
+from marks import long_but
 
 import mauvecl
 from mauvecl import Study
@@ -40,7 +41,7 @@ def test_command_line_has_every_verb_in_order() -> None:
     assert list(group.commands)[: len(VERBS)] == list(VERBS)  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize("name", long_but(QUICK, *(QUICK.keys() - {"change", "simulate"})))
 def test_progress_ends_at_its_total(name: str, engine: Engine) -> None:
     """Pass all arguments by position, since all verbs have the same."""
     seen: list[tuple[int, int]] = []

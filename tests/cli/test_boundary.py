@@ -214,6 +214,7 @@ def test_too_many_frames_are_refused(tmp_path: Path) -> None:
     assert "frames" in refused(*OBSERVE, "--set", "observation.changes.frame_s=1e-9", folder=tmp_path)
 
 
+@pytest.mark.long
 def test_long_chains_of_instruments_are_refused(tmp_path: Path) -> None:
     for i in range(100):
         (tmp_path / f"{i}.toml").write_text(f"extends = '{i + 1}.toml'\n")

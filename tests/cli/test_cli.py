@@ -288,6 +288,7 @@ def test_snr_answers_the_budgets_of_the_paper_and_sweeps(tmp_path: Path) -> None
         assert (tmp_path / "again" / name).read_text() == (tmp_path / "swept" / name).read_text()
 
 
+@pytest.mark.long
 def test_gaussian_writes_its_tables(tmp_path: Path) -> None:
     words = ("--star", "G2V", "-n", "10000", "--fap", "0.01", "--sweep", "magnitude=6,9", "--statistic", "matched")
     shown = run("gaussian", *words, folder=tmp_path).stdout
@@ -336,6 +337,7 @@ def test_exposure_prints_its_row(tmp_path: Path) -> None:
     assert row["snr_one_frame_less"] < 10 <= row["snr"]
 
 
+@pytest.mark.long
 def test_map_writes_its_table(tmp_path: Path) -> None:
     words = ("--star", "G2V", "--x", "magnitude:6:9:3", "--y", "amplitude=0.05,0.2", "-n", "20000", "--fap", "0.01")
     shown = run("map", *words, "--statistic", "matched", folder=tmp_path).stdout

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
 from refusals import refused
 from typer.testing import CliRunner
 
@@ -34,6 +35,7 @@ def test_assumptions_about_a_spectrum_come_first(tmp_path: Path) -> None:
     assert (again.star[0].wavelength_unit, again.star[0].magnitude) == ("Angstrom", 8.0)
 
 
+@pytest.mark.long
 def test_star_is_extended_and_binned(tmp_path: Path) -> None:
     flags = ("--star", str(FILES / "vb8_stiswfcnic_004.fits"), "--extend", "M3V", "--bin-nm", "2", "-m", "9")
     reported = simulated(tmp_path, *flags)

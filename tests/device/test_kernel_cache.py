@@ -184,6 +184,7 @@ Path.write_bytes = Path.write_text = full
     assert files_of(tmp_path) == []
 
 
+@pytest.mark.long
 def test_error_without_free_space_names_remedy(tmp_path: Path) -> None:
     said = run(tmp_path, "kernel_cache.MIN_FREE_BYTES = 2**60")["sentence"]
     assert "no folder for compiled kernels" in said

@@ -31,6 +31,7 @@ def test_device_is_chosen_by_name_or_number() -> None:
     assert Engine(device="0").device == present[0]
 
 
+@pytest.mark.long
 def test_error_names_missing_linker(tmp_path) -> None:
     """Raise an error that names the remedy, where PoCL would abort Python."""
     code = "from mauvecl.device.engine import Engine, DeviceError\ntry: Engine()\nexcept DeviceError as e: print(e)"

@@ -79,6 +79,7 @@ def test_nothing_changes_without_the_wheel(wheel: Path) -> None:
         assert "OCL_ICD_VENDORS" not in os.environ
 
 
+@pytest.mark.long
 def test_pocl_is_found_despite_broken_driver(wheel: Path) -> None:
     environment = {name: text for name, text in os.environ.items() if name not in vendors.FOLDER_VARIABLES}
     run = subprocess.run(

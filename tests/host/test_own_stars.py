@@ -288,6 +288,7 @@ def test_download_without_a_network_raises() -> None:
         hst_collections.fetch("HD 37202", base="http://127.0.0.1:9/")
 
 
+@pytest.mark.long
 def test_library_commands_work(tmp_path: Path, archive: str) -> None:
     run = CliRunner().invoke
     files = [str(text_file(tmp_path / f"{name}.txt")) for name in ("one", "two")]

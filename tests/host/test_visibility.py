@@ -61,6 +61,7 @@ def test_targets_near_the_pole_are_always_visible(margin: float) -> None:
     assert from_pole[seen].max(initial=-1.0) == pytest.approx(22.0 - margin, abs=0.1)
 
 
+@pytest.mark.long
 def test_constraints_agree_with_m4opt() -> None:
     """Compare angles with `m4opt.constraints` 2.3.1, by astropy's horizontal frame.
 

@@ -50,6 +50,7 @@ def test_unfitted_shape_leaves_at_most_the_allowed_residual(known):
     assert len(several) <= 2
 
 
+@pytest.mark.long
 def test_separate_flares_are_found_in_order_of_value(known):
     events = [Event(1500.0, 40.0, 0.1), Event(3000.0, 60.0, 0.3), Event(4500.0, 100.0, 0.05)]
     several = found(known, events)

@@ -7,6 +7,7 @@ from typing import Any
 import astropy.units as u
 import numpy as np
 import pytest
+from marks import long_but
 
 from mauvecl.host.stars.bands import band
 from mauvecl.host.stars.source import Source
@@ -68,7 +69,7 @@ def events(rng: np.random.Generator, most: int) -> tuple[EventChoice, ...]:
     return tuple(texts)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", long_but(range(12), 0, 1, 2))
 def test_drawn_light_carries_the_stated_energy(seed: int) -> None:
     """Draw stars, distances, bands, shapes, temperatures and cooling at random.
 
@@ -129,6 +130,7 @@ def test_replacing_flare_carries_the_energy_it_adds(seed: int) -> None:
         assert scale.erg_per_s == pytest.approx(sphere * drawn, rel=5e-4)
 
 
+@pytest.mark.long
 def test_fast_cooling_flare_keeps_its_energy() -> None:
     """Include cooling within a frame and flares shorter than a frame."""
     for half, fold in ((0.5, 0.5), (1.0, 20.0), (60.0, 0.5), (300.0, 3000.0)):

@@ -34,7 +34,7 @@ def test_rate_of_one_filter_equals_the_closed_form():
     assert alone.trials_per_frame(5.0) == pytest.approx(1.0, rel=1e-4)
 
 
-@pytest.mark.parametrize("widths", [HALF_WIDTHS_S, (20.0, 40.0, 80.0, 160.0)])
+@pytest.mark.parametrize("widths", [pytest.param(HALF_WIDTHS_S, marks=pytest.mark.long), (20.0, 40.0, 80.0, 160.0)])
 def test_rate_agrees_with_importance_sampling(widths):
     """Compare one alarm a day to one in 10^10 days, for one sum and for three temperatures.
 

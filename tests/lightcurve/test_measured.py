@@ -120,6 +120,7 @@ def test_temperature_is_measured_with_correct_errors(
     assert spread > 1.15 if cooling is not STEADY else spread < 1.005
 
 
+@pytest.mark.long
 def test_known_conditions_and_gaps_are_respected() -> None:
     """Measure frames without noise: 9000 K, area and luminosity in every bin, and no bin over a gap."""
     how = {"thermal": 3.0, "throughput": Sinusoid(0.2, 300.0), "variability": Sinusoid(0.05, 200.0), "orbit_s": 400.0}
@@ -210,6 +211,7 @@ def test_intervals_of_a_joint_fit_agree_with_its_errors() -> None:
     np.testing.assert_allclose(high, 1.0, atol=0.15)
 
 
+@pytest.mark.long
 def test_joint_fit_of_a_steady_flare_leaves_the_cooling_open() -> None:
     lit, _ = lit_frames(STEADY, Stare.of(150.0))
     found = fit_cooling(np.array([one.recorded_dn for one in lit]), quiet(), model(), levels=(0.95,), **START)
@@ -347,6 +349,7 @@ def test_intervals_of_joint_fits_cover(unknown: bool, count: int, engine: Engine
         assert ((least <= inside) & (inside <= most)).all(), (inside, least, most)
 
 
+@pytest.mark.long
 def test_unknown_levels_do_not_mislead_the_start_of_joint_fits() -> None:
     """Fit 60 stares with unknown levels of dark and star: the peak is always found to 0.5 s."""
     nuisances = Nuisances.of(quiet(), {"dark": np.inf, "light": 0.02})

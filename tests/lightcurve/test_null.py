@@ -188,6 +188,7 @@ def test_false_alarms_in_random_stares_are_as_requested(stares):
     assert np.mean(plain) > 0.95
 
 
+@pytest.mark.long
 def test_false_alarms_with_unknown_noise_are_as_requested(stares):
     """Draw drifting stars and detectors some degrees warmer or colder, which the null includes.
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from marks import long_but
 from scenes import instrument, star
 from scipy import stats
 
@@ -63,7 +64,7 @@ class Case:
         return total
 
 
-@pytest.mark.parametrize("seed", range(SEEDS))
+@pytest.mark.parametrize("seed", long_but(range(SEEDS), *range(6)))
 def test_sums_of_frames_with_hits_equal_independent_draws(engine: Engine, seed: int) -> None:
     """Compare the engine's sums with independent draws of each frame, in 60 classes of equal count.
 

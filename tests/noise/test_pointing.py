@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from marks import long_but
 from refusals import refused
 from scipy import integrate, stats
 
@@ -50,7 +51,9 @@ def occupied(time_s: float) -> float:
     return 200.0 / (200.0 + WAIT_S) * float(-np.expm1(-rates * time_s))
 
 
-@pytest.mark.parametrize(("time_s", "later_s"), [(50.0, 100.0), (500.0, 30.0), (3000.0, 300.0)])
+@pytest.mark.parametrize(
+    ("time_s", "later_s"), long_but([(50.0, 100.0), (500.0, 30.0), (3000.0, 300.0)], (3000.0, 300.0))
+)
 def test_occupation_and_its_correlation_in_time(time_s: float, later_s: float) -> None:
     """P(drift at t) and P(drift at t and t + h) follow in closed form."""
     at = np.array([time_s, time_s + later_s])
@@ -63,6 +66,7 @@ def test_occupation_and_its_correlation_in_time(time_s: float, later_s: float) -
     assert abs((lost[:, 0] & lost[:, 1]).mean() - both) < SIGMA * np.sqrt(both * (1 - both) / n)
 
 
+@pytest.mark.long
 def test_moments_of_the_loss() -> None:
     """Long after the start, the loss in a drift is a share of its depth that is uniform between 0 and 1."""
     lost = DRIFTS.losses(NUMBERS, np.array([20_000.0]), 1e-6, SEED)[:, 0]

@@ -260,6 +260,7 @@ def test_modes_have_the_covariance() -> None:
     np.testing.assert_allclose(errors.sd(nm), np.sqrt(np.diag(covariance)))
 
 
+@pytest.mark.long
 def test_unknowns_of_a_calibrated_instrument_are_its_modes(answer: CalibrateAnswer, tmp_path: Path) -> None:
     """The drawn throughputs scatter as the fitted covariance says, with the error of a variance of 256 draws."""
     answer.write(tmp_path)

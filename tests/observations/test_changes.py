@@ -175,6 +175,7 @@ def peaks(time: np.ndarray, values: np.ndarray, frequency: np.ndarray) -> tuple[
     return power[np.arange(len(values)), best], frequency[best]
 
 
+@pytest.mark.long
 def test_recovered_periods_are_those_of_another_periodogram() -> None:
     """Six cells; the thresholds have errors of some 20 % of the false-alarm probability, which moves shares by 0.03.
 

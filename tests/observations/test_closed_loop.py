@@ -123,6 +123,7 @@ def test_the_level_follows_rotation_and_the_noise_does_not() -> None:
     assert level.excess == pytest.approx(2.0, rel=0.06)
 
 
+@pytest.mark.long
 def test_independent_frames_are_called_red_as_often_as_stated() -> None:
     """2.5 % of light curves at each number of frames; each range fails by chance once in ten thousand times."""
     rng = np.random.default_rng(295)

@@ -111,6 +111,7 @@ def test_a_file_larger_than_memory_is_reduced_in_pieces(write, tmp_path: Path) -
     np.testing.assert_allclose(found["scatter"], np.sqrt((np.diff(PATTERN) ** 2).mean() / 2))
 
 
+@pytest.mark.long
 def test_pieces_give_what_the_whole_gives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     truth = Truth.of(n=1500, n_pixel=50)
     flux = truth.flux.copy()

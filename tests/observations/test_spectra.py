@@ -258,6 +258,7 @@ def test_look_alikes_are_rejected_by_their_spectrum(kind: str, spectrum: str, si
     assert (found.reason == "") == (kind == "flare")
 
 
+@pytest.mark.long
 def test_one_pixel_of_several_frames_is_no_flare() -> None:
     added = np.zeros((N, light().size))
     added[300:306, 5] = 12 * np.sqrt(model().variance(light())[5])
@@ -266,6 +267,7 @@ def test_one_pixel_of_several_frames_is_no_flare() -> None:
     assert [event.kind for event in near] == ["cosmic ray"]
 
 
+@pytest.mark.long
 def test_single_frames_that_only_the_weighted_sums_show_are_flagged() -> None:
     spike = np.zeros((N, 1))
     spike[400] = 1.0
@@ -399,6 +401,7 @@ def test_study_keeps_the_light_and_finds_cool_flares_with_it() -> None:
     assert not any("free" in line for line in messages)
 
 
+@pytest.mark.long
 def test_study_keeps_the_light_and_flares_like_its_changes_are_candidates() -> None:
     found, messages = verdicts(0.3, frame={"light": 1e-6})
     assert found == {900.0: "rejected", 1800.0: "candidate", 2900.0: "detected"}

@@ -154,6 +154,7 @@ def test_columns_of_astropys_times_are_read(tmp_path: Path, ending: str) -> None
     np.testing.assert_allclose(frames.time_s, TIME - 15, atol=2e-5)
 
 
+@pytest.mark.long
 def test_tables_of_an_analysis_state_epoch_scale_and_place(tmp_path: Path) -> None:
     hdu = fits.table_to_hdu(Table({"TIME": TIME, "FLUX": FLUX}))
     hdu.header.update({"TIMEUNIT": "s", "MJDREF": 61_299.0, "TREFPOS": "TOPOCENTER", "INSTRUME": "mauve"})

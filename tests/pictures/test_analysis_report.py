@@ -11,6 +11,7 @@ from mauvecl import Study, analyse
 from mauvecl.observations.frames import Frames
 
 
+@pytest.mark.long
 def test_report_has_every_table_remark_and_picture() -> None:
     pytest.importorskip("matplotlib")
     time, rng = np.arange(300) * 60.0, np.random.default_rng(1)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from marks import long_but
 
 import mauvecl
 from mauvecl.answers.answer import Answer
@@ -47,7 +48,7 @@ CUT = re.compile(r"\w+\[:MOST_\w+\]|zip\((?:COLOURS, \w+(?:\.items\(\))?|\w+, CO
 WHOLE = {"noise-budget"}
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", long_but(CASES, "detect", "measure"))
 def test_pictures_of_a_part_say_so(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     make, of, most = CASES[case]
     monkeypatch.setattr(*most, 1)

@@ -23,6 +23,7 @@ FILES = {912: DATA / "spectra" / "ADLeo_912s.dat", 1497: DATA / "flares" / "ADLe
 QUIET, GAP_NM = DATA / "flares" / "adleo_quiescent2.dat", (322.0, 368.0)
 
 
+@pytest.mark.long
 def test_blackbody_is_rejected_and_jump_is_measured(engine: Engine) -> None:
     """Fit 200 exposures of 50 s; 1 % of good fits have p < 0.01, more than 40 % of them once in 1e40."""
     star = Source.read(QUIET, wavelength_unit="Angstrom", extend="M3V")
@@ -59,6 +60,7 @@ def ad_leo_words(seconds: int) -> tuple[str | Path, ...]:
     return ("measure", *star, *flare, "--continue-at", "9500", "--as-observed", "--no-pictures", "-o", "out")
 
 
+@pytest.mark.long
 def test_command_line_measures_the_flare(tmp_path: Path) -> None:
     """Measure 200 exposures of 50 s; 1 % of good fits have p < 0.01, more than 40 % of them once in 1e40.
 

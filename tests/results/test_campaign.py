@@ -77,6 +77,7 @@ def test_overlapping_stacks_allow_more_per_test() -> None:
     assert per_test(5e-4, 600, 10, step=1).overlapping is None
 
 
+@pytest.mark.long
 def test_detection_reports_test_and_campaign(engine: Engine) -> None:
     study = Study.build(
         {

@@ -25,6 +25,7 @@ def found(engine: Engine, *, magnitude: float = 7.4, exposure: float = 5.0, **op
     return {d.statistic: d for d in departures(engine.detect(quiet, [flare], **kind), FAP)}
 
 
+@pytest.mark.long
 def test_nominal_payload_is_gaussian(engine: Engine) -> None:
     """Check that nothing differs at 50 s; six values exceed 4 standard errors once in 2500 seeds."""
     for d in found(engine, exposure=50.0, statistics=tuple(STATISTICS)).values():

@@ -129,6 +129,7 @@ def test_tail_intervals_have_nominal_coverage(engine: Engine) -> None:
     assert special.bdtr(49, 60, 0.95) < 5e-4
 
 
+@pytest.mark.long
 def test_detection_reports_sampled_tails(engine: Engine) -> None:
     quiet, *flares = star(amplitudes=(0.05, 0.24), payload=instrument(**PART))
     kind = {"realisations": 100_000, "seed": 2, "statistics": ("chi2", "matched")}

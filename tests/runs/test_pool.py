@@ -104,6 +104,7 @@ def test_shards_of_every_kind_of_request_join(engine: Engine) -> None:
     assert pool.standing.of == 2 * 3
 
 
+@pytest.mark.long
 def test_devices_of_different_form_give_one_answer(scene: list[Expectation], engine: Engine) -> None:
     """Share the work between engines with 16 realisations and with 1 per work-item."""
     quiet, *flares = scene
@@ -232,9 +233,11 @@ AXES = {"x": {"quantity": "magnitude", "values": [6, 8, 10]}, "y": {"quantity": 
     [
         (lambda s, e: detect(s, e).table, {}),
         (lambda s, e: snr(s, e).element, {"sweep": {"axes": [{"quantity": "exposure", "values": [5, 50]}]}}),
-        (lambda s, e: limiting_magnitude(s, e).table, {}),
+        pytest.param(lambda s, e: limiting_magnitude(s, e).table, {}, marks=pytest.mark.long),
         (lambda s, e: detection_map(s, e).table, {"map": AXES}),
-        (lambda s, e: detection_map(s, e).table, {"map": AXES, "unknowns": {"draws": 3}}),
+        pytest.param(
+            lambda s, e: detection_map(s, e).table, {"map": AXES, "unknowns": {"draws": 3}}, marks=pytest.mark.long
+        ),
     ],
     ids=["detect", "snr", "limit", "map", "unknowns"],
 )

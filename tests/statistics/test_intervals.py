@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from marks import long_but
 from scipy import optimize, stats
 
 from mauvecl.statistics.detection_interval import _orthant, detection_interval
@@ -68,7 +69,7 @@ def test_interval_has_nominal_coverage(kind: str, fap: float, n: int, seeds: int
         assert np.mean([x.high - x.low for x in found[:100]]) < 0.95 * np.mean([high - low for low, high in ends])
 
 
-@pytest.mark.parametrize("probability", [0.15, 0.5, 0.99, 0.998, 0.9995])
+@pytest.mark.parametrize("probability", long_but([0.15, 0.5, 0.99, 0.998, 0.9995], 0.5, 0.998))
 def test_interval_covers_near_the_ends(probability: float) -> None:
     """Include few missed flares of 1000, and hardly more detections than false alarms; fails in 3e-7 of seeds."""
     for kind in ("matched", "chi2"):

@@ -115,6 +115,7 @@ def test_number_of_effective_terms() -> None:
     assert QuadraticForm(np.array([3.0, 1.0]), np.zeros(2)).effective_terms == pytest.approx(1.6)
 
 
+@pytest.mark.long
 def test_unequal_weights_against_simulation() -> None:
     """Compare five values within 5 standard errors of 4e5 draws; one fails in 3e5 seeds."""
     generator = np.random.default_rng(77)

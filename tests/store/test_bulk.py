@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
+from marks import long_but
 from refusals import refused
 from stores import CHUNK, LAST, Painter, flip, forked, full_after, killed, study, tree
 from typer.testing import CliRunner
@@ -123,42 +124,38 @@ def swap(a: Path, b: Path) -> None:
     b.write_bytes(a_bytes)
 
 
-FAULTS: list[tuple[str, Callable[[Path], object], dict[str, str]]] = [
-    ("flipped byte", lambda p: flip(p / CHUNK), {CHUNK: "damaged"}),
-    ("flipped CRC", lambda p: flip(p / LAST, -1), {LAST: "damaged"}),
-    ("cut short", lambda p: (p / CHUNK).write_bytes((p / CHUNK).read_bytes()[:-10]), {CHUNK: "damaged"}),
-    ("missing", lambda p: (p / CHUNK).unlink(), {CHUNK: "missing"}),
-    (
-        "swapped",
+FAULTS: dict[str, tuple[Callable[[Path], object], dict[str, str]]] = {
+    "flipped byte": (lambda p: flip(p / CHUNK), {CHUNK: "damaged"}),
+    "flipped CRC": (lambda p: flip(p / LAST, -1), {LAST: "damaged"}),
+    "cut short": (lambda p: (p / CHUNK).write_bytes((p / CHUNK).read_bytes()[:-10]), {CHUNK: "damaged"}),
+    "missing": (lambda p: (p / CHUNK).unlink(), {CHUNK: "missing"}),
+    "swapped": (
         lambda p: swap(p / CHUNK, p / "star-1/quiescent/c/2/0"),
         {CHUNK: "foreign", "star-1/quiescent/c/2/0": "foreign"},
     ),
-    (
-        "flipped byte in the list",
+    "flipped byte in the list": (
         lambda p: flip(p / "star-1/quiescent/digests.txt", 5),
         {"star-1/quiescent/c/0/0": "unlisted"},
     ),
-    ("flipped byte in the study", lambda p: flip(p / "zarr.json", 40), {"zarr.json": "?"}),
-    (
-        "a missing description",
+    "flipped byte in the study": (lambda p: flip(p / "zarr.json", 40), {"zarr.json": "?"}),
+    "a missing description": (
         lambda p: (p / "star-1/flare-1/zarr.json").unlink(),
         {"star-1/flare-1/zarr.json": "missing"},
     ),
-    ("flipped calibration", lambda p: flip(p / "star-1/bias_dn/c/0"), {"star-1/bias_dn/c/0": "damaged"}),
-]  # fmt: skip
+    "flipped calibration": (lambda p: flip(p / "star-1/bias_dn/c/0"), {"star-1/bias_dn/c/0": "damaged"}),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(("break_it", "expected"), [f[1:] for f in FAULTS], ids=[f[0] for f in FAULTS])
-def test_damage_is_found_and_repaired_to_the_bit(
-    path: Path, engine: Engine, break_it: Callable[[Path], object], expected: dict[str, str]
-) -> None:
+@pytest.mark.parametrize("fault", long_but(FAULTS, "flipped byte", "flipped byte in the study", "missing"))
+def test_damage_is_found_and_repaired_to_the_bit(path: Path, engine: Engine, fault: str) -> None:
+    break_it, expected = FAULTS[fault]
     assert bulk.verify(path) == []
     before = tree(path)
     break_it(path)
-    found = {fault.key: fault.state for fault in bulk.verify(path)}
+    found = {one.key: one.state for one in bulk.verify(path)}
     assert found.keys() == expected.keys()
     assert all(state in (found[key], "?") for key, state in expected.items())
-    assert all(fault.mended for fault in bulk.verify(path, engine, repair=True))
+    assert all(one.mended for one in bulk.verify(path, engine, repair=True))
     # A list of digests keeps the line that could not be read.
     after = tree(path)
     assert {k: v for k, v in after.items() if "digests" not in k} == {
@@ -167,6 +164,7 @@ def test_damage_is_found_and_repaired_to_the_bit(
     assert bulk.verify(path, engine, redraw=True) == []
 
 
+@pytest.mark.long
 def test_redrawing_finds_damage_with_valid_digests(tmp_path: Path, path: Path, engine: Engine) -> None:
     """Insert chunk and digest of another seed's store, which are consistent with each other."""
     other = tmp_path / "other.zarr"

@@ -88,6 +88,7 @@ def test_limit_over_unknowns_has_the_power_on_average(engine: Engine) -> None:
     assert table["unknown_low"][0] < table["unknown_high"][0]
 
 
+@pytest.mark.long
 def test_shares_equal_those_of_a_linear_model() -> None:
     draws = drawn(study({"draws": 2048}))
     column = dict(zip(draws.names, draws.values.T, strict=True))
@@ -105,6 +106,7 @@ def test_average_over_unknowns_equals_the_mean() -> None:
     assert average([Interval(1.0, 0.99, 1.0)] * 4).high == 1.0
 
 
+@pytest.mark.long
 def test_map_is_the_mean_of_its_draws(engine: Engine) -> None:
     axes = {
         "x": {"quantity": "magnitude", "values": [7.0, 10.5]},

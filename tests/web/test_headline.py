@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from marks import long_but
 from scipy.interpolate import RegularGridInterpolator
 
 pytest.importorskip("bokeh")
@@ -61,7 +62,7 @@ def test_statistic_that_unknowns_exclude_has_one_number(tmp_path: Path) -> None:
     assert "cannot be marginalised" in usual["interval"]
 
 
-@pytest.mark.parametrize("chosen", UNKNOWN)
+@pytest.mark.parametrize("chosen", long_but(UNKNOWN, UNKNOWN[0]))
 def test_one_simulation_gives_both_numbers(chosen: str, tmp_path: Path) -> None:
     """Compare all bits with `detect` with and without the usual unknowns."""
     closed = forms_of(f"{M_DWARF}&realisations=10000&fap=0.05&unknown={chosen}", tmp_path)
@@ -113,7 +114,7 @@ def test_other_payload_is_that_of_its_own_question(tmp_path: Path) -> None:
     assert other_payloads(forms_of(M_DWARF, tmp_path)) == f"With the payload mauve-electrons: {reported}."
 
 
-@pytest.mark.parametrize("of", ["amplitude", "magnitude"])
+@pytest.mark.parametrize("of", long_but(["amplitude", "magnitude"], "magnitude"))
 def test_picture_of_the_limit_has_simulated_points_of_its_own_axis_only(of: str, tmp_path: Path) -> None:
     closed = forms_of(f"{M_DWARF}&realisations=10000&fap=0.05&of={of}", tmp_path)
     answers = SIMULATIONS["limit"](closed.study, Pool(LocalWorkers([None])))

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from marks import long_but
 
 pytest.importorskip("bokeh")
 
@@ -84,7 +85,7 @@ def _study_of(command: str, monkeypatch: pytest.MonkeyPatch) -> Study:
     return found
 
 
-@pytest.mark.parametrize("number", range(len(LINKS) + 20))
+@pytest.mark.parametrize("number", long_but(range(len(LINKS) + 20), *range(len(LINKS) + 2)))
 def test_command_and_program_are_the_question(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """For every tab: links of choice, and 20 random ones; what the verb does not use is not said."""
     monkeypatch.chdir(tmp_path)
@@ -160,7 +161,7 @@ def test_own_flare_answers_as_its_file(tmp_path: Path, monkeypatch: pytest.Monke
     assert abs(page.chance - other.chance) > 0.01
 
 
-@pytest.mark.parametrize("tab", ["detection", "measure"])
+@pytest.mark.parametrize("tab", long_but(["detection", "measure"], "detection"))
 def test_observed_flare_without_its_star_answers_as_its_files(
     tab: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -207,6 +208,7 @@ def test_observed_flare_without_its_star_answers_as_its_files(
         assert np.abs(found.flare.source_electrons / page.flare.source_electrons - 1).max() > 0.01
 
 
+@pytest.mark.long
 def test_own_added_spectrum_answers_as_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In Angstrom, for a band: as the command line reads it itself, and as the command that the page prints."""
     monkeypatch.chdir(tmp_path)

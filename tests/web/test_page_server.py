@@ -31,6 +31,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from commands import run
+from marks import long_but
 from refusals import refused
 
 pytest.importorskip("bokeh")
@@ -361,7 +362,7 @@ def test_changed_light_changes_the_question(closed: ClosedForms) -> None:
         assert at[1].probability == pytest.approx(ClosedForms.of(state.question(), Path(folder)).chance, abs=1e-9)
 
 
-@pytest.mark.parametrize("statistic", STATISTICS)
+@pytest.mark.parametrize("statistic", long_but(STATISTICS, *(name for name in STATISTICS if name != "paper")))
 def test_curve_and_map_show_the_closed_form(statistic: str, tmp_path: Path) -> None:
     """Compare also between computed points: the curve to 1 %, the map to 0.05 mag and its rows."""
     state = State()
@@ -445,7 +446,7 @@ def test_uploaded_spectrum_answers_as_on_the_command_line() -> None:
     assert "its file again" in state.faults["own_unknown"]
 
 
-@pytest.mark.parametrize("field", ["star", "flare_file", "flare_quiescent", "change_file"])
+@pytest.mark.parametrize("field", long_but(["star", "flare_file", "flare_quiescent", "change_file"], "star"))
 def test_message_on_a_file_names_the_fields_of_this_file(field: str) -> None:
     upload = UPLOADS[field]
     text = "\n".join(f"{angstrom} 1e-12" for angstrom in range(1700, 10_001, 10))
@@ -691,6 +692,7 @@ def test_visitors_who_have_left_are_sent_nothing() -> None:
     assert sent == ['{"ended": "Cancelled."}']
 
 
+@pytest.mark.long
 def test_progress_of_the_limit_has_one_total(served: Any) -> None:
     """The bar moves within each of the three limits, and never back."""
     link = "?realisations=100000&fap=0.01"
@@ -1114,6 +1116,7 @@ def arrays_of(thing: object) -> int:
     return total
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["visible", "plan"])
 def test_kept_answer_is_small(kind: str) -> None:
     """The positions of a year, 110 MB, once stayed with every plan that a visitor's connection kept."""
@@ -1125,6 +1128,7 @@ def test_kept_answer_is_small(kind: str) -> None:
     assert arrays_of(answer) < 20e6
 
 
+@pytest.mark.long
 def test_plan_of_a_hidden_target_says_so() -> None:
     """Proxima Centauri lies outside the declinations that are observed; its plan has no energies to draw."""
     state = State()

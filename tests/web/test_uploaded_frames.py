@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from marks import long_but
 
 pytest.importorskip("bokeh")
 
@@ -50,6 +51,7 @@ def closed(state: State, folder: Path) -> ClosedForms:
     return ClosedForms.of(question, folder, headline=False, given=TAB.given(question))
 
 
+@pytest.mark.long
 def test_uploaded_frames_are_analysed_as_on_the_command_line(tmp_path: Path) -> None:
     state = asked(light_curve())
     page = closed(state, tmp_path)
@@ -96,14 +98,17 @@ def test_what_is_taken_along_names_the_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("frames", "mapping", "words"),
-    [
-        (b"minute,rate\n1,2\n", MAPPING, "sd"),
+    long_but(
+        [
+            (b"minute,rate\n1,2\n", MAPPING, "sd"),
+            (light_curve(), None, "mapping"),
+            (light_curve(), b"time = [", "TOML"),
+            (b"\x89PNG\r\n", None, "text in UTF-8"),
+            (light_curve(), b'time = "minute"\nflux = "/etc/passwd"\n', "rate"),
+            (light_curve(), MAPPING + b'wavelength_file = "/etc/passwd"\n', "passwd"),
+        ],
         (light_curve(), None, "mapping"),
-        (light_curve(), b"time = [", "TOML"),
-        (b"\x89PNG\r\n", None, "text in UTF-8"),
-        (light_curve(), b'time = "minute"\nflux = "/etc/passwd"\n', "rate"),
-        (light_curve(), MAPPING + b'wavelength_file = "/etc/passwd"\n', "passwd"),
-    ],
+    ),
 )
 def test_unusable_files_end_in_a_sentence(frames: bytes, mapping: bytes | None, words: str, tmp_path: Path) -> None:
     state = asked(frames, mapping)

@@ -102,6 +102,7 @@ def page_of(contents: dict[str, bytes], folder: Path) -> ClosedForms:
     return ClosedForms.of(question, folder, headline=False, given=TAB.given(question))
 
 
+@pytest.mark.long
 def test_uploaded_standards_are_fitted_as_on_the_command_line(contents: dict[str, bytes], tmp_path: Path) -> None:
     page = page_of(contents, tmp_path)
     answers = {"calibrate": calibrate(page.study, **page.given)}
@@ -131,6 +132,7 @@ def test_uploaded_standards_are_fitted_as_on_the_command_line(contents: dict[str
     np.testing.assert_allclose(read.throughput(nm), own.instrument.throughput(nm), rtol=1e-12)
 
 
+@pytest.mark.long
 def test_pictures_show_the_fit(contents: dict[str, bytes], tmp_path: Path) -> None:
     page = page_of(contents, tmp_path)
     answers = {"calibrate": calibrate(page.study, **page.given)}
