@@ -88,16 +88,16 @@ class _Parts:
             (1.0 + change.astype(np.float64)) * middle for change, middle in zip(changes, scene.medians, strict=True)
         )
         shape = len(scene.pixels), frames.size
-        analogue, self.recorded, dark, photon, self.score, self.chance = np.zeros((6, *shape))
+        analogue, self.recorded, dark, photon = np.zeros((4, *shape))
         added = {name: np.zeros(shape) for name in scene.additive}
-        for group in range(len(scene.pixels) // 4):
+        groups = np.arange(len(scene.pixels) // 4)[:, None]
+        words = np.stack(reference.words_at(index, frames, "split_dark", groups, seed), axis=1)
+        scores = random_numbers.four_normals(reference.words_at(index, frames, "split", groups, seed))
+        for group in range(groups.size):
             drawn = reference.draws(scene, index, frames, group, seed)
-            chance = reference.words_at(index, frames, "split_dark", group, seed)
-            scores = random_numbers.four_normals(reference.words_at(index, frames, "split", group, seed))
             for i, p in enumerate(range(4 * group, 4 * group + 4)):
                 v = reference.analogue(scene, drawn, i, p, 0, *changes)
                 analogue[p], self.recorded[p] = v, reference.digitise(v, scene.edges[0, p], clip=scene.clip)
-                self.score[p], self.chance[p] = scores[i], (chance[i].astype(np.float64) + 0.5) / 2**32
                 for name, charge in drawn.added.items():
                     added[name][p] = scene.pixels[p]["electron_gain"] * charge[i]
                 if not scene.joint:
@@ -108,7 +108,9 @@ class _Parts:
                     electrons = reference.poisson_draw(drawn.photon, i, source, scene.tables, normals)
                     photon[p] = source["gain"] * electrons
         n = scene.n_pixel
-        self.recorded, self.score, self.chance = self.recorded[:n], self.score[:n], self.chance[:n]
+        self.recorded = self.recorded[:n]
+        self.score = np.stack(scores, axis=1).reshape(shape)[:n]
+        self.chance = (words.reshape(shape)[:n].astype(np.float64) + 0.5) / 2**32
         self.added = {name: charge[:n] for name, charge in added.items()}
         self.counted_dark, self.counted_photons = dark[:n], photon[:n]
         self.level = scene.base_dn[0][:, None] + analogue[:n]
