@@ -70,6 +70,8 @@ LINE_GROUPS = {
 CONTINUED_NM, CONTINUED_RATIO = (50.0, 30_000.0), 1.01
 #: Width over which a continuation is scaled to the measured flux, nm, and the largest gap that is not reported.
 JOIN_NM, GAP_NM = 20.0, 5.0
+#: Share of the star's light below which a flare is the rounding of its subtraction.
+ROUNDING = 1e-12
 
 
 @validated
@@ -454,7 +456,16 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
                     value=star.name,
                 )
             nm, messages = nm[inside], (*messages, *star.messages)
-            flux = flux[inside] - np.interp(nm, star.wavelength_nm, star.flux_flam)
+            quiet = np.interp(nm, star.wavelength_nm, star.flux_flam)
+            flux = flux[inside] - quiet
+            left, rounding = np.trapezoid([flux, ROUNDING * np.abs(quiet)], nm)
+            if not left > rounding:
+                raise InputError(
+                    f"the spectrum {read.name} is no brighter than {star.name}, which is subtracted from it",
+                    "the star with its flare, and the same star without it",
+                    key="quiescent",
+                    value=star.name,
+                )
         return cls.from_arrays(
             nm, flux, name=read.name, continue_at_k=continue_at_k,
             messages=tuple(f"{read.name}: {text}" for text in messages),

@@ -556,6 +556,29 @@ def test_failed_upload_leaves_no_answer(served: Any, monkeypatch: pytest.MonkeyP
     served(work)
 
 
+@pytest.mark.parametrize("continued", ["", "9000"])
+def test_flare_that_is_its_star_is_refused_on_the_field_of_the_star(served: Any, continued: str) -> None:
+    """One file as the flare and as the star without it: nothing is left, whether a blackbody continues it or not."""
+    spectrum = "\n".join(f"{nm} {1e-12 * (1 + 0.1 * np.sin(nm)):.9e}" for nm in range(170, 1001)).encode()
+    units = "&flare_wavelength_unit=nm&flare_flux_unit=erg+s-1+cm-2+Angstrom-1"
+    link = f"?flare_file=uploaded+file&flare_quiescent=uploaded+file&continue_at_k={continued}{units}"
+
+    async def work(host: str) -> None:
+        talk = await Talk.begin(host)
+        for field in ("flare_file", "flare_quiescent"):
+            assert (await talk.upload(spectrum, field, "same.txt", link))["entered"] == "uploaded file"
+        for tab in ("detection", "measure"):
+            reported = await talk.answer(link, tab)
+            assert "answer" not in reported
+            assert reported["faults"] == {
+                "flare_quiescent": "the spectrum uploaded flare is no brighter than uploaded star without the flare, "
+                "which is subtracted from it, expected the star with its flare, and the same star without it"
+            }
+        talk.end()
+
+    served(work)
+
+
 def test_answers_continue_while_an_upload_is_read(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     wait = threading.Event()
 
