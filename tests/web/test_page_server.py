@@ -61,6 +61,7 @@ from mauvecl.web.sentences import remedies, sentence
 from mauvecl.web.simulations import SIMULATIONS, asked, campaign_plan
 from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS, limit
+from mauvecl.web.tabs.measurements import RISE_95, Region, expected
 from mauvecl.web.tabs.tab import FIXED
 from mauvecl.web.upload import UPLOADS, Upload, read_pairs, read_upload
 from mauvecl.web.work import Job
@@ -316,6 +317,27 @@ def test_probabilities_are_never_shown_as_certain(value: float, reported: str) -
 @pytest.fixture(scope="module")
 def closed(tmp_path_factory: pytest.TempPathFactory) -> ClosedForms:
     return ClosedForms.of(State().question(), tmp_path_factory.mktemp("closed"))
+
+
+@pytest.mark.long
+def test_regions_of_two_temperatures_surround_the_flare(tmp_path: Path) -> None:
+    """Their ends are those of normal errors of the logarithms, and no region has errors of 100 %."""
+    state = State()
+    state.follow("?second_temperature_k=30000&flare_temperature_k=9000&magnitude=6&amplitude_percent=10")
+    asked = ClosedForms.of(state.question(), tmp_path)
+    known, _, free = expected(asked).values()
+    drawn = Region().drawn(asked, {}).sources
+    assert drawn["own"] == {"x": [9000.0], "y": [pytest.approx(10.0)]}
+    for name, one in (("known", known), ("free", free)):
+        kelvin, low, high = (np.asarray(drawn[name][column]) for column in ("x", "low", "high"))
+        reach = np.sqrt(RISE_95) * one.ahead.errors[:2] / [9000.0, 0.1]
+        np.testing.assert_allclose(kelvin[[0, -1]], 9000 * np.exp([-reach[0], reach[0]]), rtol=1e-9)
+        np.testing.assert_allclose([low.min(), high.max()], 10 * np.exp([-reach[1], reach[1]]), rtol=1e-3)
+        assert low[80] < 10 < high[80]
+    state.enter({"amplitude_percent": "1"})
+    faint = Region().drawn(ClosedForms.of(state.question(), tmp_path), {}).sources
+    assert np.size(faint["known"]["x"]) > 0
+    assert np.size(faint["free"]["x"]) == 0
 
 
 @pytest.mark.parametrize("tab", TABS)

@@ -7,6 +7,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mauvecl.answers.measurements.expected import expected_measurements, models_of
 from mauvecl.answers.measurements.measure import COLUMNS
@@ -20,7 +21,10 @@ from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 if TYPE_CHECKING:
     from mauvecl.answers.measurements.expected import ExpectedMeasurement
     from mauvecl.answers.measurements.measure import MeasuredFlare
+    from mauvecl.results.measurements.fit import Forecast
     from mauvecl.web.closed_forms import ClosedForms
+
+Float = NDArray[np.float64]
 
 #: Unknowns of an observer, by name on the page, as the study's section of nuisances.
 ASSUMED = {
@@ -68,7 +72,9 @@ class Errors(Picture):
         )
         for name, colour in zip(("known", "usual", "free"), ("flare", "star", "sky"), strict=True):
             called = list(ASSUMED)[("known", "usual", "free").index(name)]
-            curve = canvas.line(name, called, colour, line_width=2)
+            # Errors with other unknowns may be the same: dashes show the curve below.
+            dash = {"line_dash": "dashed"} if name == "free" else {}
+            curve = canvas.line(name, called, colour, line_width=2, **dash)
             canvas.tooltips(curve, ("amplitude (%)", "x"), (f"{called} (%)", "y"))
         canvas.pinned()
         canvas.own_point()
@@ -81,9 +87,10 @@ class Errors(Picture):
             ahead = one.forecasts(FACTORS, one.unknown)
             sources[name] = {"x": own * FACTORS, "y": [100 * f.errors[0] / f.values[0] for f in ahead]}
         known, *_, free = expected(closed).values()
+        which = "temperature" if isinstance(known.fitted, FlareModel) else "lower temperature"
         sources["own"] = {"x": [own], "y": [100 * known.ahead.errors[0] / known.ahead.values[0]]}
         text = (
-            f"With everything known the temperature has a standard error of {_error(known)}, with dark level and star "
+            f"With everything known the {which} has a standard error of {_error(known)}, with dark level and star "
             f"unknown one of {_error(free)}."
         )
         return PictureData(text, sources)
@@ -110,25 +117,42 @@ class Region(Picture):
     def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         all_known, *_, free = expected(closed).values()
         sources: dict[str, Any] = {name: {"x": [], "y": []} for name in ("fits", "own")}
-        best = all_known.perfect.estimates[0]
+        # A fit without noise stands for a flare without these quantities, such as one from a file.
+        true, without_noise = all_known.truth[:2], all_known.perfect.estimates[0, :2]
+        best = true if np.isfinite(true).all() else without_noise
         sources["own"] = {"x": [best[0]], "y": [100 * best[1]]}
         fits = simulated(answers)
         if fits is not None:
             some = fits.found.estimates[:MOST_DOTS]
             sources["fits"] = {"x": some[:, 0], "y": 100 * some[:, 1]}
-        if not isinstance(all_known.fitted, FlareModel):
-            sources |= {name: {"x": [], "low": [], "high": []} for name in ("free", "known")}
-            text = "The flare has two temperatures, of which this is the lower one: simulated fits show their region."
-            return PictureData(text, sources)
+        one_temperature = isinstance(all_known.fitted, FlareModel)
         for name, one in (("known", all_known), ("free", free)):
-            kelvin, low, high = one.region(RISE_95)
+            kelvin, low, high = one.region(RISE_95) if one_temperature else _ellipse(best, one.ahead)
             sources[name] = {"x": kelvin, "low": 100 * low, "high": 100 * high}
         x = np.asarray(sources["free"]["x"])
         text = (
             f"With dark level and star unknown the 95 % region reaches from {short(x[0])} to {short(x[-1])} K: hotter "
             "flares of smaller area look alike."
+            if one_temperature
+            else "The flare has two temperatures, of which this is the lower one. Its regions follow from standard "
+            "errors below 100 %; simulated fits show them as they are."
         )
         return PictureData(text, sources)
+
+
+def _ellipse(best: Float, ahead: Forecast, n: int = 161) -> tuple[Float, Float, Float]:
+    """Return the confidence region of the first two quantities, of normal errors of their logarithms.
+
+    Its temperatures, with the smallest and largest amplitude at each, are empty for errors of 100 % or more.
+    """
+    spread = ahead.covariance[:2, :2] / np.outer(best, best)
+    if not (np.diag(spread) < 1.0).all():
+        return np.empty(0), np.empty(0), np.empty(0)
+    angle, slope = np.linspace(-np.pi / 2, np.pi / 2, n), spread[0, 1] / spread[0, 0]
+    along = np.sqrt(RISE_95 * spread[0, 0]) * np.sin(angle)
+    half = np.sqrt(RISE_95 * (spread[1, 1] - slope * spread[0, 1])) * np.cos(angle)
+    low, high = (best[1] * np.exp(slope * along + side) for side in (-half, half))
+    return best[0] * np.exp(along), low, high
 
 
 class Course(Picture):
@@ -171,7 +195,8 @@ class Course(Picture):
             ]
             sources["estimates"] = {"x": x, "y": kelvin}
             sources["bins"] = dict(zip(("x", "low", "high"), (x, *ends), strict=True))
-            words.append(f"{x.size} bins of frames")
+            two = not isinstance(next(iter(expected(closed).values())).fitted, FlareModel)
+            words.append(f"{x.size} bins of frames{', each fitted with one temperature' if two else ''}")
         return PictureData(f"One simulated stare: {'; '.join(words)}.", sources)
 
 
