@@ -33,7 +33,7 @@ from mauvecl.web.fields import FIELDS, UPLOADED_FILE, Choice, Number
 from mauvecl.web.question import Question
 from mauvecl.web.simulations import SIMULATIONS
 from mauvecl.web.state import State
-from mauvecl.web.tabs import TABS
+from mauvecl.web.tabs import TABS, reads_of
 from mauvecl.web.tabs.tab import Tab
 
 #: Names of the commands' files, where they are not those of the page.
@@ -82,29 +82,30 @@ def random_link(generator: np.random.Generator) -> str:
     return "?" + urlencode(entered)
 
 
-def possible_question(generator: np.random.Generator, folder: Path, quick: bool = False) -> tuple[str, ClosedForms]:
-    """Return a random link with its closed forms; saturated stars are drawn again.
+def possible_question(
+    generator: np.random.Generator, tab: Tab, folder: Path, quick: bool = False
+) -> tuple[State, ClosedForms]:
+    """Return a random state of the page with the closed forms of a tab; saturated stars are drawn again.
 
     With `quick`, so are questions with an unknown spectrum of one's own, whose closed forms may take a minute.
     """
     while True:
-        link = random_link(generator)
         state = State()
-        state.follow(link)
+        state.follow(random_link(generator))
         if quick and state.entered["own_unknown"]:
             continue
         try:
-            return link, ClosedForms.of(state.question(), folder)
+            return state, ClosedForms.of(state.question(tab.reads), folder, headline=tab.headline)
         except InputError:
             continue
 
 
-def page_tables(tab: Tab, closed: ClosedForms) -> dict[str, Table]:
-    """Return the tables of a tab after all its simulations."""
+def page_tables(tab: Tab, state: State, closed: ClosedForms, folder: Path) -> dict[str, Table]:
+    """Return the tables of a tab after all its simulations, each of the fields that it reads."""
     answers: dict[str, Any] = {}
     pool = Pool(LocalWorkers([None]))
     for name in tab.simulations:
-        answers |= SIMULATIONS[name](closed.study, pool)
+        answers |= SIMULATIONS[name](state.question(reads_of(name)).study(folder), pool)
     return {name: tab.table(name, closed, answers) for name in tab.files if tab.offers(name, answers)}
 
 
@@ -121,13 +122,13 @@ def command_tables(tab: Tab, question: Question, folder: Path) -> dict[str, Tabl
     return {path.stem: Table.read(path, format="ascii.ecsv") for path in paths}
 
 
-def differences(tab: Tab, closed: ClosedForms, folder: Path) -> list[str]:
+def differences(tab: Tab, state: State, closed: ClosedForms, folder: Path) -> list[str]:
     """Return the columns of a tab in which page and command differ, as ``table: column``.
 
     A question without an answer, such as a limit beyond its range, is to be refused in the same words by both.
     """
     try:
-        page = page_tables(tab, closed)
+        page = page_tables(tab, state, closed, folder)
     except InputError as error:
         try:
             command_tables(tab, closed.question, folder)
@@ -173,11 +174,11 @@ def main() -> None:
             with tempfile.TemporaryDirectory() as place:
                 folder = Path(place)
                 generator = np.random.default_rng([given.seed, count])
-                link, closed = possible_question(generator, folder)
-                different = differences(TABS[name], closed, folder)
+                state, closed = possible_question(generator, TABS[name], folder)
+                different = differences(TABS[name], state, closed, folder)
                 wrong += bool(different)
                 if different:
-                    print(f"{name} {link}\n  {'; '.join(different)}")
+                    print(f"{name} {state.link}\n  {'; '.join(different)}")
         seconds = time.perf_counter() - started
         print(f"{name}: {given.count - wrong} of {given.count} questions agree, {seconds:.0f} s", flush=True)
 

@@ -253,20 +253,31 @@ def test_printed_commands_give_the_numbers_of_the_page(tab: str, tmp_path: Path)
     This detects a page and a command line that compute something else from the same question. Answers with an unknown
     spectrum of one's own are compared in `test_downloads_equal_the_files_of_the_command_line`.
     """
-    _, closed = check_commands.possible_question(np.random.default_rng([3, len(tab)]), tmp_path, quick=True)
-    assert check_commands.differences(TABS[tab], closed, tmp_path) == []
+    generator = np.random.default_rng([3, len(tab)])
+    state, closed = check_commands.possible_question(generator, TABS[tab], tmp_path, quick=True)
+    assert check_commands.differences(TABS[tab], state, closed, tmp_path) == []
+
+
+@pytest.mark.long
+def test_comparison_asks_what_the_tab_reads(tmp_path: Path) -> None:
+    """A sky that the plan does not read changes nothing, not even for a target that is never visible."""
+    state = State()
+    state.follow("?sky=none&targets=AU+Mic&days=10&exposure_s=7.5&magnitude=6")
+    everything = ClosedForms.of(state.question(), tmp_path)
+    assert check_commands.differences(TABS["plan"], state, everything, tmp_path) == []
 
 
 @pytest.mark.long
 def test_comparison_notices_another_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    _, closed = check_commands.possible_question(np.random.default_rng(5), tmp_path)
+    tab = TABS["spectrum"]
+    state, closed = check_commands.possible_question(np.random.default_rng(5), tab, tmp_path)
     original = check_commands.taken_along
 
     def reseeded(*how: Any) -> list[dict[str, str]]:
         return [one | {"command": re.sub(r"--seed \d+", "--seed 99", one["command"])} for one in original(*how)]
 
     monkeypatch.setattr(check_commands, "taken_along", reseeded)
-    assert check_commands.differences(TABS["spectrum"], closed, tmp_path)
+    assert check_commands.differences(tab, state, closed, tmp_path)
 
 
 def test_bibtex_cites_what_the_citation_file_cites() -> None:

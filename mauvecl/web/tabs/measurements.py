@@ -108,6 +108,9 @@ class Region(Picture):
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         canvas = Canvas(ink, "temperature (K)", "amplitude of the blackbody (%)", logs)
+        for axis in canvas.plot.xaxis:
+            # Labels of five digits stay apart on a narrow screen.
+            axis.ticker.update(desired_num_ticks=4)
         canvas.band("free", "dark and star free", "sky", alpha=0.3)
         canvas.band("known", "everything known", "flare", alpha=0.5)
         canvas.dots("fits", "simulated fits", "drawn", size=3)
