@@ -73,7 +73,7 @@ class Errors(Picture):
         for name, colour in zip(("known", "usual", "free"), ("flare", "star", "sky"), strict=True):
             called = list(ASSUMED)[("known", "usual", "free").index(name)]
             # Errors with other unknowns may be the same: dashes show the curve below.
-            dash = {"line_dash": "dashed"} if name == "free" else {}
+            dash: dict[str, Any] = {"line_dash": "dashed"} if name == "free" else {}
             curve = canvas.line(name, called, colour, line_width=2, **dash)
             canvas.tooltips(curve, ("amplitude (%)", "x"), (f"{called} (%)", "y"))
         canvas.pinned()
@@ -108,9 +108,9 @@ class Region(Picture):
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         canvas = Canvas(ink, "temperature (K)", "amplitude of the blackbody (%)", logs)
-        for axis in canvas.plot.xaxis:
-            # Labels of five digits stay apart on a narrow screen.
-            axis.ticker.update(desired_num_ticks=4)
+        axis: Any = canvas.plot.xaxis[0]
+        # Labels of five digits stay apart on a narrow screen.
+        axis.ticker.desired_num_ticks = 4
         canvas.band("free", "dark and star free", "sky", alpha=0.3)
         canvas.band("known", "everything known", "flare", alpha=0.5)
         canvas.dots("fits", "simulated fits", "drawn", size=3)
