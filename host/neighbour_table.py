@@ -215,7 +215,7 @@ def _coordinates(text: str, named: str) -> tuple[float, float]:
         place = parse_position(text)
     except InputError as error:
         raise InputError(
-            f"{named} has no row named {shortened(text)}, and it is no position",
+            f"{named} has no row named {shortened(text)}, and it is not a position",
             "the name of the star's own row, or coordinates such as '290.68 +11.12'",
             key="neighbours_of",
             value=text,

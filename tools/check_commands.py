@@ -28,7 +28,7 @@ from mauvecl.runs.pool import LocalWorkers, Pool
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.web.closed_forms import ClosedForms
-from mauvecl.web.downloads import taken_along
+from mauvecl.web.downloads import commands_and_programs
 from mauvecl.web.fields import FIELDS, UPLOADED_FILE, Choice, Number
 from mauvecl.web.question import Question
 from mauvecl.web.simulations import SIMULATIONS
@@ -112,7 +112,7 @@ def page_tables(tab: Tab, state: State, closed: ClosedForms, folder: Path) -> di
 def command_tables(tab: Tab, question: Question, folder: Path) -> dict[str, Table]:
     """Run the printed commands of a tab, and return the tables that they write."""
     with _working_in(folder):
-        for number, one in enumerate(taken_along(tab, question, folder)):
+        for number, one in enumerate(commands_and_programs(tab, question, folder)):
             program, *words = shlex.split(one["command"])
             assert program == "mauvecl", one["command"]
             ended = CliRunner().invoke(app, [*words, "--no-pictures", "--quiet", "--output", f"out-{number}"])

@@ -41,8 +41,8 @@ class Windows:
 class Visibility:
     """Visibility of targets at the times of a plan.
 
-    The positions of a year take a hundred times the memory of what is seen: they are computed again where they are
-    needed, so that answers can be kept.
+    The positions of a year take a hundred times the memory of the visibility. They are computed again when they are
+    needed, so that answers stay small.
     """
 
     orbit: Orbit

@@ -56,7 +56,7 @@ def votable_tables(content: bytes, name: str, origin: str) -> list[FileTable]:
     from astropy.io import votable
 
     if b"<!ENTITY" in content or b"<!DOCTYPE" in content:
-        raise InputError("defines entities", "a VOTable without them", key="file")
+        raise InputError("defines entities", "a VOTable without entities", key="file")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -75,7 +75,7 @@ class Verb:
     takes: tuple[str, ...]
     counts: str = ""  # what the command line's progress bar counts; empty if a closed form answers at once
     older: tuple[str, ...] = ()  # names that the function had before; they still work
-    observation: tuple[str, ...] = OBSERVATION  # keys of an observation, or of what takes its place
+    observation: tuple[str, ...] = OBSERVATION  # keys of an observation, or their replacements
     without: str = ""  # key of the observation that the command does not take
     # Values of keys where neither a study file nor a flag is given, if they differ from the study's.
     defaults: Mapping[str, Any] | None = None
@@ -249,7 +249,7 @@ VERBS: dict[str, Verb] = {
             "stares.inject",
             """Find which flares a search detects: completeness, false alarms.
 
-    Over energy (or amplitude) and half-width, with the errors of what is recovered.
+    Over energy (or amplitude) and half-width, with the errors of recovered flares.
 
     Flares are injected into drawn stares and searched for with a bank of filters. The stare lasts a day by default.
 
@@ -372,5 +372,5 @@ VERBS: dict[str, Verb] = {
         ),
     )
 }
-#: Where every public name of a verb is at home, older names among them.
+#: Module of every public name of a verb, including older names.
 HOMES = {name: f"answers.{verb.home}" for verb in VERBS.values() for name in (verb.name, *verb.older)}

@@ -163,8 +163,8 @@ class FactorDistributions:
             score, weight = few[0], few[1] / few[1].sum()
         nodes = []
         for chosen in product(*grids):
-            weights, (warm, lit, grey), scores = zip(*chosen, strict=True)
-            nodes.append(Node(math.prod(weights), warm, lit, grey, dict(zip(moved, scores, strict=True))))
+            weights, (dark, light, sky), scores = zip(*chosen, strict=True)
+            nodes.append(Node(math.prod(weights), dark, light, sky, dict(zip(moved, scores, strict=True))))
         return nodes, np.array(rows).reshape(len(rows), x.variance_dn2.size)
 
 

@@ -68,7 +68,7 @@ class EventSpectrum:
 def event_spectrum(
     survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], one: Detection
 ) -> EventSpectrum:
-    """Compare the spectrum of an event with those of flares and of what resembles them.
+    """Compare the spectrum of an event with those of flares and of changes that resemble them.
 
     Parameters
     ----------
@@ -144,9 +144,9 @@ def _weighted(
 def drifts(survey: SeriesSurvey, series: SpectralSeries, taken: NDArray[np.bool_], n_frames: int) -> dict[str, float]:
     """Return the differences of star, dark current and sky between parts of the frames and their surroundings.
 
-    Measured from means of `n_frames` quiescent frames against the means before and after: the scatter beyond that of
-    noise, and the part that the noise may hide. If there are fewer than `MIN_PARTS` such means, shorter ones are taken,
-    and changes are assumed to grow in proportion to time. The sky changes by its documented prior.
+    They follow from means of `n_frames` quiescent frames, compared with the means before and after: the scatter in
+    excess of noise, and the part that noise may hide. If there are fewer than `MIN_PARTS` such means, shorter ones are
+    taken, and changes are assumed to grow in proportion to time. The sky changes by its documented prior.
 
     Returns
     -------

@@ -77,8 +77,8 @@ class Detection:
 def detect_events(survey: SeriesSurvey, threshold: float) -> tuple[list[Detection], NDArray[np.bool_]]:
     """Detect all events above a threshold, in order of time, and return the frames that belong to them.
 
-    The search is repeated without the frames of events that were found, until there is no further event: what a bright
-    flare of an unusual shape leaves in the residuals of a fit is not mistaken for other flares.
+    The search is repeated without the frames of detected events until there are no more, so that the residuals of a
+    bright flare of unusual shape are not mistaken for other flares.
     """
     taken = np.zeros(survey.stare.n_frames, np.bool_)
     found: list[Detection] = []
@@ -149,9 +149,9 @@ def measure_events(
     found: list[Detection],
     causes: Sequence[Kind] | None = None,
 ) -> list[ObservedEvent]:
-    """Measure detected events in order of time; `taken` are their frames, and `causes` what their spectra show.
+    """Measure detected events in order of time; `taken` are their frames, and `causes` follow from their spectra.
 
-    The level follows a step with a delay: what adjoins a step and is weaker belongs to it.
+    The level follows a step with a delay, so that weaker events next to a step belong to it.
     """
     known: Sequence[Kind] = causes or ["flare"] * len(found)
     events = [measure_event(survey, taken, threshold, *one) for one in zip(found, known, strict=True)]
@@ -166,7 +166,7 @@ def measure_events(
 def measure_event(
     survey: SeriesSurvey, taken: NDArray[np.bool_], threshold: float, found: Detection, cause: Kind = "flare"
 ) -> ObservedEvent:
-    """Measure a detected event; `taken` are the frames of all events, and `cause` is what its spectrum shows."""
+    """Measure a detected event; `taken` are the frames of all events, and `cause` follows from its spectrum."""
     value, half_width, first, last = found.value, found.half_width_s, found.first, found.last
     rows = slice(first, last + 1)
     baseline, baseline_variance = _baseline(survey, taken, first, last, half_width)

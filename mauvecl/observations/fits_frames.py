@@ -33,9 +33,9 @@ class FitsFile(FrameFile):
     what : str
         The file, for messages.
     hdu : str or int, optional
-        Name or number of the extension whose columns are meant first; by default the first table.
+        Name or number of the extension whose columns are searched first; by default the first table.
     wanted : tuple of tuple of str
-        Names of columns, of each group of which the first table has one, if no extension is named.
+        Groups of names; without `hdu`, the first table with a column of each group is used.
     """
 
     def __init__(
@@ -168,7 +168,7 @@ class FitsFile(FrameFile):
 
 
 def _piece(hdu: Any, start: int, stop: int) -> Any:
-    """Read rows of a table without the others."""
+    """Read some rows of a table."""
     from astropy.io import fits
 
     place, width = hdu.fileinfo(), int(hdu.header["NAXIS1"])
@@ -190,7 +190,7 @@ def _reading(what: str) -> Iterator[None]:
 
 @contextmanager
 def open_fits(file: IO[bytes], what: str) -> Iterator[fits.HDUList]:
-    """Open a FITS file whose sizes are possible; its data are read when they are asked for."""
+    """Open a FITS file after a check of its sizes; its data are read on access."""
     from astropy.io import fits
 
     try:
@@ -205,7 +205,7 @@ def open_fits(file: IO[bytes], what: str) -> Iterator[fits.HDUList]:
 
 
 class _Content:
-    """Bytes of a file that are read when they are asked for."""
+    """Bytes of a file that are read on access."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self.file = file

@@ -1,4 +1,4 @@
-"""Folders of spectra, a file for each frame."""
+"""Folders of spectra with one file per frame."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class FolderFile(FrameFile):
         return first
 
     def _of_files(self, name: str, one: Values) -> Values:
-        """Return a column of every file, one row for each."""
+        """Return a column of every file, with one row per file."""
         n = int(np.prod(one.shape))
 
         def read(start: int, stop: int) -> Any:

@@ -110,7 +110,7 @@ class FrameModel:
         return np.asarray(self.flare.hot_spline(np.log(temperatures_k)) @ self.bins.T * self.per_dn)
 
     def unknowns(self, light: Float) -> dict[str, Float]:
-        """Return the spectra of what changes in frames without a flare, in the frames' unit, shape (n_value,) each.
+        """Return the spectra of unknown changes in frames without a flare, in their unit, shape (n_value,) each.
 
         `light` is that of the quiescent star, which pointing and throughput scale; the dark current is per deg C, and
         the sky once the nominal one, if there is a sky.
@@ -167,7 +167,7 @@ class FrameModel:
 
 
 def _per_flam(unit: str, wavelength_nm: Float) -> Float | None:
-    """Return a flux density of 1 erg s-1 cm-2 nm-1 in a unit, shape (n_value,); None if it is no flux density."""
+    """Return a flux density of 1 erg s-1 cm-2 nm-1 in a unit, shape (n_value,); None if it is not one."""
     import astropy.units as u
 
     one = np.ones(wavelength_nm.size) * u.Unit("erg / (s cm2 nm)")

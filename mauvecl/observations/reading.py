@@ -64,7 +64,7 @@ def read_frames(path: str | Path, mapping: FrameMapping | str | Path | None = No
         FITS, HDF5, ECSV or CSV, packed or not; a Zarr store; or a folder of spectra. ``FILE[name]`` names an extension,
         or an array of a store.
     mapping : FrameMapping or path, optional
-        Where the quantities are. Files of mauvecl, TESS, Kepler and lightkurve need none.
+        Places of the quantities. Files of mauvecl, TESS, Kepler and lightkurve need none.
     """
     with _frame_file(path, mapping) as (file, how, stem):
         return _frames_in(file, how, stem)
@@ -79,7 +79,7 @@ def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any 
         A table, time series or light curve of astropy or lightkurve; or spectra such as those of specutils, with
         the attributes ``flux`` of shape (n_frame, n_pixel), ``spectral_axis``, ``uncertainty`` and ``mask``.
     mapping : FrameMapping, optional
-        Where the quantities of a table are; columns with known names need none.
+        Places of the quantities of a table; columns with known names need none.
     time : Time, optional
         Middles of the frames, for spectra.
     """
@@ -144,7 +144,7 @@ def reduce_frames(
     Parameters
     ----------
     path : str or Path
-        As of `read_frames`.
+        As for `read_frames`.
     weights : array_like, shape (n_weight, n_pixel), optional
         Weights of the pixels, in the order of the file; by default the sum over all pixels.
     mapping : FrameMapping or path, optional
@@ -187,7 +187,7 @@ def _open_frames(
                 yield store, mapping or store.mapping
         elif mapping is None:
             expected = "a mapping that says where the quantities of its files are"
-            raise InputError(f"{what} is no store of spectra", expected, key="mapping")
+            raise InputError(f"{what} is not a store of spectra", expected, key="mapping")
         else:
             yield FolderFile(path, mapping, what, lambda one: _opened(one, f"file {one.name!r}", name)), mapping
         return

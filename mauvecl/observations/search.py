@@ -131,7 +131,7 @@ class SeriesSurvey:
 
     @property
     def directions(self) -> dict[Any, Float]:
-        """Derivatives of the mean sums by what jitters: nothing, for the scatter is measured."""
+        """Derivatives of the mean sums by jitters: none, since the scatter is measured."""
         return {"light": np.zeros_like(self.sums)}
 
     def covariance(self) -> Float:
@@ -143,7 +143,7 @@ class SeriesSurvey:
         return np.asarray(sums, np.float32)
 
     def along(self, direction: int) -> Float:
-        """Return the sum along a direction of the bank, which the search of its templates looks at, (n_frame,)."""
+        """Return the sum along a direction of the bank, which its templates search, (n_frame,)."""
         return np.asarray(self.sums @ self.bank.directions[direction])
 
     def frames(self, kept: NDArray[np.bool_]) -> SeriesSurvey:

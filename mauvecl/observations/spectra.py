@@ -37,7 +37,7 @@ RAY_FLARES_K = (6_000.0, 12_000.0, 30_000.0)
 #: Largest number of rounds of replacing bad values by the fit to the others, which end where the values change by less
 #: than this share of a standard deviation.
 RAY_ROUNDS, SETTLED = 50, 0.05
-#: Differences, in standard errors, beyond which noise as measured is used in place of what is stated.
+#: Differences, in standard errors, above which measured noise replaces stated noise.
 DEPARTS = 4.0
 #: Frames of one block of computations, which bounds the memory.
 BLOCK = 1024
@@ -103,9 +103,9 @@ def relative_error(differences: int) -> float:
 def clean_spectra(frames: Frames, model: FrameModel) -> CleanedSpectra:
     """Replace single bad values of spectra by a fit to the other pixels of their frame.
 
-    Flares, and changes of the star, the dark current and the sky, change many pixels; one that stands out from these by
-    itself, in one frame, is hit by a particle or read wrongly. Pixels that are not finite in a frame without a fault
-    are left out of all frames.
+    Flares, and changes of the star, the dark current and the sky, change many pixels. A single pixel that deviates in
+    one frame was hit by a particle or read incorrectly. Pixels that are not finite in a frame without a fault are
+    left out of all frames.
     """
     usable = frames.faults == 0
     fine = np.isfinite(frames.flux[usable]).all(axis=0) & (model.bins.sum(axis=1) > 0)
@@ -223,7 +223,7 @@ def survey_spectra(
     survey : SeriesSurvey
     series : SpectralSeries
     level : QuiescentLevel
-        With single frames flagged that only the weighted sums show.
+        With flags of further single frames, which only the weighted sums show.
     """
     frames, model = cleaned.frames, cleaned.model
     light = frames.flux[level.quiet].mean(axis=0)

@@ -171,7 +171,7 @@ def _in_groups(root: Any, name: str | None, what: str) -> StoredFile:
 
 
 def _chosen(found: list[str], name: str | None, what: str) -> str:
-    """Return the scene that is asked for, or the only one."""
+    """Return the requested scene, or the only one."""
     if not found:
         raise InputError(f"{what} holds no spectra", EXPECTED, key="file")
     if name is None and len(found) > 1:

@@ -40,7 +40,7 @@ class TimeSystem:
 
     @classmethod
     def of(cls, header: Mapping[str, Any], what: str) -> TimeSystem:
-        """Read the time keywords of a header; raise InputError for one that is not as in the standard."""
+        """Read the time keywords of a header; raise InputError for one that violates the standard."""
         at = _number(header, "TIMEPIXR", what)
         if at is not None and not 0.0 <= at <= 1.0:
             raise InputError.of("TIMEPIXR", at, "0 to 1", where=what)
@@ -98,7 +98,7 @@ def _direction(header: Mapping[str, Any], what: str) -> tuple[float, float] | No
 
 
 def mjd_of(texts: Sequence[str], scale: str, name: str, what: str) -> Float:
-    """Return ISO 8601 dates as modified Julian dates, NaN for empty ones; raise InputError that names a wrong one."""
+    """Return ISO 8601 dates as modified Julian dates, NaN for empty ones; raise InputError for an invalid one."""
     from astropy.time import Time
 
     found = np.full(len(texts), np.nan)

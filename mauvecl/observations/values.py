@@ -133,9 +133,9 @@ def converted(values: Values, given: str | None, unit: str, key: str) -> Values:
     Parameters
     ----------
     given : str or None
-        What the mapping says, which counts more than the file.
+        Unit in the mapping, which takes precedence over the file.
     unit : str
-        The wanted unit.
+        Unit of the result.
     key : str
         Key of the mapping that states it.
 

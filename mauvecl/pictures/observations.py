@@ -87,7 +87,7 @@ def observed_dynamic_spectrum(plt: Any, answer: AnalyseAnswer) -> Any:
 @picture_of("AnalyseAnswer", "noise-per-pixel", when=lambda answer: answer.analysis.spectra is not None)
 @styled_picture
 def observed_pixel_noise(plt: Any, answer: AnalyseAnswer) -> Any:
-    """Plot the noise of each pixel as measured over that which is stated, with the range of 95 % of normal noise."""
+    """Plot the measured over the stated noise of each pixel, with the range of 95 % of normal noise."""
     spectra = answer.analysis.spectra
     assert spectra is not None
     noise = spectra.series.noise

@@ -32,7 +32,7 @@ class Entry:
     when: Callable[[Any], bool] | None = None  # whether a thing has the picture
 
     def of(self, thing: Any) -> list[tuple[int, str, Callable[..., Any]]]:
-        """Return number, name and bound function of each picture of a thing."""
+        """Return number, name and bound function of each picture of an object."""
         if self.when is not None and not self.when(thing):
             return []
         if self.each is not None:
@@ -103,7 +103,7 @@ def load() -> None:
 def _draw(draw: Callable[..., Any], path: str | Path | None = None, *, ax: Any = None, **options: Any) -> Any:
     """Draw a picture and return the figure, the path of the saved file, or `ax`."""
     if ax is not None and not (hasattr(ax, "plot") and hasattr(ax, "figure")):
-        raise InputError.of("ax", ax, "axes, as plt.subplots makes")
+        raise InputError.of("ax", ax, "axes, as returned by plt.subplots")
     before = AXES.set(ax)
     try:
         drawn = draw(path=path, **options)

@@ -1,4 +1,4 @@
-"""The base class of everything with a `plot` method; it imports neither matplotlib nor the functions that draw."""
+"""Base class of objects with a `plot` method; it imports neither matplotlib nor the functions that draw."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Registry(Protocol):
 
 
 class Drawable:
-    """A thing with pictures."""
+    """An object with pictures."""
 
     @property
     def pictures(self) -> dict[str, Callable[..., Any]]:

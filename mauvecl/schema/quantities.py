@@ -41,18 +41,18 @@ def number(
 ) -> float:
     """Return one finite number in a unit.
 
-    Raises InputError if it is no such number, not finite, or outside.
+    Raises InputError if the value is not a finite number in the range and unit.
 
     Parameters
     ----------
     what : str
-        What it is, for the sentence of an error.
+        Name of the value, for messages.
     unit : str
         As astropy reads it. Wavelengths may come as frequencies or energies, temperatures on any scale.
     low, high : float
-        Where it may lie.
+        Closed range of accepted values.
     expected : str
-        Accepted values in the sentence; from unit and range by default.
+        Accepted values, for messages; from unit and range by default.
     """
     wanted = expected or _expected(unit, low, high)
     if type(value) is float:
@@ -83,7 +83,7 @@ def numbers(
 def count(what: str, value: Any, *, low: int = 0, high: int = 2**63 - 1) -> int:
     """Return a whole number, given as an int, a float such as 1e5 or a dimensionless Quantity.
 
-    Raises InputError if it is none, or outside `low` to `high`.
+    Raises InputError if the value is not a whole number from `low` to `high`.
     """
     wanted = f"a whole number from {low} to {high}" if high < 2**63 - 1 else f"a whole number of at least {low}"
     try:

@@ -65,7 +65,7 @@ class Record(BaseModel, metaclass=_InputErrorMeta):
 
 
 def holds_truth(given: Any) -> bool:
-    """Return whether a value is true or false, or a list that has one; records within look at their own."""
+    """Return whether a value is true or false, or a list that has one; nested records check their own."""
     if isinstance(given, list | tuple):
         return any(map(holds_truth, given))
     # NumPy's own too, which need not be loaded.

@@ -35,7 +35,7 @@ class Section(Record):
     def with_value(self, path: Sequence[str], value: Any) -> Self:
         """Return a copy with another value at a path of sections and a key.
 
-        Each of several records, such as stars, takes the value; a key with a list of numbers takes it alone.
+        Each record of a list, such as stars, takes the value; a list of numbers is replaced by it.
         """
         key, *inner = path
         old = getattr(self, key)

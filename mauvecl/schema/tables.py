@@ -99,7 +99,7 @@ def table_of(columns: Iterable[Column], rows: Iterable[object], **meta: object) 
 def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **meta: object) -> QTable:
     """Return tables as one, each after the `first` columns of its row; keep metadata that all share, and add `meta`.
 
-    A column that a table does not have is masked there.
+    Columns that a table lacks are masked.
     """
     every = list(parts)
     tables = [table for _, table in every]

@@ -10,14 +10,14 @@ T = TypeVar("T")
 
 
 class First(list[T]):
-    """The first of several things, and a note on how many there are.
+    """The first items of a list, and a note on their number.
 
     Parameters
     ----------
     most : int
-        Things that are kept, at most.
+        Largest number of items.
     name : str
-        What the things are, in the plural.
+        Plural noun for the items.
 
     Attributes
     ----------
@@ -31,10 +31,10 @@ class First(list[T]):
 
 
 def part_note(shown: int, total: int, name: str) -> str:
-    """Return the note on a part of several things, as in "6 of 9 stars shown", or nothing for all of them."""
+    """Return the note on a part of a list, as in "6 of 9 stars shown", or nothing for all of it."""
     return f"{shown} of {total} {name} shown" if shown < total else ""
 
 
 def note_of(things: Iterable[object]) -> str:
-    """Return the note of things that are a part of more, or nothing."""
+    """Return the note of items that are a part of a list, or nothing."""
     return things.note if isinstance(things, First) else ""

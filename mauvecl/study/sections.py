@@ -218,7 +218,7 @@ class Star(Section):
         return self
 
     def with_value(self, path: Sequence[str], value: Any) -> Self:
-        """Return a copy with another value; another star of the library drops all that describes this one."""
+        """Return a copy with another value; another library star drops values that describe this one."""
         changed = super().with_value(path, value)
         return changed.model_copy(update=dict.fromkeys(STAR_KEYS)) if path[0] == "library" else changed
 

@@ -27,8 +27,7 @@ def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     dict
         ``numbers``, one for each choice of what is unknown; ``chosen``, ``shown`` and ``interval`` of the question's
         choice, and ``words``; ``facts``, pairs of names and values; ``notes``, pairs of sentences and kinds;
-        ``simulated``, names of what is simulated; ``files``, tabs and names of what can be taken
-        along.
+        ``simulated``, names of what is simulated; ``files``, tabs and names of downloads.
     """
     q, x = closed.question, closed.quiet
     cut, both = closed.odds.threshold, chances(closed, answers)

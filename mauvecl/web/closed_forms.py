@@ -54,7 +54,7 @@ class ClosedForms:
         headline : bool
             Whether the chance of detection is asked, without which a star may be too bright for it.
         given : mapping, optional
-            What was read of the visitor's files.
+            Contents of the visitor's files.
         """
         case = question.case(folder)
         if question.as_bright_as_observed:

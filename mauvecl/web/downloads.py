@@ -43,7 +43,7 @@ def study_file(study: Study, name: str) -> tuple[str, bytes]:
 
 
 def visitor_files(study: Study) -> dict[tuple[str, ...], Path]:
-    """Return the files of the visitor's that a study names, by the path of sections and key."""
+    """Return the visitor's files that a study names, by the path of sections and key."""
     star, light, data = study.star[0], study.flare.spectrum, study.data
     every = {("star", "file"): star.file, ("star", "neighbours"): star.neighbours,
              ("flare", "spectrum", "file"): light.file, ("flare", "spectrum", "quiescent"): light.quiescent,
@@ -53,7 +53,7 @@ def visitor_files(study: Study) -> dict[tuple[str, ...], Path]:
 
 
 def observation_files(study: Study) -> list[Path]:
-    """Return the files of the visitor's that the observations of a calibration name, each once."""
+    """Return the visitor's files that the observations of a calibration name, without duplicates."""
     rows = study.calibrate.observations
     every = (getattr(one, key) for one in rows for key in PATHS)
     return list(dict.fromkeys(file for file in every if file is not None))
@@ -71,7 +71,7 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
         Empty for a document.
     closed : ClosedForms
     answers : mapping
-        Answers that are simulated, by name.
+        Simulated answers by name.
 
     Raises
     ------
@@ -98,8 +98,8 @@ def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answ
         return path.name, path.read_bytes()
 
 
-def taken_along(tab: Tab, question: Question, folder: Path) -> list[dict[str, str]]:
-    """Return what a tab asks as commands and Python programs, one each for each of its `questions`.
+def commands_and_programs(tab: Tab, question: Question, folder: Path) -> list[dict[str, str]]:
+    """Return each of a tab's `questions` as a command and as a Python program.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def taken_along(tab: Tab, question: Question, folder: Path) -> list[dict[str, st
 
 
 def asked_study(name: str, study: Study) -> tuple[str, bytes]:
-    """Return the file of the study that one of a tab's `questions` asks; raises InputError for another name."""
+    """Return the study file of one of a tab's `questions`; raises InputError for any other name."""
     if name not in {one for tab in TABS.values() for one in tab.questions}:
         raise InputError(f"no tab asks {name[:40]!r}", "a question of a tab", key="name", value=name)
     _, wanted = asked(name, study)

@@ -22,19 +22,19 @@ from mauvecl.statistics.registry import STATISTICS
 from mauvecl.study.keys import study_keys
 from mauvecl.web.simulations import SIMULATIONS
 
-#: Texts of fields that hold a file: of those that also take a name or numbers, and of all others.
+#: Texts of fields with an uploaded file: those that also accept a name or numbers, and all others.
 UPLOADED, UPLOADED_UNKNOWN, UPLOADED_FILE = "uploaded star", "uploaded spectrum", "uploaded file"
-#: Realisations that a visitor may ask for, and with a tail by importance sampling.
+#: Numbers of realisations that a visitor can request, without and with importance sampling of the tail.
 REALISATIONS, SAMPLED = (10_000, 100_000, 1_000_000, 4_000_000), (100_000, 1_000_000)
 
-#: Choices of what is unknown.
+#: Choices of the unknowns.
 UNKNOWN = ("nothing", "the usual")
 SKIES = ("brightness", "target and time", "none")
-#: Characters of a field that are looked at.
+#: Largest number of characters of a field.
 MOST_CHARACTERS = 200
-#: Targets whose visibility and plan a visitor may ask for.
+#: Largest number of a visitor's targets.
 MOST_TARGETS = 30
-#: Characters of a table of neighbours, which links hold.
+#: Largest number of characters of a table of neighbours, which is a part of links.
 MOST_TABLE = 3000
 
 
@@ -78,7 +78,7 @@ class Choice:
         """Parse the value; an error states what is accepted."""
         if text not in self.options:
             raise InputError(
-                f"{shortened(text)} is no choice here", f"one of {', '.join(self.options)}", key="choice", value=text
+                f"{shortened(text)} is not a choice", f"one of {', '.join(self.options)}", key="choice", value=text
             )
         return self.made(text)
 
@@ -88,7 +88,7 @@ def several(text: str) -> tuple[str, ...]:
     names = [name for name in text.split(",") if name]
     if len(names) > len(SIMULATIONS) or not set(names) <= SIMULATIONS.keys():
         raise InputError(
-            f"{shortened(text)} is no simulation", f"some of {', '.join(SIMULATIONS)}", key="simulated", value=text
+            f"{shortened(text)} is not a simulation", f"some of {', '.join(SIMULATIONS)}", key="simulated", value=text
         )
     return tuple(dict.fromkeys(names))
 
@@ -101,7 +101,7 @@ def points(text: str) -> tuple[tuple[float, float], ...] | None:
     pairs = [pair.split() for pair in text.split(",") if text.strip()]
     if any(len(pair) != 2 for pair in pairs):
         raise InputError(
-            f"{shortened(text)} is no spectrum",
+            f"{shortened(text)} is not a spectrum",
             "pairs of nm and DN with commas between them",
             key="own_unknown",
             value=text,
@@ -109,13 +109,16 @@ def points(text: str) -> tuple[tuple[float, float], ...] | None:
     spectrum = tuple((float(number(nm)), float(number(dn))) for nm, dn in pairs)
     if any(low >= high for (low, _), (high, _) in itertools.pairwise(spectrum)):
         raise InputError(
-            f"{shortened(text)} does not ascend in nm", "pairs of nm and DN that do", key="own_unknown", value=text
+            f"{shortened(text)} does not ascend in nm",
+            "pairs of nm and DN in ascending order",
+            key="own_unknown",
+            value=text,
         )
     return spectrum
 
 
 def or_nothing(number: Number) -> Callable[[str], float | int | None]:
-    """Return a parser that takes nothing entered for None."""
+    """Return a parser that converts empty text to None."""
     return lambda text: number(text) if text.strip() else None
 
 
@@ -128,7 +131,7 @@ def line_fluxes(text: str) -> tuple[tuple[str, float], ...]:
         (EmissionLine.named(name).name, float(number_of(LineFraction)(value))) for name, _, value in pairs
     )
     if len(dict(fractions)) < len(fractions):
-        raise InputError(f"{shortened(text)} holds a line twice", "each once", key="lines", value=text)
+        raise InputError(f"{shortened(text)} contains a line twice", "each line once", key="lines", value=text)
     return fractions
 
 
@@ -162,7 +165,7 @@ def day(text: str) -> str:
     try:
         found = datetime.date.fromisoformat(text.strip())
     except ValueError:
-        raise InputError(f"{shortened(text)} is no day", expected, key="start", value=text) from None
+        raise InputError(f"{shortened(text)} is not a day", expected, key="start", value=text) from None
     if not YEARS[0] <= found.year < YEARS[1]:
         raise InputError(f"{found} is out of range", expected, key="start", value=text)
     return found.isoformat()

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mauvecl.host.spectra.conversion import ReadSpectrum
     from mauvecl.host.stars.source import Source
 
-#: Fields that set their keys together with the file of another field; files are written in nm, so that units do not.
+#: Fields that set their keys together with the file of another field; units do not, since files are written in nm.
 SET_WITH_FILE = {"flare_file": ("continue_at_k", "flare_quiescent", "as_observed"), "change_file": ("change_band",)}
 #: Fields whose values only apply together with those of others.
 CONDITIONAL = (
@@ -46,7 +46,7 @@ class Question:
 
     @property
     def uploaded(self) -> Source | None:
-        """The visitor's own star, if it is asked for."""
+        """The visitor's own star, or None."""
         return self.uploads.get("star")
 
     def __getattr__(self, name: str) -> Any:
@@ -75,7 +75,7 @@ class Question:
         Raises
         ------
         InputError
-            For values that cannot be together.
+            If values are incompatible.
         """
         if folder is None and (self.uploads.keys() - {"own_unknown"} or self.neighbours is not None):
             raise InputError("no folder for the visitor's files", "a folder", key="folder")

@@ -64,7 +64,7 @@ def read_limited(content: bytes, kind: type[Spectrum], options: Mapping[str, Any
     Parameters
     ----------
     content : bytes
-        What it is shows in itself: a name says nothing.
+        Its format is recognised from the content, not from a name.
     kind : type
         `Source`, `ObservedFlare` or `ReadSpectrum`.
     options : mapping, optional

@@ -44,7 +44,7 @@ def field_of(key: str | None) -> str | None:
 
 
 def sentence(error: InputError, keys: Mapping[str, str] = NO_KEYS) -> str:
-    """Return the message of an error as the page says it; `keys` has other names of its keys."""
+    """Return the message of an error as the page shows it; `keys` maps other names of its keys to fields."""
     text = _VALUE.sub(
         lambda found: f"{_label(found['key'], keys)} {'is empty' if found['empty'] else '= '}", str(error)
     )

@@ -78,7 +78,7 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
     return server
 
 
-def let_go() -> None:
+def close_unused() -> None:
     """Close the connections of unused pages."""
     from mauvecl.web.visitor import UNUSED, Visitor
 
@@ -151,7 +151,7 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
             )
         url = f"http://{netloc(address, port)}/"
         print(f"mauvecl serves at {url}; Ctrl-C ends it.", flush=True)
-        PeriodicCallback(let_go, 1000 * SWEEP_S).start()
+        PeriodicCallback(close_unused, 1000 * SWEEP_S).start()
         if show:
             import webbrowser
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 #: Answers of a question by name.
 Answers = dict[str, Any]
-#: Name of the detection with the other choice of what is unknown: the card shows both.
+#: Name of the detection with the other choice of unknowns; the card shows both.
 OTHER = "detection otherwise"
 #: Cells along each axis of the page's map, and realisations per cell.
 MAP_STEPS, MAP_REALISATIONS = 8, 20_000
@@ -97,9 +97,9 @@ class Simulation:
         Parameters
         ----------
         progress : callable, optional
-            Called with numbers of what the main verb counts.
+            Called with the progress of the main verb.
         given : mapping, optional
-            What was read of the visitor's files, as arguments of the main verb.
+            Contents of the visitor's files, as arguments of the main verb.
         """
         asked = self.asked(study)
         main = next(iter(self.verbs.values()))
@@ -140,7 +140,7 @@ SIMULATIONS = {name: Simulation({name: name}) for name, verb in VERBS.items() if
 
 
 def asked(name: str, study: Study) -> tuple[str, Study]:
-    """Return the verb of a simulation, or of a name that is a verb, with the study that it is asked of the page's."""
+    """Return the verb of a simulation, or the verb of that name, with its study derived from the page's."""
     if name not in SIMULATIONS:
         return name, study
     one = SIMULATIONS[name]

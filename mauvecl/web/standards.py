@@ -1,4 +1,4 @@
-"""Observations of standard stars in an archive of a visitor's: a study that lists them, and the files that it names."""
+"""Observations of standard stars in a visitor's archive: a study that lists them, and the files that it names."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mauvecl.schema.text import printable, shortened
 from mauvecl.study.calibrations import PATHS, CalibrateQuestion, CalibrationObservation
 from mauvecl.web.folders import content_folder
 
-#: Files and observations of an archive, and bytes to which it unpacks, at most.
+#: Largest numbers of files and observations of an archive, and of bytes to which it unpacks.
 MOST_FILES, MOST_BYTES = 40, 64 * 2**20
 #: Bytes of a TOML file of it, and characters of a file's name, at most.
 MOST_TOML_BYTES, MOST_NAME = 2**18, 100
@@ -26,7 +26,7 @@ BOUNDED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 @dataclass(frozen=True)
 class Observations:
-    """Archive of a visitor's with frames of standard stars."""
+    """A visitor's archive with frames of standard stars."""
 
     name: str  # name on the visitor's computer
     content: bytes  # the zip archive
@@ -39,7 +39,7 @@ class Observations:
 
     @property
     def files(self) -> dict[str, bytes]:
-        """Contents by name without folders, unpacked anew: they are large."""
+        """Contents by name without folders, unpacked on each call since they are large."""
         return unpacked(self.content)
 
     def written(self, folder: Path) -> list[dict[str, Any]]:
@@ -62,8 +62,8 @@ def placed(rows: Iterable[CalibrationObservation], place: Callable[[Path], str])
 def unpacked(content: bytes) -> dict[str, bytes]:
     """Return the files of a zip archive by their names without folders.
 
-    Hidden files, which some systems add, are left out. Raises InputError if it is none, is damaged or encrypted, holds
-    too much, or if a name is no plain one in a folder of the archive.
+    Hidden files, which some systems add, are left out. Raises InputError if the content is not a zip archive, is
+    damaged, encrypted or too large, or contains a name that is not a plain one in a folder of the archive.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -112,7 +112,7 @@ def _name(path: str) -> str:
 def observations_in(files: Mapping[str, bytes]) -> tuple[CalibrationObservation, ...]:
     """Return the observations that a study among files lists, with the names of their files.
 
-    Raises InputError if not one of the files is such a study, or the others lack one that it names.
+    Raises InputError unless exactly one file is such a study, and the archive contains all files that it names.
     """
     studies = [rows for name, one in files.items() if name.endswith(".toml") and (rows := _observations(name, one))]
     if len(studies) != 1:
@@ -142,7 +142,7 @@ def _observations(name: str, content: bytes) -> list[dict[str, Any]]:
     try:
         study = tomllib.loads(content.decode("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{shortened(name)} is no TOML file ({error})", "valid TOML", key="observations") from error
+        raise InputError(f"{shortened(name)} is not a TOML file ({error})", "valid TOML", key="observations") from error
     section = study.get("calibrate")
     if not isinstance(section, dict) or "observations" not in section:
         return []

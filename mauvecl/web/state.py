@@ -117,18 +117,18 @@ class State:
                 parse_time(self.entered["time"])
 
     def asked(self, names: Collection[str] = tuple(FIELDS)) -> tuple[str, ...]:
-        """Return the text of fields on which an answer depends: of all, or of those named."""
+        """Return the text of the named fields on which an answer depends, by default of all."""
         return tuple(self.entered[name] for name in FIELDS if name in names)
 
     def question(self, names: Collection[str] = tuple(FIELDS)) -> Question:
         """Return the question.
 
-        Raises InputError if a field that is asked is invalid, with the accepted values of each.
+        Raises InputError with the accepted values if a requested field is invalid.
 
         Parameters
         ----------
         names : collection of str
-            Fields that are asked; the others have their first values.
+            Requested fields; the others have their first values.
         """
         faults = self.faults_of(names)
         if faults:

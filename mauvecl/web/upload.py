@@ -26,14 +26,14 @@ from mauvecl.web.question import Points
 from mauvecl.web.sandboxed_reader import Spectrum, read_frames_limited, read_limited
 from mauvecl.web.standards import Observations
 
-#: Bytes of an upload, and points of its spectrum, at most.
+#: Largest size of an upload, bytes, and largest number of points of its spectrum.
 MOST_UPLOADED, MOST_POINTS = 4 * 2**20, 200_000
-#: Bytes of a file that is kept as it is, such as frames: those of a day have some 8 MiB in resolution elements.
+#: Largest size of a file that is kept unread, such as frames; a day of resolution elements takes some 8 MiB.
 MOST_KEPT_BYTES = 16 * 2**20
-#: Values of frames that are read for an answer, at most: the spectra of a day.
+#: Largest number of values of frames that an answer reads: the spectra of a day.
 MOST_VALUES = 2**24
 
-#: Bytes and rows of what is unknown: it goes into every table's study.
+#: Largest size and number of rows of an unknown spectrum, which the study in every table contains.
 MOST_PAIRS_BYTES, MOST_PAIRS = 2**18, 4000
 
 
@@ -91,7 +91,7 @@ def read_flare(
 ) -> ReadSpectrum:
     """Read an untrusted spectrum of a flare, like `read_upload`.
 
-    The result holds what was measured: the study that reads it continues it.
+    Only the measured range is returned; the study that reads the file continues it.
     """
     options = {"wavelength_unit": flare_wavelength_unit, "flux_unit": flare_flux_unit, "continue_at_k": continue_at_k}
     flare = _spectrum(content, ObservedFlare, options)
@@ -118,7 +118,7 @@ def _spectrum(content: bytes, kind: type[Spectrum], options: Mapping[str, Any]) 
 
 
 def check_size(content: bytes, most: int) -> None:
-    """Raise InputError for a file with more bytes than are read."""
+    """Raise InputError if a file is too large."""
     if len(content) > most:
         size = len(content) / 2**20
         raise InputError(f"upload of {size:.1f} MiB", f"at most {most / 2**20:g} MiB", key="upload", value=len(content))
@@ -136,30 +136,34 @@ def read_pairs(name: str, content: bytes) -> Points:
     try:
         text = content.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise InputError(f"{shortened(name)} is no text", "two columns, nm and DN", key="upload", value=name) from error
+        raise InputError(
+            f"{shortened(name)} is not text", "two columns, nm and DN", key="upload", value=name
+        ) from error
     pairs = columns(f"upload {shortened(name)}", text)
     if pairs.ndim != 2 or pairs.shape[1] != 2 or not 2 <= len(pairs) <= MOST_PAIRS:
         raise InputError(
-            f"{shortened(name)} has other rows",
-            f"2 to {MOST_PAIRS} of two numbers, nm and DN",
+            f"{shortened(name)} does not have two columns",
+            f"2 to {MOST_PAIRS} rows of two numbers, nm and DN",
             key="upload",
             value=name,
         )
     if not np.isfinite(pairs).all() or (np.diff(pairs[:, 0]) <= 0).any():
-        raise InputError(f"{shortened(name)} does not ascend in nm", "rows that do", key="upload", value=name)
+        raise InputError(
+            f"{shortened(name)} does not ascend in nm", "rows in ascending order", key="upload", value=name
+        )
     return tuple((float(nm), float(dn)) for nm, dn in pairs)
 
 
 @dataclass(frozen=True)
 class VisitorFile:
-    """File of a visitor as it came, until an answer needs it."""
+    """A visitor's file, not read until an answer needs it."""
 
     name: str  # name on the visitor's computer, without folders and odd characters
     content: bytes
 
     @classmethod
     def of(cls, name: str, content: bytes) -> VisitorFile:
-        """Keep a file that is not too large."""
+        """Keep a file; raise InputError if it is too large."""
         check_size(content, MOST_KEPT_BYTES)
         plain = re.sub(r"[^A-Za-z0-9_.+-]", "_", re.split(r"[/\\]", name)[-1])[-80:].strip(".-")
         return cls(plain or "file", content)
@@ -188,7 +192,7 @@ class Upload:
 
     @cached_property
     def keys(self) -> dict[str, str]:
-        """Names of `options` by the names that the messages of readers have for them."""
+        """Names of `options` by their names in the messages of readers."""
         return {
             key: name
             for name in self.options

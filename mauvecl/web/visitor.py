@@ -25,7 +25,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 from mauvecl.web.card import card, without_headline
 from mauvecl.web.closed_forms import ClosedForms
-from mauvecl.web.downloads import as_file, asked_study, taken_along
+from mauvecl.web.downloads import as_file, asked_study, commands_and_programs
 from mauvecl.web.folders import visitor_folder
 from mauvecl.web.headline import other_payloads, solved
 from mauvecl.web.known_stars import known
@@ -58,8 +58,8 @@ UNUSED = 4000
 class Visitor(WebSocketHandler):
     """WebSocket connection of a page.
 
-    Messages are JSON: ``ask`` says what is asked, ``n`` numbers it, ``link`` holds the fields. Answers have the same
-    ``n``; of several questions in a row only the last need be answered.
+    Messages are JSON: ``ask`` names the request, ``n`` is its number, and ``link`` contains the fields. Answers have
+    the same ``n``; of several pending questions, only the last is answered.
     """
 
     #: Everybody who is here.
@@ -125,12 +125,12 @@ class Visitor(WebSocketHandler):
             if not (isinstance(asked["n"], int) and isinstance(asked["link"], str)):
                 raise TypeError
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-            log.warning("a message is no question of the page's: %s", shortened(message))
+            log.warning("a message is not a valid request: %s", shortened(message))
             self.close(1003, "expected a question as the page asks it")
             return
         ask(asked)
 
-    # ClosedForms forms
+    # State and answers
 
     def state(self, link: str) -> State:
         """Enter values."""
@@ -398,12 +398,12 @@ class Visitor(WebSocketHandler):
         return self._files[which]
 
     def _ask_export(self, asked: dict[str, Any]) -> None:
-        """Send what a tab asks as commands and as Python programs."""
+        """Send a tab's questions as commands and as Python programs."""
         n, tab = asked["n"], tab_of(str(asked.get("tab")))
         self._give(self._export(n, self.state(asked["link"]), tab), n=n)
 
     async def _export(self, n: int, state: State, tab: Tab) -> None:
-        work = partial(taken_along, tab, state.question(tab.reads), Path(self._folder.name))
+        work = partial(commands_and_programs, tab, state.question(tab.reads), Path(self._folder.name))
         self.send(n=n, taken=await self._in_thread(work))
 
 

@@ -20,7 +20,7 @@ TOGETHER = 2
 #: Simulations that take longer, s, leave memory to release; that of a short one would stop all visitors for longer.
 LONG_S = 1.0
 _threads = ThreadPoolExecutor(TOGETHER, thread_name_prefix="mauvecl-page")
-_own = threading.local()
+_per_thread = threading.local()
 #: Uploads are read one after the other, outside the event loop.
 _reader = ThreadPoolExecutor(1, thread_name_prefix="mauvecl-upload")
 
@@ -34,19 +34,19 @@ class Cancelled(Exception):  # noqa: N818
     """Cancellation by the visitor."""
 
 
-def _strike(thread: int, with_what: type[BaseException] | None) -> None:
-    """Raise an exception in a thread at its next bytecode, or withdraw it."""
-    given = None if with_what is None else ctypes.py_object(with_what)
+def _set_pending(thread: int, error: type[BaseException] | None) -> None:
+    """Set the exception that a thread raises at its next bytecode, or clear a pending one."""
+    given = None if error is None else ctypes.py_object(error)
     ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), given)
 
 
 def _engine(progress: Callable[[int, int], None]) -> Engine:
     """Return this thread's engine, which reports the progress of this job from any thread."""
-    if not hasattr(_own, "engine"):
-        listener = _own.listener = [progress]
-        _own.engine = Engine(progress=lambda done, total: listener[0](done, total))
-    _own.listener[0] = progress
-    engine: Engine = _own.engine
+    if not hasattr(_per_thread, "engine"):
+        listener = _per_thread.listener = [progress]
+        _per_thread.engine = Engine(progress=lambda done, total: listener[0](done, total))
+    _per_thread.listener[0] = progress
+    engine: Engine = _per_thread.engine
     return engine
 
 
@@ -65,11 +65,11 @@ class Job:
     Parameters
     ----------
     ask : callable
-        Makes the answer with a pool; with a unit also with a function that is called with counts of it.
+        Computes the answer from a pool and, if there is a unit, a function that receives counts of it.
     drawing : bool
-        Whether it draws: it then ends between two tiles. What draws nothing asks nobody, and ends wherever it is.
+        Whether realisations are drawn. Such a job is cancelled between two tiles, others anywhere by an exception.
     unit : str
-        What is counted; realisations of the pool if empty.
+        Unit of the progress; realisations of the pool if empty.
     """
 
     ask: Callable[..., Any]
@@ -105,7 +105,7 @@ class Job:
             # A pending interruption would otherwise reach the next work of this thread.
             with self._lock:
                 if self._thread is not None:
-                    _strike(self._thread, None)
+                    _set_pending(self._thread, None)
                 self._thread = None
 
     def _asked(self) -> Any:
@@ -130,7 +130,7 @@ class Job:
             again = self._cancelled.is_set()
             self._cancelled.set()
             if self._thread is not None and not again:
-                _strike(self._thread, Cancelled)
+                _set_pending(self._thread, Cancelled)
         # Work that waits for fits in other threads is not interrupted: fits end between two of their draws.
         if self._pool is not None:
             self._pool.stop()

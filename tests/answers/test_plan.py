@@ -200,7 +200,7 @@ def test_plan_takes_completeness_as_argument(study: Study) -> None:
     answer = plan(one, completeness=none_below)
     assert answer.table["expected"][0] == pytest.approx(0.5 * 5, rel=0.02)
     mean = answer.table["expected"][0]
-    # Rates of one's own have no scatter: Poisson's alone.
+    # The user's own rates have no scatter beyond Poisson noise.
     assert [answer.table["low"][0], answer.table["high"][0]] == stats.poisson.ppf([0.025, 0.975], mean).tolist()
 
 

@@ -65,7 +65,7 @@ def test_cost_equals_that_of_the_methods(
     assert found.marginal == pytest.approx(marginal, rel=0.01)
     (line,) = cost_lines([found], asked.nuisances)
     assert f"{found.marginal:.3g} marginalised" in line
-    # Where the study names none, the documented ones, and it says so.
+    # Without unknowns of the study, the documented ones are used, which the answer states.
     none = NuisanceChoice()
     found = unknown_cost("it", *Case(asked).expectations, none, asked.run.comparison())
     (line,) = cost_lines([found], none)

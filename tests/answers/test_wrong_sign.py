@@ -46,7 +46,7 @@ def test_lowered_statistic_is_reported_if_simulation_lowers_it(
 
 
 def test_cases_include_lowered_and_raised_statistics(engine: Engine) -> None:
-    """Check that the test above meets both, and that a lowered statistic detects nothing."""
+    """Check that the test above covers both cases, and that a lowered statistic detects nothing."""
     found = {}
     for temperature_k in (4000.0, 10_000.0):
         study = small(

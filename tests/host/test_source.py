@@ -430,8 +430,8 @@ def test_mean_too_far_below_zero_raises() -> None:
 def test_standard_error_equals_the_scatter_of_means() -> None:
     """Compare with the scatter of 200 spectra with white noise.
 
-    200 draws tell a standard deviation to 5 %, and the error told, a mean over 20 of them, is right to 3 %: 0.75 to
-    1.25 is beyond four deviations and fails by chance less than once in 1e3 for any of ten pixels, of a fixed seed.
+    The standard deviation of 200 draws is accurate to 5 %, and the reported error, a mean over 20 of them, to 3 %. The
+    limits of 0.75 and 1.25 lie beyond four standard deviations: false failures of any of ten pixels in < 1e-3 of seeds.
     """
     from mauvecl.host.measured_noise import standard_error_per_second
     from mauvecl.host.response import electrons_per_second

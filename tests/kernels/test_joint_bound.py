@@ -33,7 +33,7 @@ TAIL = 5e-3
 
 @dataclass(frozen=True)
 class Noise:
-    """One pixel: Gaussian noise of so many DN, Poisson counts of dark and light with their steps, and where in a DN."""
+    """Noise of a pixel: Gaussian noise (DN), Poisson dark and light with their steps, and the phase within a DN."""
 
     read: float
     dark: float

@@ -51,7 +51,7 @@ def test_rate_agrees_with_importance_sampling(widths):
 
 
 def test_rate_agrees_with_counts():
-    """Compare some alarms a day, where maxima come in clumps: the rate is a fifth too large at most.
+    """Compare at a few alarms per day, where maxima are clustered and the rate is at most a fifth too large.
 
     600 stares of six hours: 4 standard errors fail by chance once in 10^4 runs.
     """

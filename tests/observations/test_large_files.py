@@ -27,7 +27,7 @@ import astropy.io.fits, astropy.table, astropy.time, scipy.special
 import numpy as np
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.observations.reading import read_frames, reduce_frames
-# OpenBLAS reserves address space at the first large product; it is no part of what reading needs.
+# OpenBLAS reserves address space at the first large product; reading does not need it.
 np.ones((300, 300)) @ np.ones((300, 300))
 pages = int(open("/proc/self/statm").read().split()[0])
 limit = pages * resource.getpagesize() + {margin} * 2**20
@@ -146,7 +146,7 @@ from mauvecl.observations.mapping import FrameMapping
 from mauvecl.observations.reading import read_frames
 how = dict(time="time", flux="flux_*", wavelength="names", wavelength_unit="nm")
 read_frames({small!r}, FrameMapping(time_unit="s", **how))
-# OpenBLAS reserves address space at the first large product; it is no part of what reading needs.
+# OpenBLAS reserves address space at the first large product; reading does not need it.
 np.ones((300, 300)) @ np.ones((300, 300))
 pages = int(open("/proc/self/statm").read().split()[0])
 limit = pages * resource.getpagesize() + {margin} * 2**20

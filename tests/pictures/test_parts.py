@@ -1,4 +1,4 @@
-"""Pictures and tables that show a part of what there is say how large the part is."""
+"""Pictures and tables that show a part of an answer state how large the part is."""
 
 from __future__ import annotations
 

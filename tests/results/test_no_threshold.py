@@ -82,7 +82,7 @@ def test_threshold_exists_unless_a_value_is_too_probable(engine: Engine, seed: i
 
 
 def test_scenes_include_stars_without_threshold(engine: Engine) -> None:
-    """Check that the test above meets stars with and without a threshold."""
+    """Check that the test above includes stars with and without a threshold."""
     kinds = set()
     for seed in range(20):
         quiet, _ = nearly_saturated(seed)

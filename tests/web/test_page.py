@@ -92,7 +92,7 @@ def test_one_edit_answers_without_scrolling(browser: Browser, server: Server) ->
 
 
 def test_page_and_command_line_give_the_same_bits(page: Page, tmp_path: Path) -> None:
-    assert page.get_by_text("not a flight calibration").count() == 1, "told once"
+    assert page.get_by_text("not a flight calibration").count() == 1, "stated once"
     enter(page, "Flare amplitude", "1.9")
     place = page.locator("#plot-excess").bounding_box()
     reported = simulate(page)
@@ -441,7 +441,7 @@ def test_uploads_are_used_or_refused(page: Page, tmp_path: Path) -> None:
     choose.set_input_files(bad)
     page.locator("#w-star", has_text=re.compile(r"line 2: .* is not numeric")).wait_for()
     answerless(page)
-    assert star.input_value() == "", "no star's name beside another's file"
+    assert star.input_value() == "", "no star's name next to another star's file"
     choose.set_input_files(good)
     until(page, lambda: star.input_value() == "uploaded star")
     until(page, lambda: "your own star" in shown(page))
@@ -632,7 +632,7 @@ def test_command_and_program_are_shown(page: Page) -> None:
 
 @pytest.mark.parametrize("theme", ["light", "dark", "forced"])
 def test_page_is_accessible(browser: Browser, server: Server, theme: str) -> None:
-    """axe-core finds no violation, of whatever impact, on any tab, dialog, or fault."""
+    """Check that axe-core finds no violation of any impact on any tab, dialog or error."""
     axe = Path(pytest.importorskip("axe_playwright_python").__file__).parent / "axe.min.js"
     colours = {"forced_colors": "active"} if theme == "forced" else {"color_scheme": theme}
     page = fresh(browser, server.address, **colours)
@@ -762,7 +762,7 @@ def test_help_is_next_to_its_question_mark(page: Page) -> None:
 
 
 def test_page_works_by_keyboard(page: Page) -> None:
-    """From the first field to a download, with the keys alone; each stop can be seen."""
+    """Use only the keyboard from the first field to a download; the focus is visible at every stop."""
     page.evaluate("document.body.focus()")
 
     def go(true: str, keys: str = "Tab") -> None:
@@ -797,7 +797,7 @@ def test_page_works_by_keyboard(page: Page) -> None:
 
 
 def test_page_fits_a_phone_and_zoom(browser: Browser, server: Server) -> None:
-    """390 pixels wide, and 1280 pixels at 200 %: the answer first, nothing to scroll sideways for."""
+    """Check 390 pixels, and 1280 pixels at 200 %: the answer comes first, and nothing scrolls sideways."""
     for width, height in ((390, 844), (640, 400)):
         page = fresh(browser, server.address, viewport={"width": width, "height": height})
         card, asked = page.locator("#numbers").bounding_box(), page.locator("#asked").bounding_box()
@@ -877,7 +877,7 @@ def test_star_is_filled_in_or_offered(page: Page) -> None:
     page.get_by_text("No answer.", exact=True).wait_for()
     page.get_by_role("button", name="Use M1V at V = 8.81").click()
     until(page, lambda: "M1V star" in shown(page) and "V = 8.81" in shown(page))
-    # A magnitude of one's own stays.
+    # A magnitude that the user entered stays.
     enter(page, "Magnitude", "9")
     until(page, lambda: "V = 9," in shown(page))
 

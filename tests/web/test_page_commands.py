@@ -30,7 +30,7 @@ from mauvecl.study.cases import cases
 from mauvecl.study.study import Study
 from mauvecl.web.closed_forms import ClosedForms
 from mauvecl.web.commands import differing, keys_used
-from mauvecl.web.downloads import study_file, taken_along
+from mauvecl.web.downloads import commands_and_programs, study_file
 from mauvecl.web.fields import UPLOADED
 from mauvecl.web.simulations import SIMULATIONS, asked
 from mauvecl.web.state import State
@@ -98,7 +98,7 @@ def test_command_and_program_are_the_question(number: int, tmp_path: Path, monke
         state.follow(check_commands.random_link(generator))
     question = state.question()
     for tab in TABS.values():
-        for one in taken_along(tab, question, tmp_path):
+        for one in commands_and_programs(tab, question, tmp_path):
             verb, wanted = asked(one["question"], question.study())
             assert one["command"].startswith(f"mauvecl {verb}")
             given: dict[str, Any] = {}
@@ -121,7 +121,7 @@ def test_own_star_is_in_the_study_that_the_command_names(tmp_path: Path, monkeyp
     state.follow(f"?star={UPLOADED.replace(' ', '+')}")
     for tab in TABS.values():
         question = state.question(tab.reads)
-        for one in taken_along(tab, question, kept):
+        for one in commands_and_programs(tab, question, kept):
             if "star" not in tab.reads:
                 continue
             verb, wanted = asked(one["question"], question.study(kept))
@@ -146,7 +146,7 @@ def test_own_flare_answers_as_its_file(tmp_path: Path, monkeypatch: pytest.Monke
     state.follow("?flare_file=uploaded+file&flare_wavelength_unit=Angstrom&continue_at_k=9000")
     question = state.question()
     page = ClosedForms.of(question, kept)
-    taken = {one["question"]: one for one in taken_along(TABS["detection"], question, kept)}
+    taken = {one["question"]: one for one in commands_and_programs(TABS["detection"], question, kept)}
     assert taken["detection"]["command"] == "mauvecl detect study.toml"
     _, content = study_file(page.study, "study")
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -188,7 +188,7 @@ def test_observed_flare_without_its_star_answers_as_its_files(
     question = state.question(TABS[tab].reads)
     page = ClosedForms.of(question, kept)
     assert page.question.amplitude_percent == pytest.approx(100 * page.study.flare.amplitudes[0])
-    (taken,) = taken_along(TABS[tab], question, kept)
+    (taken,) = commands_and_programs(TABS[tab], question, kept)
     verb = {"detection": "detect"}.get(tab, tab)
     assert taken["command"] == f"mauvecl {verb} study.toml"
     _, content = study_file(page.study, "study")
@@ -223,7 +223,7 @@ def test_own_added_spectrum_answers_as_its_file(tmp_path: Path, monkeypatch: pyt
     question = state.question(tab.reads)
     page = SIMULATIONS["change"](question.study(kept), Pool(LocalWorkers([None])))["change"].table
     assert page["change"].tolist() == ["Mg II", "spectrum"]
-    (taken,) = taken_along(tab, question, kept)
+    (taken,) = commands_and_programs(tab, question, kept)
     assert "--change-file added.ecsv --change-band B" in taken["command"]
     _, content = study_file(asked("change", question.study(kept))[1], "study")
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -250,8 +250,8 @@ def test_own_added_spectrum_answers_as_its_file(tmp_path: Path, monkeypatch: pyt
 def test_printed_commands_give_the_numbers_of_the_page(tab: str, tmp_path: Path) -> None:
     """Run the command of a random question for each tab; `tools/check_commands.py` runs twenty.
 
-    This detects a page and a command line that compute something else from the same question. Answers with an unknown
-    spectrum of one's own are compared in `test_downloads_equal_the_files_of_the_command_line`.
+    This detects a page and a command line that compute something else from the same question. Answers with the
+    user's own unknown spectrum are compared in `test_downloads_equal_the_files_of_the_command_line`.
     """
     generator = np.random.default_rng([3, len(tab)])
     state, closed = check_commands.possible_question(generator, TABS[tab], tmp_path, quick=True)
@@ -271,12 +271,12 @@ def test_comparison_asks_what_the_tab_reads(tmp_path: Path) -> None:
 def test_comparison_notices_another_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tab = TABS["spectrum"]
     state, closed = check_commands.possible_question(np.random.default_rng(5), tab, tmp_path)
-    original = check_commands.taken_along
+    original = check_commands.commands_and_programs
 
     def reseeded(*how: Any) -> list[dict[str, str]]:
         return [one | {"command": re.sub(r"--seed \d+", "--seed 99", one["command"])} for one in original(*how)]
 
-    monkeypatch.setattr(check_commands, "taken_along", reseeded)
+    monkeypatch.setattr(check_commands, "commands_and_programs", reseeded)
     assert check_commands.differences(tab, state, closed, tmp_path)
 
 

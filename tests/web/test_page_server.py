@@ -957,12 +957,12 @@ def test_unused_page_is_closed(served: Any, monkeypatch: pytest.MonkeyPatch) -> 
     async def work(host: str) -> None:
         connection = await opened(host, Origin=f"http://{host}")
         await connection.read_message()
-        server.let_go()
+        server.close_unused()
         (one,) = visitor.Visitor.here
         monkeypatch.setattr(server, "IDLE_S", 0)
-        server.let_go()
+        server.close_unused()
         assert await asyncio.wait_for(connection.read_message(), 10) is None
-        assert connection.close_code == visitor.UNUSED, "the page is told why"
+        assert connection.close_code == visitor.UNUSED, "the page receives the reason"
         await asyncio.sleep(0.1)
         assert one not in visitor.Visitor.here
         assert not Path(one._folder.name).exists()
@@ -1027,7 +1027,7 @@ def test_invalid_messages_give_no_traceback_and_no_path(served: Any, caplog: pyt
         served(work)
     form = Plain()
     lines = [form.format(record) for record in caplog.records]
-    assert any("no question" in one for one in lines), "there is something to see"
+    assert any("not a valid request" in one for one in lines), "there is something to see"
     for text in (*reported, *lines):
         assert "Traceback" not in text
         assert "site-packages" not in text

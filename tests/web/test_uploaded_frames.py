@@ -1,4 +1,4 @@
-"""Frames that a visitor uploads: read apart from the server, analysed as the command line does, and taken along."""
+"""Frames that a visitor uploads: read apart from the server, analysed as the command line does, and exported."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 from mauvecl.web.closed_forms import ClosedForms
-from mauvecl.web.downloads import as_file, study_file, taken_along
+from mauvecl.web.downloads import as_file, commands_and_programs, study_file
 from mauvecl.web.fields import UPLOADED_FILE
 from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS
@@ -79,9 +79,9 @@ def test_uploaded_frames_are_analysed_as_on_the_command_line(tmp_path: Path) -> 
         as_file(TAB, "measured", "ecsv", page, {"analyse": answer})
 
 
-def test_what_is_taken_along_names_the_file(tmp_path: Path) -> None:
+def test_exports_name_the_file(tmp_path: Path) -> None:
     question = asked(light_curve()).question(TAB.reads)
-    (taken,) = taken_along(TAB, question, tmp_path)
+    (taken,) = commands_and_programs(TAB, question, tmp_path)
     assert taken["command"].startswith("mauvecl analyse my_curve.csv ")
     assert "--mapping curve.toml" in taken["command"]
     assert "--alarms-per day" in taken["command"]
@@ -155,7 +155,7 @@ def test_neighbours_of_the_page_are_those_of_the_command_line(tmp_path: Path) ->
     assert chances["alone"].chance == chances["none of it"].chance
     assert chances["blended"].chance < chances["alone"].chance - 0.004
     state.enter({"neighbour_share": "1"})
-    (taken, *_) = taken_along(TABS["detection"], state.question(TABS["detection"].reads), tmp_path)
+    (taken, *_) = commands_and_programs(TABS["detection"], state.question(TABS["detection"].reads), tmp_path)
     assert "--neighbours neighbours.csv --neighbours-of 'Gaia DR3 1'" in taken["command"]
     _, content = study_file(state.question().study(tmp_path), "study")
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -192,6 +192,6 @@ def test_pointing_losses_are_those_of_the_study(tmp_path: Path) -> None:
     found = study.stare.pointing
     assert found is not None
     assert (found.rate_per_h, found.duration_s, found.depth) == (2.0, 200.0, 0.1)
-    (taken,) = taken_along(tab, state.question(tab.reads), tmp_path)
+    (taken,) = commands_and_programs(tab, state.question(tab.reads), tmp_path)
     assert "stare.pointing" in taken["command"]
     assert State().question(tab.reads).study(tmp_path).stare.pointing is None

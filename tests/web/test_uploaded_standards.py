@@ -19,7 +19,7 @@ pytest.importorskip("bokeh")
 
 from mauvecl import Instrument, Source, Study, calibrate
 from mauvecl.web.closed_forms import ClosedForms
-from mauvecl.web.downloads import as_file, taken_along
+from mauvecl.web.downloads import as_file, commands_and_programs
 from mauvecl.web.fields import UPLOADED_FILE
 from mauvecl.web.standards import MOST_BYTES, MOST_FILES, MOST_NAME, MOST_TOML_BYTES, Observations, unpacked
 from mauvecl.web.state import State
@@ -142,7 +142,7 @@ def test_pictures_show_the_fit(contents: dict[str, bytes], tmp_path: Path) -> No
     assert "DN per electron" in pictures["transfer"]["text"]
     assert shown("calibrate", page, {})["pictures"]["transfer"]["text"].startswith("Choose an archive")
     assert TAB.rows(page, answers)[1][0] == "dark current"
-    (one,) = taken_along(TAB, page.question, tmp_path)
+    (one,) = commands_and_programs(TAB, page.question, tmp_path)
     assert str(tmp_path) not in one["command"] + one["python"]
 
 

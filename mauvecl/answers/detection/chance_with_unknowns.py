@@ -1,4 +1,4 @@
-"""Chance of detection with the usual unknowns, next to answers that take everything but the noise as known."""
+"""Chance of detection with the usual unknowns, next to answers that assume that everything but the noise is known."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAX_FLARES = 100
 def chance_with_unknowns(prepared: Sequence[Case]) -> list[str]:
     """Return a sentence on the chance with and without the usual unknowns, or none if the study has unknowns.
 
-    It is that of the flare whose chance is nearest to one half: others are seen, or lost, with and without unknowns.
+    The flare is the one whose chance is nearest to one half; others are detected, or missed, either way.
     """
     study = prepared[0].study
     if study.nuisances != NuisanceChoice() or study.run.comparison().estimated:

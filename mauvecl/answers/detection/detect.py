@@ -347,7 +347,7 @@ def _wanted(asked: CampaignQuestion, tests: int, stack: int, seed: int) -> list[
         if not asked.alarms < tests:
             raise InputError(
                 f"campaign.alarms = {asked.alarms:g} of {tests} tests",
-                "fewer than tests",
+                "fewer alarms than tests",
                 key="campaign.alarms",
                 value=asked.alarms,
             )

@@ -136,7 +136,7 @@ class CalibrateAnswer(Answer):
     ----------
     study : Study
     nominal : Instrument
-        The instrument from which the fit starts, which gives what is not determined.
+        The instrument from which the fit starts, whose values remain where the observations determine none.
     observations : tuple of CalibrationFrames
     dark : DarkFit
     transfer : PhotonTransfer

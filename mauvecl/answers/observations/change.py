@@ -255,8 +255,8 @@ def change(
     Parameters
     ----------
     study : Study
-        Its ``change`` says which changes, and how many visits; ``run.fap`` and ``limit.power`` at which probabilities;
-        ``nuisances`` what is unknown in each visit.
+        Its ``change`` gives the changes and the number of visits, ``run.fap`` and ``limit.power`` the probabilities,
+        and ``nuisances`` the unknowns of each visit.
     engine : Engine or Pool, optional
         Not used: errors are closed forms, and periodograms are simulated on the host.
     progress : callable, optional

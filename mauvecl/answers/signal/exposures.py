@@ -51,7 +51,7 @@ class Exposure:
 
 
 def _floored(snr: float) -> str:
-    """Return an S/N to three digits, rounded down: what falls short must not look as if it did not."""
+    """Round an S/N down to three digits, so that an insufficient one does not appear sufficient."""
     return f"{math.floor(1000 * snr) / 1000:.3f}"
 
 
@@ -129,7 +129,7 @@ def exposure(
     Parameters
     ----------
     study : Study
-        Its ``signal`` says which; its exposure does not matter.
+        Its ``signal`` gives S/N and wavelength; its exposure is not used.
     engine : Engine or Pool, optional
         Not used: nothing is drawn.
     progress : callable, optional
@@ -186,7 +186,7 @@ def exposure_for(
     Parameters
     ----------
     study : Study
-        Its exposure does not matter.
+        Its exposure is not used.
     snr : float, optional
     wavelength_nm : Quantity, or float in nm, optional
         In place of those of the study's ``signal``.

@@ -121,7 +121,7 @@ def snr(
     progress : callable, optional
         Called as ``progress(done, total)`` in stars.
     """
-    # Bad input is refused before anything is drawn.
+    # Invalid input raises an error before anything is drawn.
     prepared, run, asked = cases(study), study.run, study.signal.wavelength_nm
     quiet = [case.quiet for case in prepared]
     if asked is not None:

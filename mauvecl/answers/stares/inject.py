@@ -265,7 +265,7 @@ def inject(
     ----------
     study : Study
     engine : Stares or Pool, optional
-        Draws; the default device if not given.
+        Simulator; by default that of the default device.
     progress : callable, optional
         Called as ``progress(done, total)`` in injections; may raise to stop the work.
     """

@@ -320,9 +320,9 @@ def stare(
     Parameters
     ----------
     study : Study
-        Its section `stare`, `events`, star, flare, sky, observation; `run.seed` and `stare.number` say which stare.
+        Its section `stare`, `events`, star, flare, sky, observation; `run.seed` and `stare.number` select the stare.
     engine : Stares, optional
-        Draws it; the default device.
+        Simulator; by default that of the default device.
     progress : callable, optional
         Called as ``progress(done, total)`` in stares.
     checkpoint : Checkpoint, optional

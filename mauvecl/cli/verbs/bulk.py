@@ -38,7 +38,7 @@ def realise(session: Session) -> None:
     """Draw raw spectra in bulk: a Zarr store, a FITS or HDF5 file.
 
     One file holds fewer than 4 GiB. An array per star and flare, a row per realisation, with calibration, units and
-    the study. What was written stays: --resume draws what is missing.
+    the study. An interrupted run keeps its rows: --resume draws the rest.
 
     Examples: mauvecl realise study.toml -n 10000 --output frames.zarr
 
@@ -191,7 +191,7 @@ def export(
         ),
     ] = None,
     rows: RowsFlag = None,
-    replace: Annotated[bool, typer.Option("--replace", help="Take the place of what has that name.")] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace an existing file of that name.")] = False,
     quiet: QuietFlag = False,
 ) -> None:
     """Write a part of a store as one FITS or HDF5 file.

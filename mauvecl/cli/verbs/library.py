@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mauvecl.host.stars.own_stars import OwnStar
 
 app = typer.Typer(invoke_without_command=True, rich_markup_mode=None, add_completion=False)
-ReplaceFlag = Annotated[bool, typer.Option("--replace", help="Take the place of what has that name.")]
+ReplaceFlag = Annotated[bool, typer.Option("--replace", help="Replace an existing star of that name.")]
 
 
 @app.callback()
@@ -103,7 +103,7 @@ def fetch(
 
 @app.command()
 def remove(names: Annotated[list[str], typer.Argument(help="Names of kept stars.")], quiet: QuietFlag = False) -> None:
-    """Forget spectra of your own.
+    """Remove spectra of your own.
 
     Example: mauvecl library remove "HD 1234"
     """

@@ -105,7 +105,7 @@ def alarms(
         Logarithm of the energy per second of equivalent duration as a function of the logarithm of the temperature,
         and its derivative.
     profiled : collection of str
-        Those of `QUANTITIES` whose intervals are wanted; each takes many fits.
+        Those of `QUANTITIES` whose intervals are computed; each takes many fits.
     """
     search = _StareSearch(StareSums(survey, templates, np.asarray(survey.net(sums[None])[0], np.float64)), threshold)
     search.run()

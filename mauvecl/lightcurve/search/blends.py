@@ -94,7 +94,7 @@ class SearchedStare(Protocol):
 
     @property
     def directions(self) -> Mapping[Any, Float]:
-        """Derivatives of the mean sums by what changes, shape (n_frame, n_sum) each."""
+        """Derivatives of the mean sums by unknown changes, shape (n_frame, n_sum) each."""
 
     def covariance(self) -> Float:
         """Return the covariance of each frame's sums without a flare, shape (n_frame, n_sum, n_sum)."""

@@ -32,7 +32,7 @@ def exponential_less_one(x: Floats) -> Floats:
 
 
 def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int, lost: Floats) -> dict[str, Floats]:
-    """Draw what some stares have in a frame: coefficients of the steady components and the factor on light, minus one.
+    """Draw the coefficients of the steady components and the factor on light in a frame, minus one.
 
     Returns
     -------

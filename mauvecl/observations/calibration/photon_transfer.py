@@ -136,7 +136,7 @@ def fit_photon_transfer(
     measured : sequence of MeasuredVariance
         At least one.
     nominal : Instrument
-        Gives what is not determined.
+        Instrument whose values are kept where the data determine none.
     dark_error_dn : float
         Standard error of the dark of a mean frame, which moves the read noise.
     """

@@ -274,7 +274,7 @@ class TailSamples:
         self.realisations = np.empty(0, np.int64)
 
     def add(self, values: NDArray[np.float32], first: int) -> None:
-        """Add the values of realisations from `first` on; of equal values the earlier realisation is kept."""
+        """Add the values of realisations from `first` on; among equal values the earlier realisation is kept."""
         signed = self._sign * values
         if self.values.size == TAIL_SAMPLES:
             beyond = np.flatnonzero(signed > self._sign * self.values[-1])

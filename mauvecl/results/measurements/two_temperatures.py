@@ -39,23 +39,23 @@ APART = 4
 
 @dataclass(frozen=True, eq=False)
 class TwoTemperatures:
-    """The mean counts of a flare of two blackbodies, both temperatures free."""
+    """Mean counts of a flare of two blackbodies with free temperatures."""
 
     single: FlareModel  # model of one blackbody, optionally with lines
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of what fits report."""
+        """Names of the reported quantities."""
         return (*self.single.names, "second temperature", "second area")
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Their units."""
+        """Units of the reported quantities."""
         return (*self.single.units, "K", "")
 
     @property
     def bounds(self) -> tuple[float, ...]:
-        """Smallest possible values."""
+        """Smallest possible values of the reported quantities."""
         return (*self.single.bounds, -np.inf, 0.0)
 
     def counts(self, temperatures_k: Float, amplitudes: Sequence[float] | Float) -> Float:

@@ -1,5 +1,5 @@
 // @ts-check
-// What visitors take along: tables, studies, pictures, commands, programs, and the link.
+// Exports: tables, studies, pictures, commands, programs, and the link.
 
 import {byId, every} from "./dom.js"
 

@@ -326,7 +326,7 @@ ${actions(tab)}
 </dialog>
 <dialog id="about" aria-labelledby="about-head">
 <h2 id="about-head">About mauvecl ${version}</h2>
-<p>Closed forms follow every change at once; Simulate refines them with noise realisations. Whatever is seen can be taken along and gives the same numbers on the command line.</p>
+<p>Closed forms follow every change at once; Simulate refines them with noise realisations. Everything on the page can be exported, and gives the same numbers on the command line.</p>
 <h3>Documentation</h3><p>The folder <code>docs</code> of the project, its page <code>docs/page.md</code> on this page, and <code>mauvecl --help</code>.</p>
 <h3>Citation</h3><p>Please cite mauvecl ${version} (The mauvecl developers: “mauvecl: would the Mauve satellite see this stellar flare?”) and the paper whose instrument model it implements: Saba, A., et al., “MauveSim: the instrument simulator software for the Blue Skies Space Mauve satellite”, RAS Techniques and Instruments. The file <code>CITATION.cff</code> has both.</p>
 <div class="row"><button type="button" data-closes>Close</button></div>

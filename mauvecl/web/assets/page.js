@@ -102,7 +102,7 @@ class Page {
     this.follow(window.location.search)
     this.simulations.wanted = this.routing.simulated
     this.simulations.stop()
-    this.withdraw()
+    this.discardAnswer()
     this.ask()
   }
 
@@ -113,7 +113,7 @@ class Page {
     if (other) {
       this.routing.seen.simulated = ""
       this.simulations.changed()
-      this.withdraw()
+      this.discardAnswer()
       this.ask()
       this.routing.step(last)
     } else if (last) {
@@ -133,7 +133,7 @@ class Page {
   // The answer
 
   // The previous answer is invalid until there is one to these fields.
-  withdraw() {
+  discardAnswer() {
     this.answer = null
     clearTimeout(this.soon)
     clearTimeout(this.later)
@@ -145,7 +145,7 @@ class Page {
    * @param {Faults} faults
    * @param {string} [refused] */
   none(faults, refused) {
-    this.withdraw()
+    this.discardAnswer()
     document.title = "No answer: mauvecl"
     this.fields.tell(faults)
     if (refused && !this.tab.headline) this.card.notices([[refused, "danger"]])
@@ -324,7 +324,7 @@ class Page {
   lost(code) {
     const unused = code === words.unused
     this.simulations.lost()
-    this.withdraw()
+    this.discardAnswer()
     this.card.ended("")
     byId("lost-message").textContent = unused
       ? "This page was not used for a long time, and the server let it go."

@@ -43,7 +43,7 @@ def minutes(frames: Frames, time_s: Any) -> Float:
 
 
 def thinned(values: Float, most: int) -> NDArray[np.int64]:
-    """Return the places of at most `most` values, among them the smallest and largest of each part."""
+    """Return the indices of at most `most` values, including the smallest and largest of each part."""
     if values.size <= most:
         return np.arange(values.size)
     parts = np.array_split(np.arange(values.size), most // 2)
@@ -239,7 +239,7 @@ class Analyse(Tab):
         return question.uploads["frames"].name if "frames" in question.uploads else "no file of frames yet"
 
     def offers(self, name: str, answers: Answers) -> bool:
-        """Return whether the answer has a table: some are of spectra alone."""
+        """Return whether the answer has a table; some exist only for spectra."""
         return self.answer in answers and name in answers[self.answer].tables
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:

@@ -54,7 +54,7 @@ class _Kept:
         self.key = (*_key(closed), *more)
 
     def take(self) -> ClosedForms:
-        """Return the closed forms once: a key that a cache keeps must not keep them, which have tens of MB."""
+        """Return the closed forms and forget them, since caches keep this key and they take tens of MB."""
         closed, self._closed = self._closed, None
         assert closed is not None
         return closed

@@ -24,7 +24,7 @@ Columns = tuple[Any, Any, Any]
 
 
 def _columns(answers: Answers) -> list[Columns]:
-    """Return the columns of each target that is seen."""
+    """Return the columns of each visible target."""
     answer, found = answers["plan"], []
     table = answer.by_energy
     for star in answer.planned:

@@ -88,9 +88,9 @@ class Tab(ABC):
     #: Fields that it reads although its verbs do not take their keys, and those that it does not read.
     also: ClassVar[tuple[str, ...]] = ()
     never: ClassVar[tuple[str, ...]] = ()
-    #: Tables that can be taken along, with the simulation that each needs, or none.
+    #: Tables that can be downloaded, with the simulation that each needs, or none.
     files: ClassVar[Mapping[str, str | None]] = {}
-    #: Documents of answers that can be taken along, by file name, with the simulation that each needs.
+    #: Documents of answers that can be downloaded, by file name, with the simulation that each needs.
     documents: ClassVar[Mapping[str, str]] = {}
 
     def __init_subclass__(cls, **words: Any) -> None:
@@ -137,7 +137,7 @@ class Tab(ABC):
         return f"{star} of {question.band} = {question.magnitude:g}"
 
     def offers(self, name: str, answers: Answers) -> bool:
-        """Return whether one of `files` can be taken along: by default, whether the answer it needs is simulated."""
+        """Return whether one of `files` can be downloaded; by default, whether the answer it needs is simulated."""
         needed = self.files[name]
         return needed is None or needed in answers
 
