@@ -11,7 +11,7 @@ from refusals import refused
 from scipy import stats
 
 from mauvecl import Engine, Study, measure
-from mauvecl.answers.measurements.measure import MeasureAnswer
+from mauvecl.answers.measurements.measure import COLUMNS, THROUGHPUT_COLUMN, MeasureAnswer
 from mauvecl.host.stars.bands import photons
 from mauvecl.runs.pool import Pool
 from mauvecl.study.cases import Case
@@ -237,3 +237,10 @@ def test_expected_regions_close(jump: MeasureAnswer) -> None:
         width = high - low
         assert (width[[0, -1]] < 1e-4 * width.max()).all()
         assert kelvin[0] < one.perfect.estimates[0, 0] < kelvin[-1]
+
+
+def test_undefined_values_are_empty_cells() -> None:
+    """A faint flare of two temperatures has quantities without an error or a scatter."""
+    record = {column.name: np.nan for column in (*COLUMNS, THROUGHPUT_COLUMN)}
+    texts = {column.name: column.text(record) for column in (*COLUMNS[2:], THROUGHPUT_COLUMN) if column.heading}
+    assert set(texts.values()) == {""}, texts

@@ -128,16 +128,16 @@ COLUMNS = (
     Column("quantity", "", "", "what is measured", "quantity"),
     Column("unit", "", "", "of truth, estimates and errors", "unit"),
     Column("truth", "", "", "true value; undefined where the flare has none", "truth", number(".4g")),
-    Column("error_known", "", "", "standard error in advance, everything known", "error, all known", ".4g"),
-    Column("error", "", "", "standard error in advance, unknowns marginalised over", "error", ".4g"),
-    Column("perfect", "", "", "estimate from an exposure without noise", "fit without noise", ".4g"),
+    Column("error_known", "", "", "standard error in advance, everything known", "error, all known", number(".4g")),
+    Column("error", "", "", "standard error in advance, unknowns marginalised over", "error", number(".4g")),
+    Column("perfect", "", "", "estimate from an exposure without noise", "fit without noise", number(".4g")),
     Column("low_68", "", "", "lower end of the 68 % interval of that fit; infinite if there is none"),
     Column("high_68", "", "", "its upper end"),
     Column("low_95", "", "", "lower end of the 95 % interval of that fit", "95 % from", number(".4g")),
     Column("high_95", "", "", "its upper end", "to", number(".4g")),
     Column("median", "", "", "median of the estimates"),
     Column("bias", "", "", "median of the estimates less the truth", "bias", number(".4g")),
-    Column("scatter", "", "", "half of the central 68.27 % of the estimates", "scatter", ".4g"),
+    Column("scatter", "", "", "half of the central 68.27 % of the estimates", "scatter", number(".4g")),
     *_coverage_columns(LEVELS[0], "", "of all"),
     *_coverage_columns(LEVELS[1], "", "of all", "95 % covers"),
     *_coverage_columns(LEVELS[0], "_selected", "of detected flares"),
@@ -147,7 +147,7 @@ COLUMNS = (
 )
 #: Column of errors that all exposures share, after the standard errors of one exposure.
 THROUGHPUT_COLUMN = Column("error_throughput", "", "", "standard error by the calibration of the throughput, which all "
-                           "exposures share", "by throughput", ".4g")  # fmt: skip
+                           "exposures share", "by throughput", number(".4g"))  # fmt: skip
 
 
 def columns_of(flares: Sequence[MeasuredFlare]) -> tuple[Column, ...]:

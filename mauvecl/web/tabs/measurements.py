@@ -137,8 +137,8 @@ class Region(Picture):
             f"With dark level and star unknown the 95 % region reaches from {short(x[0])} to {short(x[-1])} K: hotter "
             "flares of smaller area look alike."
             if one_temperature
-            else "The flare has two temperatures, of which this is the lower one. Its regions follow from standard "
-            "errors below 100 %; simulated fits show them as they are."
+            else "The flare has two temperatures, of which this is the lower one. Regions follow from its standard "
+            "errors where these are below 100 %; simulated fits need no such limit."
         )
         return PictureData(text, sources)
 
