@@ -5,12 +5,23 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
+from collections.abc import Iterator
 from pathlib import Path
 
 from mauvecl.schema.errors import InputError
 
 #: Prefix of files that are being written.
 UNFINISHED = ".unfinished-"
+
+
+@contextlib.contextmanager
+def writing(what: str, path: Path, expected: str, *, key: str) -> Iterator[None]:
+    """Convert failures of the operating system in the block to an InputError that `what` cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        fault = f"{what} cannot be written ({error.strerror or error})"
+        raise InputError(fault, expected, key=key, value=str(path)) from error
 
 
 def write_whole(path: Path, *parts: bytes | memoryview, shared: bool = False) -> None:
@@ -36,14 +47,8 @@ def write_whole(path: Path, *parts: bytes | memoryview, shared: bool = False) ->
                     left = left[file.write(left) :]
             os.fsync(file.fileno())
         unfinished.replace(path)
-    except BaseException as error:
+    except BaseException:
         with contextlib.suppress(OSError):
             unfinished.unlink(missing_ok=True)
-        if not isinstance(error, OSError):
+        with writing(repr(str(path)), path, "a writable disk with room; what was written before is kept", key="file"):
             raise
-        raise InputError(
-            f"{str(path)!r} cannot be written ({error.strerror})",
-            "a writable disk with room; what was written before is kept",
-            key="file",
-            value=str(path),
-        ) from error

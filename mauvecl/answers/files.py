@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.checked import OWN_DIGEST, RECORD, digest_of, record_digest
-from mauvecl.host.files.atomic import write_whole
+from mauvecl.host.files.atomic import write_whole, writing
 from mauvecl.host.files.json_text import json_text
 from mauvecl.host.files.parsing import read_text
 from mauvecl.host.version import VERSION
@@ -36,18 +36,11 @@ def make_folder(path: Path) -> Path:
         raise InputError(
             f"output folder {str(path)!r} is a file", "the name of a folder", key="output", value=str(path)
         )
-    try:
+    with writing(f"output folder {str(path)!r}", path, "a writable one", key="output"):
         path.mkdir(parents=True, exist_ok=True)
         probe = path / ".mauvecl-probe"
         probe.write_text("")
         probe.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"output folder {str(path)!r} cannot be written ({error.strerror})",
-            "a writable one",
-            key="output",
-            value=str(path),
-        ) from error
     return path
 
 

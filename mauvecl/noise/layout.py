@@ -178,11 +178,6 @@ STARE_JOB = np.dtype(
     ]
 )
 
-#: Rows of the known properties of frames: coefficients, the same minus one, and the factor on all light.
-KNOWN_OF_FRAMES = (
-    *("star", "star_less_one", "sky", "sky_less_one", "dark", "dark_less_one", "neighbours", "neighbours_less_one"),
-    "light",
-)
 #: Parts of the signal that unknowns of a stare change, in the order of their numbers.
 MOVED = CHANGING
 #: Frames are padded to a multiple of this.

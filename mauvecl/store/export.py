@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.files.atomic import UNFINISHED, write_whole
+from mauvecl.host.files.atomic import UNFINISHED, write_whole, writing
 from mauvecl.host.version import VERSION
 from mauvecl.schema.errors import InputError
 from mauvecl.store.description import CALIBRATION, COMMON_DRAWS, NOMINAL, exposure_attributes
@@ -117,7 +117,7 @@ def export(selection: Selection, path: str | Path, *, replace: bool = False) -> 
         _hdf5(selection, packed)
         write_whole(path, packed.getbuffer(), shared=True)
         return path
-    try:
+    with writing(f"export {str(path)!r}", path, "a writable place with room", key="file"):
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=path.parent) as folder:
             temporary = Path(folder) / path.name
@@ -125,13 +125,6 @@ def export(selection: Selection, path: str | Path, *, replace: bool = False) -> 
             with temporary.open("rb") as file:
                 os.fsync(file.fileno())
             temporary.replace(path)
-    except OSError as error:
-        raise InputError(
-            f"export {str(path)!r} cannot be written ({error.strerror or error})",
-            "a writable place with room",
-            key="file",
-            value=str(path),
-        ) from error
     return path
 
 

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.files.atomic import UNFINISHED, write_whole
+from mauvecl.host.files.atomic import UNFINISHED, write_whole, writing
 from mauvecl.host.files.parsing import toml
 from mauvecl.host.files.size_limits import read_bytes
 from mauvecl.runs.locks import differing_keys
@@ -225,21 +225,17 @@ class Store:
         """Add a chunk's digest to its array's list."""
         self.digests[chunk.key] = digest_text
         line = f"{chunk.name} {digest_text} {_check(chunk.name, digest_text)}\n"
-        try:
-            # A single short write at the end. A line that a full disk cut short is terminated first.
-            with (self.path / chunk.scene.path / DIGESTS).open("a+b", buffering=0) as file:
-                file.seek(0, 2)
-                if file.tell():
-                    file.seek(-1, 2)
-                    line = line if file.read(1) == b"\n" else "\n" + line
-                file.write(line.encode())
-        except OSError as error:
-            raise InputError(
-                f"{chunk.scene.path}/{DIGESTS} of {self.path.name} cannot be written ({error.strerror})",
-                "a writable disk with room; what was written before is kept",
-                key="store",
-                value=str(self.path),
-            ) from error
+        what = f"{chunk.scene.path}/{DIGESTS} of {self.path.name}"
+        # A single short write at the end. A line that a full disk cut short is terminated first.
+        with (
+            writing(what, self.path, "a writable disk with room; what was written before is kept", key="store"),
+            (self.path / chunk.scene.path / DIGESTS).open("a+b", buffering=0) as file,
+        ):
+            file.seek(0, 2)
+            if file.tell():
+                file.seek(-1, 2)
+                line = line if file.read(1) == b"\n" else "\n" + line
+            file.write(line.encode())
 
     def encode(self, chunk: Chunk, rows: NDArray[Any]) -> tuple[memoryview, bytes]:
         """Encode a chunk by Zarr's codecs `bytes` and `crc32c`, padding the last chunk with zeros."""

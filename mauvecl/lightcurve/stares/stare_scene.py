@@ -102,7 +102,8 @@ class StareScene:
     stare: Stare
     scene: Scene  # of one quiescent frame, for addresses, clipping and additive processes
     numbers: NDArray[np.uint32]  # of frames, including gaps, shape (n_padded_frame,)
-    known: Floats  # rows of `layout.KNOWN_OF_FRAMES`, shape (9, n_padded_frame)
+    #: Star, sky, dark and neighbours, each followed by its value minus one; then all light. Shape (9, n_padded_frame).
+    known: Floats
     curves: Floats  # of the stare's unknowns, times their standard deviations, shape (n_unknown, n_padded_frame)
     kinds: NDArray[np.uint32]  # rows of `layout.MOVED`, shape (n_unknown,)
     stare_job: NDArray[np.void]  # of `layout.STARE_JOB`, without the values of flares, shape ()
