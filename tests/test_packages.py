@@ -15,6 +15,8 @@ import pytest
 
 from mauvecl.host.version import VERSION
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parent.parent
 #: What a checkout has, or an unpacked sdist; a working copy has much more beside it.
 FOLDERS = (".ci", ".github", "bench", "docs", "host", "kernels", "mauvecl", "paper", "recipe", "tests", "tools")
@@ -93,7 +95,6 @@ def unpacked(packages: Packages, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return folder / f"mauvecl-{VERSION}"
 
 
-@pytest.mark.long
 def test_same_files_give_the_same_packages(packages: Packages, tmp_path: Path) -> None:
     """Build in another folder, with other times and permissions of the files."""
     tree = copied(tmp_path / "elsewhere")
@@ -106,13 +107,11 @@ def test_same_files_give_the_same_packages(packages: Packages, tmp_path: Path) -
     assert again.sdist == packages.sdist
 
 
-@pytest.mark.long
 def test_sdist_holds_every_file_and_no_link(packages: Packages, unpacked: Path) -> None:
     assert files_below(unpacked) - {"PKG-INFO"} == files_below(packages.tree)
     assert not [path for path in unpacked.rglob("*") if path.is_symlink()]
 
 
-@pytest.mark.long
 def test_wheel_from_the_sdist_equals_that_from_the_checkout(packages: Packages, unpacked: Path, tmp_path: Path) -> None:
     assert built(unpacked, tmp_path).wheel == packages.wheel
 
