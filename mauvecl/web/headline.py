@@ -97,7 +97,7 @@ LIMITS = {
         "of an amplitude that takes a simulation",
     ),
     "magnitude": Wording(
-        "to a magnitude of", lambda value: f"{value:.2f}", "at no magnitude", "to a magnitude that takes a simulation"
+        "to {band} =", lambda value: f"{value:.2f}", "at no magnitude", "to a magnitude that takes a simulation",
     ),
     "exposure": Wording(
         "in", lambda value: f"{short(value)} s", "in no exposure", "in an exposure that takes a simulation"
@@ -114,7 +114,7 @@ def solved(closed: ClosedForms) -> str:
         try:
             assumed = closed.assuming(unknown)
             near = None if assumed.slow else _limit(assumed, near)
-            clauses.append(words.slow if near is None else f"{words.before} {words.value(near)}")
+            clauses.append(words.slow if near is None else f"{words.before.format(band=q.band)} {words.value(near)}")
         except InputError:
             clauses.append(words.none)
     flares = "flares" if asked.of == "amplitude" else f"flares of {q.amplitude_percent:g} %"
@@ -149,5 +149,5 @@ def other_payloads(closed: ClosedForms) -> str:
                     shown.append(percent(closed.assuming(unknown, instrument=name).chance))
                 except InputError:
                     shown.append("no number")
-            clauses.append(f"With the payload {name}: {' and '.join(shown)}.")
+            clauses.append(f"Chances with {name}: {' and '.join(shown)}.")
     return " ".join(clauses)

@@ -29,18 +29,24 @@ KINDS = {
     "json": "application/json",
     "html": "text/html; charset=utf-8",
 }
-#: Citation, as in the project's file CITATION.cff; the paper's volume and pages are not known there.
+#: Citation, as in the project's file CITATION.cff, which has neither the paper's volume and pages nor an address of
+#: the project.
 BIBTEX = """@software{{mauvecl,
   author = {{{{The mauvecl developers}}}},
   title = {{mauvecl: would the Mauve satellite see this stellar flare?}},
-  version = {{{version}}}
+  version = {{{version}}},
+  year = {{2026}}
 }}
 
 @article{{mauvesim,
   author = {{Saba, A. and Favata, F. and Savini, G. and Tinetti, G. and Bradley, L. and Stotesbury, I. and
             Tessenyi, M.}},
   title = {{MauveSim: the instrument simulator software for the Blue Skies Space Mauve satellite}},
-  journal = {{RAS Techniques and Instruments}}
+  journal = {{RAS Techniques and Instruments}},
+  year = {{2025}},
+  eprint = {{2502.01389}},
+  archivePrefix = {{arXiv}},
+  url = {{https://arxiv.org/abs/2502.01389}}
 }}
 """
 _FOLDER = Path(__file__).parent / "assets"

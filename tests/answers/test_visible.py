@@ -60,7 +60,7 @@ def test_sky_of_a_day(found: VisibleAnswer) -> None:
 
 def test_messages_name_unseen_targets_and_the_orbit(found: VisibleAnswer) -> None:
     reported = " ".join(found.messages)
-    assert "EK Dra is never seen: the limit of declination alone leaves nothing" in reported
+    assert "EK Dra is never seen: the limit of declination (-46.4 to 31.8 deg) alone leaves nothing" in reported
     assert "mean Sun-synchronous" in reported
     assert "Stray light is not modelled" in reported
     assert {"earth_limb_deg", "sun_deg", "moon_deg", "proton_flux"} <= set(found.assumptions["limit"])

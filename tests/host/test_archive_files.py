@@ -144,6 +144,14 @@ def test_messages_of_archive_files() -> None:
     assert any("below 290.033 nm it is continued by M3V" in text for text in reported["vb8_stiswfcnic_004.fits"])
 
 
+def test_messages_of_the_star_that_continues_a_spectrum() -> None:
+    """What the library says of its star's ultraviolet is said of a spectrum that it continues to the blue."""
+    noisy = [text for text in Source.from_library("M4V").messages if "noise rules" in text]
+    assert noisy
+    continued = Source.read(HERE / "vb8_stiswfcnic_004.fits", extend="M4V").messages
+    assert all(f"in M4V, {text}" in continued for text in noisy)
+
+
 def test_start_and_step_in_one_row() -> None:
     """Read IUE's 640 fluxes from 1750 A in steps of 2.662668 A, which are zero from 3350 A."""
     read = read_spectrum(HERE / "lwp11854.mxlo")

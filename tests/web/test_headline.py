@@ -86,7 +86,7 @@ def test_sentence_holds_the_limits_of_the_verb(of: str, tmp_path: Path) -> None:
         limit = LimitSearch(closed.assuming(unknown).case, "matched").root()
         wanted = {"amplitude": f"{100 * limit:.3g} %", "magnitude": f"{limit:.2f}", "exposure": f"{limit:.3g} s"}[of]
         (clause,) = re.findall(
-            rf"(?:of at least|to a magnitude of|in) ([\d.]+(?: %| s)?)(?: at V = 9 are detected)? with {words}",
+            rf"(?:of at least|to V =|in) ([\d.]+(?: %| s)?)(?: at V = 9 are detected)? with {words}",
             reported,
         )
         assert clause == wanted, reported
@@ -111,7 +111,7 @@ def test_limit_that_does_not_exist_is_told(tmp_path: Path) -> None:
 def test_other_payload_is_that_of_its_own_question(tmp_path: Path) -> None:
     other = chances(forms_of(f"{M_DWARF}&instrument=mauve-electrons", tmp_path), {})
     reported = " and ".join(percent(one.value) for one in other)
-    assert other_payloads(forms_of(M_DWARF, tmp_path)) == f"With the payload mauve-electrons: {reported}."
+    assert other_payloads(forms_of(M_DWARF, tmp_path)) == f"Chances with mauve-electrons: {reported}."
 
 
 @pytest.mark.parametrize("of", long_but(["amplitude", "magnitude"], "magnitude"))
@@ -122,7 +122,7 @@ def test_picture_of_the_limit_has_simulated_points_of_its_own_axis_only(of: str,
     magnitudes = list(drawn.sources["simulated"]["x"])
     assert bool(magnitudes) == (of == "magnitude")
     assert all(5 < magnitude < 14 for magnitude in magnitudes)
-    unit = r"of at least [\d.]+ % \[[\d.]+ % to [\d.]+ %\]" if of == "amplitude" else r"magnitude of [\d.]+ \["
+    unit = r"of at least [\d.]+ % \[[\d.]+ % to [\d.]+ %\]" if of == "amplitude" else r"to V = [\d.]+ \["
     assert re.search(f"Simulated: 90 % are detected .*{unit}", drawn.text), drawn.text
 
 

@@ -289,4 +289,6 @@ def test_bibtex_cites_what_the_citation_file_cites() -> None:
         assert f"title = {{{entry['title']}}}" in text
         assert all(one.get("family-names", one.get("name")) in text for one in entry["authors"])
     assert f"version = {{{cited['version']}}}" in text
-    assert cited["references"][0]["journal"] in text
+    paper = cited["references"][0]
+    for value in (paper["journal"], str(paper["year"]), paper["url"], str(cited["date-released"])[:4]):
+        assert f"{{{value}}}" in text

@@ -115,7 +115,7 @@ def test_which_flares_on_an_m_dwarf(visitor: Mouse) -> None:
 def test_limiting_magnitude(visitor: Mouse) -> None:
     page = visitor.page
     visitor.choose(page.get_by_label("Solve for", exact=True), "magnitude")
-    assert "with everything known" in sentence(page, "to a magnitude of 8.14")
+    assert "with everything known" in sentence(page, "to V = 8.14")
     assert visitor.clicks == 2
 
 

@@ -307,7 +307,11 @@ class VisibleAnswer(Answer):
         """Return the reason why a target is never visible."""
         k = [one.name for one in self.targets].index(name)
         alone = [limit for limit, kept in self.visibility.kept_by.items() if kept[k] == 0]
-        return f"the limit of {alone[0]} alone leaves nothing" if alone else "its limits together leave nothing"
+        if not alone:
+            return "its limits together leave nothing"
+        ends = np.atleast_1d(getattr(self.visibility.limits, f"{alone[0]}_deg", ()))
+        value = f" ({' to '.join(f'{end:g}' for end in ends)} deg)" if ends.size else ""
+        return f"the limit of {alone[0].replace('_', ' ')}{value} alone leaves nothing"
 
 
 @validated

@@ -169,7 +169,8 @@ class Curve(Picture):
                 if one.of == "magnitude":
                     sources["simulated"] = dict(zip(("x", "y"), np.array(points).T, strict=True))
                 value, low, high = map(words.value, (one.value.value, one.value.low, one.value.high))
-                text += f" Simulated: {100 * power:g} % are detected {words.before} {value} [{low} to {high}]."
+                limit = f"{words.before.format(band=q.band)} {value} [{low} to {high}]"
+                text += f" Simulated: {100 * power:g} % are detected {limit}."
         return PictureData(text, sources, {"power": {"location": power}})
 
 
