@@ -497,6 +497,66 @@ def test_units_are_chosen_where_they_are_advised_and_files_outlive_a_reload(brow
         other.close()
 
 
+#: Messages of faults that can be seen, as pairs with what they lie over, and those that do not span their form.
+COVERED = """
+() => [...document.querySelectorAll(".wrong")].filter(e => e.textContent && e.checkVisibility({opacityProperty: true}))
+  .flatMap(message => {
+    const at = message.getBoundingClientRect(), form = message.closest("form, .form")
+    const others = [...form.querySelectorAll("label, input, select, textarea, button")].filter(e => {
+      const box = e.getBoundingClientRect()
+      const apart = box.bottom <= at.top + 1 || box.top >= at.bottom - 1 || box.right <= at.left || box.left >= at.right
+      return e.checkVisibility() && !apart
+    })
+    const narrow = form.matches("form") && at.width < 0.9 * form.clientWidth ? ["narrow"] : []
+    return [...others.map(e => e.outerHTML.slice(0, 80)), ...narrow].map(what => [message.id, what])
+  })
+"""
+
+
+@pytest.mark.parametrize("width", [390, 1440])
+def test_refused_uploads_cover_no_field(browser: Browser, server: Server, width: int) -> None:
+    """The reason stays at the field of the file, across the form, and moves down what follows.
+
+    Of every field that takes a file: a file that is too large; and of each with a unit, wavelengths that look like
+    Angstrom. Of the star: a spectrum that ends within the payload's range.
+    """
+    page = fresh(browser, server.address, viewport={"width": width, "height": 900})
+    if width < 900:
+        page.get_by_text("Change the question").click()
+    page.get_by_text("Advanced", exact=True).click()
+    angstrom = "\n".join(f"{wavelength} 1e-12" for wavelength in range(3000, 7001, 10)).encode()
+
+    def refuse(name: str, content: bytes, reason: str) -> None:
+        page.locator(f"[data-upload={name}]").set_input_files(
+            {"name": "mine.txt", "mimeType": "text/plain", "buffer": content}
+        )
+        page.locator(f"#w-{name}:visible", has_text=reason).wait_for()
+        # Messages at typed fields are seen while the field has the focus.
+        page.locator(f"[data-choose={name}]").focus()
+        assert page.evaluate(COVERED) == [], name
+
+    seen = set()
+    for tab_name in TABS:
+        tab(page, TABS[tab_name].title)
+        reads = page.evaluate("page.tab.reads")
+        uploads = page.evaluate("Object.entries(page.uploads.words.uploads)")
+        for name, upload in uploads:
+            if name not in reads or name in seen:
+                continue
+            seen.add(name)
+            refuse(name, bytes(upload["most"] + 1), "expected at most")
+            if any(option.endswith("wavelength_unit") for option in upload["options"]):
+                refuse(name, angstrom, "look like Angstrom")
+            if name == "star":
+                page.get_by_role("button", name="Unit of wavelengths: Angstrom", exact=True).click()
+                page.locator("#w-extend", has_text="Continue with").wait_for()
+                assert page.evaluate(COVERED) == []
+            page.get_by_role("button", name="Start afresh").click()
+            settled(page)
+    assert len(seen) == len(uploads)
+    page.context.close()
+
+
 def test_added_spectrum_is_a_change(page: Page) -> None:
     """A companion's spectrum in Angstrom: advised units stand below its file, and it is removed with them."""
     tab(page, "Change")
@@ -749,6 +809,16 @@ def test_page_without_scripts_says_so(browser: Browser, server: Server) -> None:
 def test_slider_speaks_its_unit(page: Page) -> None:
     assert page.get_by_label("Exposure, slider").get_attribute("aria-valuetext") == "50 s"
     assert page.get_by_label("Magnitude, slider").get_attribute("aria-valuetext") == "V = 8.5"
+
+
+def test_focus_of_a_slider_leaves_its_number_free(page: Page) -> None:
+    number, slider = page.locator("#f-amplitude_percent"), page.get_by_label("Flare amplitude, slider")
+    number.focus()
+    page.keyboard.press("Tab")
+    frame = """e => { const style = getComputedStyle(e)
+        return e.getBoundingClientRect().top - parseFloat(style.outlineWidth) - parseFloat(style.outlineOffset) }"""
+    assert slider.evaluate("e => e.matches(':focus-visible')")
+    assert slider.evaluate(frame) >= number.evaluate("e => e.getBoundingClientRect().bottom")
 
 
 def test_help_is_next_to_its_question_mark(page: Page) -> None:

@@ -204,6 +204,10 @@ export class Uploads {
       name.title = name.textContent && "Kept in this tab of your browser, also over a reload."
     }
     for (const button of every("[data-remove]")) button.hidden = !this.holds(button.dataset.remove)
+    for (const field of uploads) {
+      const [box] = every(`[data-field="${field}"]`)
+      box.classList.toggle("filed", field in this.lacks || this.stands(field))
+    }
     this.fields.filed = new Set(uploads.filter(field => this.holds(field)))
     this.fields.hide()
     byId("link-lacks").hidden = !uploads.some(field => this.stands(field))
