@@ -7,7 +7,16 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
-from bokeh.models import BasicTickFormatter, BoxZoomTool, DataRange1d, HoverTool, Range1d, ResetTool, WheelZoomTool
+from bokeh.models import (
+    BasicTickFormatter,
+    BoxZoomTool,
+    DataRange1d,
+    HoverTool,
+    NoOverlap,
+    Range1d,
+    ResetTool,
+    WheelZoomTool,
+)
 from bokeh.models.annotations import Label, Span
 from bokeh.models.sources import ColumnDataSource
 from bokeh.plotting import figure
@@ -96,6 +105,8 @@ class Canvas:
             min_height=60,
             min_width=60,
             min_border=2,
+            # Half of a label at the end of the axis, which is else moved over its neighbour.
+            min_border_right=14,
             # The wheel alone scrolls the page; two fingers zoom.
             tools=[BoxZoomTool(), WheelZoomTool(modifiers={"ctrl": True}), ResetTool()],
             active_scroll="auto",
@@ -110,7 +121,7 @@ class Canvas:
                 axis_label_text_font_style="normal", axis_label_text_font="system-ui", axis_label_text_font_size="12px",
                 axis_label_text_color=ink.text, major_label_text_font="system-ui", major_label_text_font_size="11px",
                 major_label_text_color=ink.text, axis_line_color=ink.text, major_tick_line_color=ink.text,
-                minor_tick_line_color=None,
+                minor_tick_line_color=None, major_label_policy=NoOverlap(),
             )  # fmt: skip
             if isinstance(axis.formatter, BasicTickFormatter):
                 axis.formatter.power_limit_high = 7

@@ -9,6 +9,7 @@ import sys
 import time
 import zipfile
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -731,6 +732,57 @@ def test_page_is_accessible(browser: Browser, server: Server, theme: str) -> Non
         look("notice")
         enter(page, "Magnitude", "x")
         look("fault")
+    page.context.close()
+
+
+#: Record what is written on canvases: text, and its left and right end in pixels of the canvas.
+WRITTEN = """
+() => {
+  const kind = CanvasRenderingContext2D.prototype, write = kind.fillText
+  window.written = []
+  kind.fillText = function (text, x, y) {
+    const at = this.getTransform(), left = at.a * x + at.e
+    if (!at.b) window.written.push([text, left, left + at.a * this.measureText(text).width])
+    write.call(this, text, x, y)
+  }
+}
+"""
+
+
+def test_plan_on_a_phone(browser: Browser, server: Server) -> None:
+    """The flares are seen without scrolling, wide tables show that they scroll, labels of axes stay apart."""
+    page = fresh(browser, server.address, viewport={"width": 390, "height": 844})
+    assert page.get_by_role("button", name="Share, export, cite").is_visible(), "outside of what is folded"
+    tab(page, "Plan")
+    settled(page)
+    page.get_by_role("button", name="Three flare stars").click()
+    page.evaluate(WRITTEN)
+    simulate(page, "Plan")
+    table = page.get_by_role("region", name="Table of Plan")
+    until(page, lambda: "·" not in table.inner_text())
+    box, flares = table.bounding_box(), table.get_by_role("columnheader", name="flares", exact=True).bounding_box()
+    assert box is not None
+    assert flares is not None
+    assert flares["x"] + flares["width"] <= box["x"] + box["width"]
+    for wide in (table, page.get_by_role("region", name="Table of targets")):
+        assert wide.evaluate("e => e.scrollWidth > e.clientWidth && e.tabIndex === 0")
+        assert "gradient" in wide.evaluate("e => getComputedStyle(e).backgroundImage"), "a shadow at the edge"
+    settled_ranges(page, "recovered")
+    settled_ranges(page, "expected")
+    # Decades are a base and its exponent.
+    written = page.evaluate("written")
+    energies = [
+        (exponent, left, right)
+        for (base, left, _), (exponent, _, right) in pairwise(written)
+        if base == "10" and exponent in map(str, range(28, 38))
+    ]
+    starts = [k for k, (exponent, *_) in enumerate(energies) if exponent == "28"]
+    assert len(energies) > len(starts) > 0
+    for (first, _, right), (second, left, _) in pairwise(energies):
+        assert left > right or second == "28", (first, second)
+    page.get_by_label("First day", exact=True).fill("2026-11-01")
+    settled(page)
+    assert page.get_by_role("status").inner_text() == "", "nothing is done of another plan"
     page.context.close()
 
 

@@ -57,7 +57,7 @@ ${upload("own_unknown", "Use a file of nm and DN", "File of the unknown spectrum
 ${upload(name, "Use a file", field.label, "text, ECSV, VOTable or FITS; or drop it here")}
 % elif field.kind == "targets":
 <textarea id="f-targets" name="targets" hidden></textarea>
-<div class="wide"><table id="targets"><caption class="quiet">Targets</caption><thead><tr></tr></thead><tbody></tbody></table></div>
+<div class="wide" tabindex="0" role="region" aria-label="Table of targets"><table id="targets"><caption class="quiet">Targets</caption><thead><tr></tr></thead><tbody></tbody></table></div>
 <div class="row"><button type="button" class="plain" id="targets-example">Three flare stars, as an example</button>
 <button type="button" class="plain" id="targets-open">Open a CSV table</button><input type="file" id="targets-file" accept=".csv,.ecsv,.txt" aria-label="CSV table of targets" tabindex="-1" hidden>
 <button type="button" class="plain" id="targets-clear" hidden>Remove all</button>
@@ -171,13 +171,13 @@ ${control(name)}
 </fieldset>
 % endfor
 </details>
+</form>
+</details>
 <div class="row">
 <button type="button" id="pin">Pin</button>
 <button type="button" data-opens="export">Share, export, cite</button>
 <button type="button" class="plain" id="afresh">Start afresh</button>
 </div>
-</form>
-</details>
 </section>
 <section id="answer" aria-labelledby="answer-head" tabindex="-1">
 <h2 id="answer-head" class="quiet">Answer</h2>

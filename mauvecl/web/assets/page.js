@@ -100,6 +100,7 @@ class Page {
   // The browser's history has led to another question or tab.
   moved() {
     this.follow(window.location.search)
+    this.simulations.changed()
     this.simulations.wanted = this.routing.simulated
     this.simulations.stop()
     this.discardAnswer()

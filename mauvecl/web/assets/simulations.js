@@ -78,10 +78,12 @@ export class Simulations {
     if (this.running !== null) this.live.ask("cancel", {})
   }
 
-  // Another question: want no other, and stop what does not belong to it.
+  // Another question: want no other, stop what does not belong to it, and say no more that it is done.
   changed() {
     this.wanted = []
-    if (this.question !== this.page.question(this.kind)) this.stop()
+    if (this.question === this.page.question(this.kind)) return
+    if (this.running === null) this.card.ended("")
+    else this.stop()
   }
 
   // Stop, and want no other.
