@@ -191,7 +191,7 @@ def export(
         ),
     ] = None,
     rows: RowsFlag = None,
-    replace: Annotated[bool, typer.Option("--replace", help="Replace an existing file of that name.")] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace what already has that name.")] = False,
     quiet: QuietFlag = False,
 ) -> None:
     """Write a part of a store as one FITS or HDF5 file.

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mauvecl.host.stars.own_stars import OwnStar
 
 app = typer.Typer(invoke_without_command=True, rich_markup_mode=None, add_completion=False)
-ReplaceFlag = Annotated[bool, typer.Option("--replace", help="Replace an existing star of that name.")]
+ReplaceFlag = Annotated[bool, typer.Option("--replace", help="Replace what already has that name.")]
 
 
 @app.callback()
