@@ -518,8 +518,8 @@ COVERED = """
 def test_refused_uploads_cover_no_field(browser: Browser, server: Server, width: int) -> None:
     """The reason stays at the field of the file, across the form, and moves down what follows.
 
-    Of every field that takes a file: a file that is too large; and of each with a unit, wavelengths that look like
-    Angstrom. Of the star: a spectrum that ends within the payload's range.
+    Of every field that takes a file: a file that is larger than accepted, which is made small here; and of each with a
+    unit, wavelengths that look like Angstrom. Of the star: a spectrum that ends within the payload's range.
     """
     page = fresh(browser, server.address, viewport={"width": width, "height": 900})
     if width < 900:
@@ -545,7 +545,10 @@ def test_refused_uploads_cover_no_field(browser: Browser, server: Server, width:
             if name not in reads or name in seen:
                 continue
             seen.add(name)
-            refuse(name, bytes(upload["most"] + 1), "expected at most")
+            most = "page.uploads.words.uploads[name].most"
+            page.evaluate(f"name => {most} = 10", name)
+            refuse(name, bytes(11), "expected at most")
+            page.evaluate(f"([name, bytes]) => {most} = bytes", [name, upload["most"]])
             if any(option.endswith("wavelength_unit") for option in upload["options"]):
                 refuse(name, angstrom, "look like Angstrom")
             if name == "star":
