@@ -259,7 +259,14 @@ def means(wavelength: Float, flux: Float, edges: Float) -> Float:
 
 
 def extended(
-    name: str, wavelength: Float, flux: Float, extension: str, beyond: Float, shape: Float
+    name: str,
+    wavelength: Float,
+    flux: Float,
+    extension: str,
+    beyond: Float,
+    shape: Float,
+    *,
+    ultraviolet: tuple[str, ...] = (),
 ) -> tuple[Float, Float, tuple[str, ...]]:
     """Continue a spectrum by a longer one, scaled at the join, and return messages.
 
@@ -270,6 +277,8 @@ def extended(
         Name of the other spectrum.
     beyond, shape : ndarray, shape (m,)
         Wavelengths, nm, and fluxes of the other spectrum.
+    ultraviolet : tuple of str
+        Messages on the other spectrum's ultraviolet, returned if it continues the spectrum to the blue.
 
     Raises InputError if less than a third of 200-700 nm is measured, or a spectrum has no light at a join.
     """
@@ -291,6 +300,8 @@ def extended(
             f"{'below' if blue else 'above'} {end:g} nm it is continued by {extension}, scaled by {own / other:.4g} to "
             f"agree at {join[0]:g}-{join[1]:g} nm"
         )
+        if blue:
+            messages += [f"in {extension}, {message}" for message in ultraviolet]
         wavelength, flux = (
             (np.append(beyond[more], wavelength), np.append(added, flux))
             if blue

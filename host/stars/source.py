@@ -216,12 +216,11 @@ class Source(Drawable, ContentEquality):
         messages += remarks(wavelength, flux)
         if extend is not None:
             other = cls.from_library(extend) if isinstance(extend, str) else extend
-            first = wavelength[0]
-            wavelength, flux, added = extended(name, wavelength, flux, other.name, other.wavelength_nm, other.flux_flam)
+            wavelength, flux, added = extended(
+                name, wavelength, flux, other.name, other.wavelength_nm, other.flux_flam,
+                ultraviolet=other.messages if isinstance(extend, str) else (),
+            )  # fmt: skip
             messages += added
-            if isinstance(extend, str) and wavelength[0] < first:
-                # What the library says of its star's ultraviolet holds for the continuation, too.
-                messages += tuple(f"in {other.name}, {message}" for message in other.messages)
         check_flux(name, wavelength, flux)
         measured = (float(wavelength[0]), float(wavelength[-1]))
         wavelength, flux, added = continued(name, wavelength, flux, dark_only=True)

@@ -147,7 +147,7 @@ def test_missing_values_are_reported(answer: PlanAnswer) -> None:
     reported = " ".join(answer.messages)
     assert "Flare rates of Denebola, of the type 'A3V', are unknown except for an exponent of 1.3" in reported
     assert "EK Dra is never seen" in reported
-    assert "the hours of several may be the same time" in reported
+    assert "the hours of different targets may coincide" in reported
     table = answer.table
     assert np.isnan(table["expected"][2])
     assert np.isfinite(table["E50"][2].value)

@@ -152,6 +152,13 @@ def test_messages_of_the_star_that_continues_a_spectrum() -> None:
     assert all(f"in M4V, {text}" in continued for text in noisy)
 
 
+def test_messages_of_the_continuing_star_are_given_if_dark_ends_are_cut() -> None:
+    """The spectrum starts before that of the library, with zeros that stand for missing data."""
+    wavelength = np.arange(90.0, 1100.0)
+    spectrum = wavelength, np.where(wavelength < 300.0, 0.0, 1e-12)
+    assert any("in M4V, noise rules" in text for text in Source.from_arrays(*spectrum, extend="M4V").messages)
+
+
 def test_start_and_step_in_one_row() -> None:
     """Read IUE's 640 fluxes from 1750 A in steps of 2.662668 A, which are zero from 3350 A."""
     read = read_spectrum(HERE / "lwp11854.mxlo")

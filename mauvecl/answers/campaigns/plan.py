@@ -264,7 +264,7 @@ class PlanAnswer(Answer):
         """Messages on saturation, targets without an answer, extrapolations and visibility."""
         lines = of_kind(collect_messages(self.inputs), SATURATED)
         if len(self.planned) > 1:
-            lines.append("Each target is planned by itself: the hours of several may be the same time.")
+            lines.append("Each target is planned by itself: the hours of different targets may coincide.")
         for case in self.observed:
             if case.neighbours is not None:
                 lines += case.neighbours.messages(case.label, case.instrument)
