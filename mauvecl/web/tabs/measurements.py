@@ -108,9 +108,6 @@ class Region(Picture):
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         canvas = Canvas(ink, "temperature (K)", "amplitude of the blackbody (%)", logs)
-        axis: Any = canvas.plot.xaxis[0]
-        # Labels of five digits stay apart on a narrow screen.
-        axis.ticker.desired_num_ticks = 4
         canvas.band("free", "dark and star free", "sky", alpha=0.3)
         canvas.band("known", "everything known", "flare", alpha=0.5)
         canvas.dots("fits", "simulated fits", "drawn", size=3)
