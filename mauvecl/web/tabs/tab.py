@@ -81,7 +81,7 @@ class Tab(ABC):
     simulations: ClassVar[Mapping[str, str]] = {}  # what can be simulated here, with the label of the button
     answer: ClassVar[str] = ""  # name of the simulated answer whose table is below the pictures
     view: ClassVar[int] = 0  # number of that table among the answer's `views`
-    #: Questions of "Take along": names of simulations or verbs; by default its own simulations.
+    #: Questions of "Share, export, cite": names of simulations or verbs; by default its own simulations.
     questions: ClassVar[tuple[str, ...]] = ()
     #: Whether the chance of detection stands above it, whose fields it then shows.
     headline: ClassVar[bool] = True
