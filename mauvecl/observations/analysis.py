@@ -11,19 +11,20 @@ from numpy.typing import NDArray
 
 from mauvecl.lightcurve.defaults import RANK, Per, per_day
 from mauvecl.lightcurve.flares.shapes import shape_of
-from mauvecl.lightcurve.search.importance_sampling import SampledRate
 from mauvecl.observations.colour import Colour, event_colour
 from mauvecl.observations.completeness import Completeness, inject
+from mauvecl.observations.detection import detect_events
 from mauvecl.observations.event_spectrum import EventSpectrum, event_spectrum, measure_flare
-from mauvecl.observations.events import ObservedEvent, detect_events, measure_events
+from mauvecl.observations.events import ObservedEvent, measure_events
+from mauvecl.observations.false_alarms import SimulatedRate, innovations, simulated_rates
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames
-from mauvecl.observations.level import QuiescentLevel, quiescent_level
-from mauvecl.observations.noise import Scatter, binned_scatter
-from mauvecl.observations.search import NO_COLOUR_K, MeasuredRate, SeriesSurvey
+from mauvecl.observations.level import QuiescentLevel
+from mauvecl.observations.light_curve import survey_light_curve
+from mauvecl.observations.noise import Likeness, Scatter, binned_scatter, likeness
+from mauvecl.observations.search import NO_COLOUR_K, SeriesSurvey
 from mauvecl.observations.spectra import CleanedSpectra, SpectralSeries, clean_spectra, survey_spectra
 from mauvecl.results.measurements.fit import Measurement
-from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
 
 Float = NDArray[np.float64]
@@ -53,19 +54,25 @@ class Analysis:
     level: QuiescentLevel
     survey: SeriesSurvey
     wanted: float  # wanted false alarms per star-day
-    normal: SampledRate  # false-alarm rate in normal noise of the measured variance
-    measured: MeasuredRate  # false-alarm rate in noise resampled from quiescent frames
+    modelled: SimulatedRate  # false-alarm rate in light curves of the fitted process
+    measured: SimulatedRate  # the same with residuals resampled from quiescent frames
     threshold: float  # threshold for the wanted rate: the higher of the thresholds of both
     candidates: float  # threshold for candidates
     events: list[ObservedEvent]  # events above the threshold of candidates, in order of time
     completeness: Completeness  # share of flares that the search detects in these frames
     scatter: list[Scatter]
+    likeness: Likeness  # of the residuals and the noise of the process
     spectra: SpectralAnalysis | None = None  # of spectra that are searched with weights for flares
 
     @cached_property
     def days(self) -> float:
         """Star-days of the searched frames."""
         return self.survey.stare.observed_s / DAY_S
+
+    @property
+    def unit(self) -> float:
+        """Level of the star in standard deviations of a frame, to which changes are relative."""
+        return self.survey.level / self.survey.scale
 
     @cached_property
     def light_misleads(self) -> bool:
@@ -74,13 +81,8 @@ class Analysis:
         return series is not None and bool(series.changes) and bool(np.isfinite(series.jitters["light"]))
 
     def false_alarms(self, event: ObservedEvent) -> tuple[float, float]:
-        """Return the false alarms per star-day at an event's statistic: in normal noise, and in noise as measured."""
-        try:
-            normal = self.normal.rate(event.value).value
-        except InputError:
-            # Beyond the largest sampled threshold the rate is smaller than there.
-            normal = self.normal.rate(float(self.normal.thresholds[-1])).value
-        return normal, self.measured.rate(event.value)
+        """Return the false alarms per star-day at an event's statistic: by the process, and with measured residuals."""
+        return self.modelled.rate(event.value), self.measured.rate(event.value)
 
     def colour(self, event: ObservedEvent) -> Colour | None:
         """Return the colour of an event in spectra with errors, against quiescent frames; None without these."""
@@ -112,17 +114,17 @@ class Analysis:
                 "The throughput changes, as by pointing losses; short changes may resemble flares: "
                 'search.frame.light = "free", the default, searches without the light that all pixels share.'
             )
-        red = next((one for one in self.scatter if one.red), None)
-        if red is not None:
-            of = "single frames" if red.frames == 1 else f"means of {red.frames} frames"
+        if self.level.process.terms:
+            lines.append(f"The quiescent light is not constant: {self.level.process.describe(self.unit)}.")
+        if not self.likeness.alike:
             lines.append(
-                f"Quiescent frames are correlated: {of} scatter {red.measured / red.white:.2f} "
-                "times as much as independent frames."
+                f"Residuals of the quiescent light are correlated ({self.likeness.correlation:.2f} at a lag of "
+                f"{self.likeness.lag} frames), which the fitted process does not describe: there are no verdicts."
             )
         if self.wanted < self.measured.smallest:
             lines.append(
-                f"The noise as measured shows rates down to {self.measured.smallest:.2g} false alarms per star-day; "
-                "its threshold for fewer is extrapolated with the tail of normal noise."
+                f"Simulated light curves show rates down to {self.measured.smallest:.2g} false alarms per star-day; the "
+                "threshold for fewer is extrapolated with the tail of their noise."
             )
         return lines
 
@@ -163,26 +165,19 @@ def analyse_frames(
     wanted = per_day(false_alarms, per)
     cleaned = None if model is None else clean_spectra(frames, model)
     frames = frames if cleaned is None else cleaned.frames
-    flux, error = frames.white_light
-    saturated = np.zeros(frames.n_frames, np.bool_) if cleaned is None else cleaned.saturated
-    level = quiescent_level(frames, flux, error, saturated=saturated)
     series = None
     if cleaned is None:
-        survey = SeriesSurvey.of(frames, flux, error, level, shape_of(shape))
+        survey, level, frames = survey_light_curve(frames, shape_of(shape), seed)
     else:
-        survey, series, level = survey_spectra(cleaned, flux, level, shape_of(shape), rank, jitters)
+        survey, series, level = survey_spectra(cleaned, shape_of(shape), rank, seed, jitters)
+    flux, error = frames.white_light
     frequent = max(wanted, CANDIDATES)
-    normal = survey.normal_rate(frequent, seed)
-    first = _threshold(normal, frequent)
-    # Real flares are no noise: what exceeds the threshold of normal noise is left out of the resampled light curves.
-    _, taken = detect_events(survey, first)
-    measured = survey.measured_rate(level.quiet[level.used] & ~taken, wanted, seed)
-    threshold = max(_threshold(normal, wanted), measured.threshold(wanted))
-    candidates = min(max(first, measured.threshold(frequent)), threshold)
+    modelled, measured = simulated_rates(survey, level.quiet[level.used], wanted, seed)
+    threshold, candidates = (max(one.threshold(rate) for one in (modelled, measured)) for rate in (wanted, frequent))
     detected, taken = detect_events(survey, candidates)
     seen = None if series is None else [event_spectrum(survey, series, taken, one) for one in detected]
     causes = None if seen is None else [one.cause for one in seen]
-    events = measure_events(survey, taken, candidates, detected, causes)
+    events = measure_events(survey, taken, detected, causes)
     spectra = None
     if cleaned is not None and series is not None and seen is not None:
         measured_flares = [
@@ -190,12 +185,14 @@ def analyse_frames(
             for event, one in zip(events, detected, strict=True)
         ]
         spectra = SpectralAnalysis(cleaned, series, seen, measured_flares)
-    quiet = level.quiet[level.used] & ~taken
-    residual = survey.along(len(survey.bank.directions) // 2) / np.sqrt(survey.variance)
+    quiet = ~taken
+    residual = innovations(survey, quiet)
+    middle = survey.bank.directions[len(survey.bank.directions) // 2]
+    numbers = survey.stare.numbers[quiet]
     return Analysis(
-        frames, flux, error, level, survey, wanted, normal, measured, threshold, candidates, events,
+        frames, flux, error, level, survey, wanted, modelled, measured, threshold, candidates, events,
         inject(survey, ~taken, threshold, seed, temperature_k),
-        binned_scatter(survey.stare.numbers[quiet], residual[quiet]), spectra,
+        binned_scatter(numbers, residual @ middle), likeness(numbers, residual), spectra,
     )  # fmt: skip
 
 
@@ -235,12 +232,3 @@ def _spectral_messages(spectra: SpectralAnalysis) -> list[str]:
         else:
             lines.append(f"The search leaves out all changes of the {name} of single frames.")
     return lines
-
-
-def _threshold(normal: SampledRate, rate: float) -> float:
-    """Return the threshold for a rate in normal noise, and the lowest that is sampled if the rate is reached there.
-
-    Few frames a day give few false alarms at any sensible threshold.
-    """
-    lowest = normal.lowest
-    return lowest if rate >= normal.rate(lowest).value else normal.threshold(rate).value

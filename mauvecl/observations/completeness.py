@@ -14,8 +14,8 @@ Float = NDArray[np.float64]
 
 #: Default numbers of half-widths, sizes and peak times.
 WIDTHS, SIZES, TIMES = 4, 12, 40
-#: Injections that are searched together.
-BATCH = 10
+#: Injections that are searched together, and the largest number of consecutive frames into which they are made.
+BATCH, MAX_FRAMES = 10, 2**15
 #: Range of sizes, in equivalent durations whose S/N without a baseline equals these multiples of the threshold.
 RANGE = (0.5, 4.0)
 #: Probability of detection that limits refer to.
@@ -77,20 +77,26 @@ def inject(
     temperature_k : float
         Temperature of the flares; light curves have no colour.
     """
-    part = survey.frames(free)
+    every = np.flatnonzero(free)
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, INJECTION_KEY]))
-    bank, frame_s = part.bank, part.stare.frame_s
+    bank, frame_s = survey.bank, survey.stare.frame_s
     widths = np.geomspace(bank.half_widths_s[0], bank.half_widths_s[-1], WIDTHS)
-    kelvin = np.array(part.templates.temperatures_k)
-    direction = part.templates.directions[int(np.argmin(np.abs(np.log(kelvin / temperature_k))))]
+    kelvin = np.array(survey.templates.temperatures_k)
+    direction = survey.templates.directions[int(np.argmin(np.abs(np.log(kelvin / temperature_k))))]
     # Photon noise of a flare of unit amplitude.
-    own_noise = np.linalg.cholesky(part.templates.noise_of(temperature_k) + 1e-300 * np.eye(direction.size))
-    noise = float(np.median(np.sqrt(part.variance))) / float(np.linalg.norm(direction))
-    edges = np.column_stack([part.stare.start_s, part.stare.start_s + frame_s])
+    own_noise = np.linalg.cholesky(survey.templates.noise_of(temperature_k) + 1e-300 * np.eye(direction.size))
+    size_of = float(np.linalg.norm(direction))
     durations = np.zeros((WIDTHS, SIZES))
     detected = np.zeros((WIDTHS, SIZES), np.int64)
     for w, width in enumerate(widths):
-        power = float(np.sqrt(np.max(bank.template(float(width)).power))) / noise
+        if w == 0 or every.size > MAX_FRAMES:
+            # Part of a long light curve, another one for each half-width.
+            start = int(rng.integers(max(every.size - MAX_FRAMES, 0) + 1))
+            kept = np.zeros(free.size, np.bool_)
+            kept[every[start : start + MAX_FRAMES]] = True
+            part = survey.frames(kept)
+        edges = np.column_stack([part.stare.start_s, part.stare.start_s + frame_s])
+        power = size_of * _power(part, float(width))
         amplitudes = threshold / power * np.geomspace(*RANGE, SIZES)
         durations[w] = amplitudes * width * bank.shape.equivalent_duration
         for first in range(0, TIMES, BATCH):
@@ -105,14 +111,23 @@ def inject(
             ])  # fmt: skip
             best = np.full((SIZES, count), -np.inf)
             # The statistics are linear in the sums, so that one search serves all sizes.
-            for row, rho in part.search.values(added.astype(np.float32)):
-                at = (part.stare.numbers[0] + row.peaks + row.template.phases[row.phase]) * frame_s
+            for row, rho in part.search.values(added):
+                at = part.search.peak_s(row, np.arange(row.peaks.size))
+                tried = (row.per_amplitude > 0).any(axis=0)
                 for k, peak in enumerate(peaks):
                     near = np.abs(at - peak) <= 2 * (width + frame_s) + row.template.half_width_s
-                    near &= row.per_amplitude > 0
+                    near &= tried
                     if near.any():
                         quiet, flare, own = (rho[n][:, near] for n in (0, 1 + k, 1 + count + k))
                         size = amplitudes[:, None, None]
                         best[:, k] = np.maximum(best[:, k], (quiet + size * flare + np.sqrt(size) * own).max((1, 2)))
             detected[w] += (best >= threshold).sum(axis=1)
     return Completeness(widths, durations, detected, TIMES)
+
+
+def _power(part: SeriesSurvey, width: float) -> float:
+    """Return the typical S/N of a flare of a half-width whose peak is one standard deviation of a frame."""
+    row = min(part.search.rows, key=lambda one: abs(np.log(one.template.half_width_s / width)))
+    tried = row.per_amplitude[row.per_amplitude > 0]
+    typical = float(np.median(tried)) if tried.size else 1.0
+    return typical * float(np.sqrt(width / row.template.half_width_s))

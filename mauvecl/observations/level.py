@@ -1,136 +1,199 @@
-"""Quiescent level and noise of a light curve, estimated robustly."""
+"""Quiescent light of observed frames: level, noise, and frames that cannot be part of a flare."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from mauvecl.observations.frames import Frames, Reason
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.physical import DAY_S
+
+if TYPE_CHECKING:
+    from mauvecl.observations.process import Process
 
 Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
 
 #: Standard deviation of a normal distribution in units of its median absolute deviation.
 PER_MAD = 1.0 / float(scipy.special.ndtri(0.75))
-#: Distance from the level, in standard deviations, beyond which a frame is no part of the quiescent star.
-CLIP = 3.0
 #: Smallest distance of a frame without light of the star, below, and of a single bright frame, above.
 FAR = 5.0
 #: Largest distance of the neighbours of a single bright frame.
 NEAR = 3.0
-#: Iterations of clipping; it converges in a few.
-ROUNDS = 20
-#: Default length of the running median: flares are shorter, and rotation of active stars is slower (assumed).
-MEDIAN_S = 0.3 * DAY_S
+#: Rise within a few frames, in robust standard deviations of such rises, from which a first guess of the flares begins,
+#: and the numbers of frames.
+JUMP, JUMP_FRAMES = 8.0, (1, 2, 3)
+#: A guessed flare ends at this share of its rise, or within this number of standard deviations of the level before it.
+DECAYED, WITHIN = 0.02, 3.0
+#: Largest share of the frames in guessed flares.
+MOST_GUESSED = 0.8
+#: Largest mean of counts in a frame whose noise is treated as Poisson noise rather than as normal noise.
+MAX_COUNTS = 100.0
+#: Factor by which the noise of frames without weight exceeds the standard deviation of the process.
+NO_WEIGHT = 1e4
+#: Largest share of frames far below the level that are left out; more of them are part of the light of the star.
+MOST_BELOW = 0.03
+#: Smallest variance of the noise of a frame relative to the typical one.
+LEAST_VARIANCE = 0.1
+#: Simulated light curves from which the standard error of the level is estimated, to 1 / sqrt(2 times as many).
+LEVEL_DRAWS = 32
+#: Second half of the generator's key, which makes the draws independent of others.
+LEVEL_KEY = 0x6C65766C
 
 
 @dataclass(frozen=True, eq=False)
 class QuiescentLevel:
     """Quiescent level and noise of a light curve."""
 
-    level: Float  # shape (n_frame,); median flux of the quiescent star around each frame
-    # Shape (n_frame,); standard deviation of a frame at that level: the stated error of quiescent frames times
-    # `excess`, or the scatter of quiescent frames if no errors are stated.
+    level: Float  # shape (n_frame,); mean of the process given the quiescent frames
+    level_error: Float  # shape (n_frame,); its standard error
+    # Shape (n_frame,); standard deviation of a frame at that level: the stated error times `excess`, or the scatter of
+    # quiescent frames if no errors are stated.
     error: Float
     excess: float  # measured scatter over the stated errors of quiescent frames; NaN if no errors are stated
-    # Shape (n_frame,); frames that are used and within `CLIP` standard deviations of the level.
-    quiet: NDArray[np.bool_]
+    quiet: Bool  # shape (n_frame,); frames that are searched and belong to no event
     reasons: NDArray[np.int64]  # shape (n_frame,); why frames are not searched; see `frames.Reason`
+    process: Process  # in standard deviations of the noise of a typical frame
 
     @property
-    def used(self) -> NDArray[np.bool_]:
+    def used(self) -> Bool:
         """Frames that are searched."""
         return np.asarray(self.reasons == 0)
 
-    def without(self, single: NDArray[np.bool_]) -> QuiescentLevel:
+    def without(self, single: Bool) -> QuiescentLevel:
         """Return the level without some single bright frames."""
         return replace(
             self, quiet=self.quiet & ~single, reasons=np.where(single, self.reasons | Reason.SPIKE, self.reasons)
         )
 
 
-def quiescent_level(
-    frames: Frames,
-    flux: Float,
-    error: Float | None,
-    median_s: float = MEDIAN_S,
-    *,
-    saturated: NDArray[np.bool_] | None = None,
-) -> QuiescentLevel:
-    """Estimate level and noise of a light curve, and flag frames that cannot be part of a flare.
+def counts_per_unit(frames: Frames) -> float | None:
+    """Return the number of counts in a unit of the flux if frames hold few counts, or None.
+
+    Fluxes that are whole numbers, or become so by multiplication with the exposure time, are counts.
+    """
+    flux = frames.flux
+    finite = np.isfinite(flux)
+    if flux.ndim > 1 or not finite.any() or (flux[finite] < 0).any():
+        return None
+    exposure = float(np.median(frames.exposure_s))
+    for factor in (1.0, exposure):
+        counts = flux[finite] * factor
+        whole = np.abs(counts - np.rint(counts)) < 1e-6 * np.maximum(counts, 1.0)
+        if whole.all() and np.ptp(counts) > 0 and float(np.median(counts)) < MAX_COUNTS:
+            return factor
+    return None
+
+
+def guess_flares(numbers: NDArray[np.int64], flux: Float) -> Bool:
+    """Return a first guess of the frames in flares, which rise faster than the star otherwise does, shape (n_frame,).
 
     Parameters
     ----------
-    flux, error : ndarray, shape (n_frame,)
-        The light curve; for spectra, light in a band.
-    median_s : float
-        Length of the running median.
-    saturated : ndarray of bool, shape (n_frame,), optional
-        Frames with saturated pixels.
+    numbers : ndarray, shape (n_frame,)
+        Numbers of the frames on their regular grid.
+    flux : ndarray, shape (n_frame,)
     """
-    reasons = frames.faults | (0 if saturated is None else np.where(saturated, Reason.SATURATED, 0))
-    usable = reasons == 0
-    if usable.sum() < 10:
-        raise InputError(
-            f"{frames.name} has {usable.sum()} frames without a fault",
-            "at least 10",
-            key="frames",
-            value=int(usable.sum()),
-        )
-    width = max(3, round(median_s / frames.cadence_s))
-    quiet = usable.copy()
-    excess = float("nan")
-    for _ in range(ROUNDS):
-        level = running_median(frames, flux, quiet, width)
-        stated = np.ones_like(flux) if error is None else running_median(frames, error, quiet, width)
-        spread = _scatter(frames.numbers[quiet], ((flux - level) / stated)[quiet])
-        if not spread > 0:
-            raise InputError(
-                f"{frames.name}: the flux of most frames is the same",
-                "a light curve with noise",
-                key="flux",
-                value=float(np.median(flux[quiet])),
-            )
-        now = usable & (np.abs(flux - level) < CLIP * spread * stated)
-        if (now == quiet).all():
-            break
-        quiet = now
-    noise = stated * spread
-    excess = spread if error is not None else float("nan")
-    finite = np.isfinite(flux)
-    sigmas = np.where(usable, (flux - level) / noise, 0.0)
-    reasons |= np.where(finite & (np.where(finite, flux, 0.0) - level < -FAR * noise), Reason.BELOW, 0)
-    fine = reasons == 0
-    reasons |= np.where(single_frames(frames, sigmas, fine), Reason.SPIKE, 0)
-    return QuiescentLevel(level, noise, excess, quiet & (reasons == 0), reasons)
+    inside = np.zeros(flux.size, np.bool_)
+    rises: list[tuple[float, int, int]] = []
+    steps = np.diff(flux)[np.diff(numbers) == 1]
+    noise = PER_MAD * float(np.median(np.abs(steps))) / np.sqrt(2.0) if steps.size else 0.0
+    for lag in JUMP_FRAMES:
+        if flux.size <= lag:
+            continue
+        rise = np.where(numbers[lag:] - numbers[:-lag] <= 2 * lag, flux[lag:] - flux[:-lag], 0.0)
+        limit = JUMP * PER_MAD * float(np.median(np.abs(rise)))
+        rises += [(float(rise[k]), int(k), lag) for k in np.flatnonzero(rise > max(limit, 1e-300))]
+    for rise_of, start, _ in sorted(rises, reverse=True):
+        if inside[start]:
+            continue
+        before = float(flux[start])
+        faint = flux[start + 1 :] < before + max(WITHIN * noise, DECAYED * rise_of)
+        # Two faint frames in a row end the flare.
+        both = faint[:-1] & faint[1:]
+        # The first frames belong to the rise.
+        ends = np.flatnonzero(both[3:]) + 3
+        last = start + 1 + (int(ends[0]) if ends.size else faint.size)
+        new = inside.copy()
+        new[start + 1 : last + 1] = True
+        if new.mean() <= MOST_GUESSED:
+            inside = new
+    return inside
 
 
-def running_median(frames: Frames, values: Float, chosen: NDArray[np.bool_], width: int) -> Float:
-    """Return the running median of chosen frames, interpolated to all frames."""
-    at = np.flatnonzero(chosen)
-    if at.size <= width:
-        return np.full(values.size, float(np.median(values[at])))
-    smooth = scipy.ndimage.median_filter(values[at], size=width, mode="reflect")
-    return np.asarray(np.interp(frames.time_s, frames.time_s[at], smooth))
+def quiet_variance(flux: Float, error: Float | None, level: Float, quiet: Bool) -> tuple[Float, float]:
+    """Return the variance of the noise of each frame at its level as stated, and its rise with the flux.
+
+    Stated errors often follow the counts of their own frame; what they owe to the difference from the level is taken
+    away. Without stated errors the variance is 1.
+    """
+    if error is None:
+        return np.ones(flux.size), 0.0
+    squared = error**2
+    apart = (flux - level)[quiet]
+    spread = float(apart @ apart)
+    slope = 0.0
+    if spread > 0:
+        slope = max(float(apart @ (squared[quiet] - squared[quiet].mean())) / spread, 0.0)
+    typical = float(np.median(squared[quiet]))
+    return np.maximum(squared - slope * (flux - level), LEAST_VARIANCE * typical), slope
 
 
-def _scatter(numbers: NDArray[np.int64], values: Float) -> float:
-    """Return the standard deviation of frames, from differences of neighbours: slow variability has no part in it."""
-    steps = np.diff(values)[np.diff(numbers) == 1]
-    return PER_MAD * float(np.median(np.abs(steps))) / np.sqrt(2.0) if steps.size else float("nan")
+def process_level(process: Process, time_s: Float, values: Float, variance: Float, quiet: Bool) -> Float:
+    """Return the mean of a process at all times given the quiescent values, shape (n,) or (n, k) as `values`.
+
+    Parameters
+    ----------
+    variance : ndarray, shape (n,)
+        Variance of the noise of each value, without the excess of the process.
+    quiet : ndarray of bool, shape (n,)
+    """
+    columns = values.reshape(len(values), -1)
+    noise = variance * process.excess**2
+    one = process.covariance(time_s[quiet], noise[quiet])
+    level = one.solve(np.ones(int(quiet.sum())))
+    mean = level @ columns[quiet] / level.sum()
+    if not process.terms:
+        return np.asarray(np.broadcast_to(mean, columns.shape)).reshape(values.shape)
+    # Values without weight have a large variance; the mean of the process at a value is the value less its noise.
+    held = np.where(quiet[:, None], columns - mean, 0.0)
+    noise = np.where(quiet, noise, NO_WEIGHT**2 * (process.sd**2 + np.median(noise)))
+    solved = process.covariance(time_s, noise).solve(held)
+    return np.asarray(held - noise[:, None] * solved + mean).reshape(values.shape)
 
 
-def single_frames(frames: Frames, sigmas: Float, fine: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def level_error(process: Process, time_s: Float, variance: Float, quiet: Bool, seed: int) -> Float:
+    """Return the standard error of the mean of a process at all times, shape (n,).
+
+    It is the scatter of differences between simulated processes and their means given noisy values (Matheron's rule),
+    with that of the constant level.
+    """
+    noise = variance * process.excess**2
+    fixed = process.covariance(time_s[quiet], noise[quiet]).solve(np.ones(int(quiet.sum()))).sum()
+    if not process.terms:
+        return np.full(time_s.size, float(fixed**-0.5))
+    rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, LEVEL_KEY]))
+    tiny = np.full(time_s.size, 1e-9 * (process.sd**2 + float(np.median(noise))))
+    total = np.zeros(time_s.size)
+    for _ in range(LEVEL_DRAWS):
+        truth = process.covariance(time_s, tiny).coloured(rng.standard_normal(time_s.size))
+        seen = truth + np.sqrt(noise) * rng.standard_normal(time_s.size)
+        total += (process_level(process, time_s, seen, variance, quiet) - truth) ** 2
+    return np.sqrt(total / LEVEL_DRAWS)
+
+
+def single_frames(numbers: NDArray[np.int64], sigmas: Float, fine: Bool) -> Bool:
     """Return single frames far above the level whose neighbours on both sides are not.
 
     A flare decays over several frames; one that is shorter than a frame cannot be distinguished from a cosmic ray.
 
     Parameters
     ----------
+    numbers : ndarray, shape (n_frame,)
+        Numbers of the frames on their regular grid.
     sigmas : ndarray, shape (n_frame,)
         Distance of the frames from the level, in standard deviations.
     fine : ndarray of bool, shape (n_frame,)
@@ -141,7 +204,7 @@ def single_frames(frames: Frames, sigmas: Float, fine: NDArray[np.bool_]) -> NDA
     if at.size < 3:
         return single
     here, before, after = at[1:-1], at[:-2], at[2:]
-    adjacent = (frames.numbers[after] - frames.numbers[before]) == 2
+    adjacent = (numbers[after] - numbers[before]) == 2
     low = (np.abs(sigmas[before]) < NEAR) & (np.abs(sigmas[after]) < NEAR)
     single[here] = adjacent & low & (sigmas[here] > FAR)
     return single

@@ -1,4 +1,4 @@
-"""Measured noise of observed frames, compared with the stated noise."""
+"""Measured noise of observed frames: scatter of means, and correlation of the residuals of the fitted process."""
 
 from __future__ import annotations
 
@@ -14,6 +14,57 @@ Float = NDArray[np.float64]
 BINS = (1, 2, 4, 8, 16, 32, 64, 128)
 #: Smallest number of bins.
 MIN_BINS = 8
+#: Largest lag of correlations in frames.
+MAX_LAG = 40
+#: Correlation of the residuals from which the process does not describe them, if it is also as many standard errors.
+CORRELATED, SIGNIFICANT = 0.12, 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Likeness:
+    """Comparison of the residuals of the fitted process with independent noise."""
+
+    correlations: (
+        Float  # shape (n_lag,); autocorrelation at lags of 1, 2 ... frames, of the sum that is most correlated
+    )
+    error: float  # its standard error for independent residuals
+
+    @property
+    def lag(self) -> int:
+        """Lag of the largest correlation in frames."""
+        return int(np.argmax(np.abs(self.correlations))) + 1
+
+    @property
+    def correlation(self) -> float:
+        """Largest correlation."""
+        return float(self.correlations[self.lag - 1])
+
+    @property
+    def alike(self) -> bool:
+        """True unless the residuals are significantly and clearly correlated."""
+        return abs(self.correlation) < max(CORRELATED, SIGNIFICANT * self.error)
+
+
+def likeness(numbers: NDArray[np.int64], residual: Float) -> Likeness:
+    """Return the autocorrelation of residuals.
+
+    Parameters
+    ----------
+    numbers : ndarray, shape (n_frame,)
+        Numbers of the frames on their regular grid.
+    residual : ndarray, shape (n_frame, n_sum)
+    """
+    # Single extreme values would hide correlations, or feign them.
+    scaled = np.clip(residual, -4.0, 4.0)
+    scaled = (scaled - scaled.mean(axis=0)) / np.maximum(scaled.std(axis=0), 1e-300)
+    lags = np.arange(1, max(2, min(MAX_LAG, len(numbers) // 4) + 1))
+    found = np.zeros((residual.shape[1], lags.size))
+    for k, lag in enumerate(lags):
+        pairs = numbers[lag:] - numbers[:-lag] == lag
+        if pairs.sum() > 10:
+            found[:, k] = (scaled[lag:][pairs] * scaled[:-lag][pairs]).mean(axis=0)
+    worst = int(np.argmax(np.abs(found).max(axis=1)))
+    return Likeness(found[worst], float(len(numbers) ** -0.5))
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,13 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates
+from mauvecl.observations.detection import alternate
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Reason
-from mauvecl.observations.level import MEDIAN_S, PER_MAD, QuiescentLevel, running_median, single_frames
+from mauvecl.observations.level import PER_MAD, QuiescentLevel, guess_flares, single_frames
 from mauvecl.observations.light_changes import LightChange, light_changes
-from mauvecl.observations.search import SeriesSurvey, bank_of, stare_of
+from mauvecl.observations.light_curve import check_usable, quiescent_light
+from mauvecl.observations.search import WHITE, SeriesSurvey, bank_of, stare_of
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.nuisances import Nuisances
 
@@ -39,6 +41,11 @@ RAY_FLARES_K = (6_000.0, 12_000.0, 30_000.0)
 RAY_ROUNDS, SETTLED = 50, 0.05
 #: Differences, in standard errors, above which measured noise replaces stated noise.
 DEPARTS = 4.0
+#: Largest number of times that weights and events are found in alternation, and the share of the frames in events that
+#: may change in the last.
+ROUNDS, SETTLED_EVENTS = 3, 0.01
+#: Number of frames in means that show slow changes.
+SLOW_FRAMES = 12
 #: Frames of one block of computations, which bounds the memory.
 BLOCK = 1024
 
@@ -197,23 +204,23 @@ def measure_noise(excess: Float, pairs: NDArray[np.intp], stated: Float, shared:
 
 def survey_spectra(
     cleaned: CleanedSpectra,
-    flux: Float,
-    level: QuiescentLevel,
     shape: Shape,
     rank: int,
+    seed: int,
     jitters: Mapping[str, float] | None = None,
 ) -> tuple[SeriesSurvey, SpectralSeries, QuiescentLevel]:
     """Prepare the search of spectra that is weighted for flares.
 
+    Slow changes of the dark current and of what else the weights let through are processes of the weighted sums; the
+    level of the light in each frame is free, so that pointing losses take no part.
+
     Parameters
     ----------
-    flux : ndarray, shape (n_frame,)
-        Their sum over wavelength.
-    level : QuiescentLevel
-        Of this sum.
     shape : Shape
     rank : int
         Largest number of sums of a frame.
+    seed : int
+        Seed of the standard error of the level.
     jitters : mapping of str to float, optional
         Standard deviations of unknowns of each frame, infinite for those that are projected out. Where they do not
         state it, that of the light is infinite and that of the dark current as measured.
@@ -223,56 +230,113 @@ def survey_spectra(
     survey : SeriesSurvey
     series : SpectralSeries
     level : QuiescentLevel
-        With flags of further single frames, which only the weighted sums show.
+        Of the sum over wavelength, with flags of single frames that only the weighted sums show.
+    """
+    frames = cleaned.frames
+    flux, error = frames.white_light
+    assert error is not None
+    reasons = frames.faults | np.where(cleaned.saturated, Reason.SATURATED, 0)
+    check_usable(frames, reasons)
+    used = reasons == 0
+    events = np.zeros(flux.size, np.bool_)
+    events[used] = guess_flares(frames.numbers[used], flux[used])
+    for _ in range(ROUNDS):
+        series, templates, sums = _weighted_sums(cleaned, reasons, used & ~events, rank, jitters)
+        directions = templates.directions[list(templates.chosen)]
+        stare = stare_of(frames, used)
+        scale = float(np.median(error[used]))
+        # The noise follows that of the whole light in time.
+        variance = (error[used] / scale) ** 2
+        light = series.light
+        photon = float(series.model.gain @ np.maximum(light, 0.0) / np.maximum(light, 0.0).sum())
+        survey = SeriesSurvey(
+            stare, bank_of(stare, directions, shape), templates, sums[used], variance, (WHITE,) * sums.shape[1],
+            flux[used] / scale, variance, WHITE, scale, abs(float(np.median(flux[used & ~events]))), photon,
+            frames.time_s[used],
+        )  # fmt: skip
+        survey, taken = alternate(survey, events[used])
+        now = np.zeros(flux.size, np.bool_)
+        now[used] = taken
+        sigmas = np.zeros(flux.size)
+        sigmas[used] = survey.along(len(survey.bank.directions) // 2, ~taken)
+        single = single_frames(frames.numbers, sigmas, used & ~now)
+        settled = not single.any() and float((now ^ events).mean()) <= SETTLED_EVENTS
+        events = now
+        if settled:
+            break
+        reasons = np.where(single, reasons | Reason.SPIKE, reasons)
+        used = reasons == 0
+    kept = reasons[_searched(frames, survey)] == 0
+    survey = survey.frames(kept)
+    series = replace(series, excess=series.excess[used])
+    level = quiescent_light(frames, flux, frames.error, survey, used, used & ~events, reasons, seed)
+    return survey, series, level
+
+
+def _searched(frames: Frames, survey: SeriesSurvey) -> NDArray[np.intp]:
+    """Return the frames of a survey among all frames."""
+    return np.searchsorted(frames.time_s, survey.time_s)
+
+
+def _weighted_sums(
+    cleaned: CleanedSpectra, reasons: NDArray[np.int64], quiet: Bool, rank: int, jitters: Mapping[str, float] | None
+) -> tuple[SpectralSeries, Templates, Float]:
+    """Return the spectra less that of the quiescent star, the weights for flares, and the weighted sums of each frame.
+
+    Sums have unit covariance from frame to frame, and are independent of each other over longer times as well.
+
+    Parameters
+    ----------
+    quiet : ndarray of bool, shape (n_frame,)
+        Frames that belong to no event.
     """
     frames, model = cleaned.frames, cleaned.model
-    light = frames.flux[level.quiet].mean(axis=0)
+    light = frames.flux[quiet].mean(axis=0)
     unknown = model.unknowns(light)
     excess = frames.flux - light
     neighbours = np.diff(frames.numbers) == 1
-    pairs = np.flatnonzero(level.quiet[:-1] & level.quiet[1:] & neighbours)
+    pairs = np.flatnonzero(quiet[:-1] & quiet[1:] & neighbours)
+    if not pairs.size:
+        raise InputError.of("frames", 0, "neighbouring frames without a flare, from which the noise follows",
+                            where=frames.name)  # fmt: skip
     assert frames.wavelength_nm is not None
     shared = np.array([unknown["light"], unknown["dark"]])
     noise = measure_noise(excess, pairs, cleaned.stated, shared, frames.wavelength_nm)
     flares = model.flares(TEMPERATURES_K)
-    compared = np.flatnonzero((level.reasons & ~Reason.BELOW) == 0)
+    compared = np.flatnonzero(reasons == 0)
     others = np.vstack([flares, *(spectrum for name, spectrum in unknown.items() if name != "light")])
     changes = light_changes(excess, compared, frames.numbers, light, others, noise.used)
     known = {"light": np.inf} | _dark_jitter(excess, pairs, noise.used, shared) | dict(jitters or {})
     names = tuple(name for name in known if name in unknown)
     nuisances = Nuisances(names, np.array([unknown[name] for name in names]).reshape(len(names), light.size),
                           np.array([known[name] for name in names]))  # fmt: skip
-    typical = abs(float(np.median(level.level[level.used])))
     # Flares that double the light of the star, in the sum over wavelength.
-    flares *= typical / flares.sum(axis=1, keepdims=True)
+    flares *= abs(float(light.sum())) / flares.sum(axis=1, keepdims=True)
     templates, steady = (
         Templates.of_spectra(noise.used**2, flares, model.gain, TEMPERATURES_K, nuisances=some, rank=rank)
         for some in (nuisances, nuisances.without(["light"]))
     )
     kept = float(np.median(templates.best / steady.best))
     sums = np.concatenate([excess[i : i + BLOCK] @ templates.weights.T for i in range(0, len(excess), BLOCK)])
-    used = level.used
-    width = max(3, round(MEDIAN_S / frames.cadence_s))
-    sums -= np.column_stack([running_median(frames, column, level.quiet, width) for column in sums.T])
     mixing = _whitening(sums, pairs)
     if mixing is not None:
         templates, sums = templates.mixed(mixing), sums @ mixing.T
-    directions = templates.directions[list(templates.chosen)]
-    middle = directions[len(directions) // 2] / np.linalg.norm(directions[len(directions) // 2])
-    single = single_frames(frames, np.where(used, sums @ middle, 0.0), used)
-    level = level.without(single)
-    used = level.used
-    stare = stare_of(frames, used)
-    scale = float(np.median(level.error[used]))
-    # The noise follows that of the whole light in time.
-    variance = (level.error[used] / scale) ** 2
-    net = (flux - level.level)[used] / scale
-    photon = float(model.gain @ np.maximum(light, 0.0) / np.maximum(light, 0.0).sum())
-    survey = SeriesSurvey(
-        stare, bank_of(stare, directions, shape), templates, sums[used], variance, net, variance, scale, typical,
-        photon, frames.time_s[used],
-    )  # fmt: skip
-    return survey, SpectralSeries(excess[used], light, noise, model, known, changes, kept), level
+    turn = _slow_axes(sums, quiet)
+    templates, sums = templates.mixed(turn), sums @ turn.T
+    return SpectralSeries(excess, light, noise, model, known, changes, kept), templates, sums
+
+
+def _slow_axes(sums: Float, quiet: Bool) -> Float:
+    """Return the rotation of sums to the axes along which they change slowly, shape (n_sum, n_sum).
+
+    The noise, of unit covariance, stays so.
+    """
+    values = sums[quiet]
+    n = len(values) // SLOW_FRAMES
+    if n < 2 * sums.shape[1]:
+        return np.eye(sums.shape[1])
+    means = values[: n * SLOW_FRAMES].reshape(n, SLOW_FRAMES, -1).mean(axis=1)
+    return np.asarray(np.linalg.eigh(np.cov(means.T).reshape(sums.shape[1], -1))[1].T[::-1])
 
 
 def _dark_jitter(excess: Float, pairs: NDArray[np.intp], sd: Float, shared: Float) -> dict[str, float]:

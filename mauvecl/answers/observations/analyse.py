@@ -116,18 +116,21 @@ class EventRow:
 
     @property
     def verdict(self) -> str:
-        """Judgement of the event: a detected flare, a candidate, or rejected as an event of another kind.
+        """Judgement of the event: a detected flare, a candidate, rejected as an event of another kind, or undecided.
 
-        Where the throughput changes, only a spectrum that is clearly that of a flare makes an event a detection.
+        Where the throughput changes, only a spectrum that is clearly that of a flare makes an event a detection. Where
+        the fitted process does not describe the light, its false-alarm rate is not known.
         """
         if self.event.kind != "flare":
             return "rejected"
+        if not self.analysis.likeness.alike:
+            return "undecided"
         doubtful = self.spectrum is not None and self.spectrum.ambiguous and self.analysis.light_misleads
         return "detected" if self.significant and not doubtful else "candidate"
 
     @property
     def rates(self) -> tuple[float, float]:
-        """False alarms per star-day, in normal noise and in noise as measured."""
+        """False alarms per star-day, in light curves of the fitted process and in those of measured residuals."""
         return self.analysis.false_alarms(self.event)
 
     @property
@@ -137,18 +140,16 @@ class EventRow:
 
     @property
     def half_width_s(self) -> float:
-        """Half-width of the largest fitted flare; NaN if none is measured."""
-        found = self.event.components
-        return float(found[0].recovered.half_width_s[0]) if found else float("nan")
+        """Half-width of the largest fitted flare."""
+        return self.event.energy.flares[0].half_width_s
 
     @property
-    def fitted_s(self) -> tuple[float, float, float]:
-        """Equivalent duration of the fitted flares, and the ends of its 68 % interval if there is a single one."""
-        found = self.event.components
-        if not found:
-            return (float("nan"),) * 3
-        total = float(sum(one.recovered.equivalent_duration_s[0] for one in found))
-        return (total, *(found[0].intervals["equivalent_duration_s"] if len(found) == 1 else (float("nan"),) * 2))
+    def fitted_s(self) -> tuple[float, float, float, float, float]:
+        """Equivalent duration of the whole flare, and the ends of its 68 % and 95 % intervals; NaN if it is no flare."""
+        energy = self.event.energy
+        if self.event.kind != "flare":
+            return (float("nan"),) * 5
+        return (energy.fitted_s, energy.low_s[0], energy.high_s[0], energy.low_s[1], energy.high_s[1])
 
     @cached_property
     def colour(self) -> tuple[float, float, float]:
@@ -164,11 +165,16 @@ class EventRow:
         event = self.event
         notes = ["a step of the level fits better than a flare"] if event.kind == "step" else []
         notes += [self.spectrum.reason] if self.spectrum is not None and self.spectrum.reason else []
-        notes += ["it begins before or ends after the frames"] if event.cut else []
+        if event.is_limit:
+            notes.append("a gap or an end of the frames cuts it: the summed ED is a lower limit")
+        elif event.cut:
+            notes.append("it reaches a gap or an end of the frames")
         frames = "1 missing frame is" if event.missing == 1 else f"{event.missing} missing frames are"
         notes += [f"{frames} interpolated"] if event.missing else []
-        if event.components and event.components[0].p_value < 1e-3:
-            notes.append("the shape of the templates does not fit it")
+        if event.kind == "flare" and event.energy.p_value < 1e-3:
+            notes.append("the shapes of the templates do not fit it, which its interval includes")
+        if event.kind == "flare" and not event.energy.peak_observed:
+            notes.append("no frame shows its peak")
         return "; ".join(notes)
 
 
@@ -212,21 +218,30 @@ EVENTS = (
            lambda days: f"{1440 * days:.3g}"),
     Column("ampl_rec", "event.amplitude", "", "largest flux above the level, relative to the level", "peak",
            percent(".3g")),
-    Column("ed_rec", "event.equivalent_duration_s", "s", "equivalent duration: sum of the flux above the level over "
-           "the event, relative to the level; misses the faint tail of a flare", "ED (s)", number(".4g")),
-    Column("ed_rec_err", "event.equivalent_duration_error_s", "s", "its standard error", "error (s)", number(".2g")),
-    Column("ed_fit", lambda row: row.fitted_s[0], "s", "equivalent duration of the flares fitted to it; nan: none",
-           "ED by fit (s)", number(".4g")),
-    Column("ed_fit_low", lambda row: row.fitted_s[1], "s", "lower end of its 68 % interval; nan: several flares"),
-    Column("ed_fit_high", lambda row: row.fitted_s[2], "s", "upper end"),
+    Column("ed", lambda row: row.fitted_s[0], "s", "recommended equivalent duration, of the whole flare: the light that "
+           "is observed, and the shape where it is not; proportional to the energy; nan: no flare", "ED (s)",
+           number(".4g")),
+    Column("ed_low", lambda row: row.fitted_s[1], "s", "lower end of its 68 % interval, which includes the errors of "
+           "level and shape", "68 %", interval(".4g"), ("ed_high",)),
+    Column("ed_high", lambda row: row.fitted_s[2], "s", "upper end"),
+    Column("ed_low_95", lambda row: row.fitted_s[3], "s", "lower end of its 95 % interval"),
+    Column("ed_high_95", lambda row: row.fitted_s[4], "s", "upper end"),
+    Column("ed_rec", "event.energy.summed_s", "s", "equivalent duration in the frames of the event: sum of the flux "
+           "above the level, relative to the level at the peak", "ED in frames (s)", number(".4g")),
+    Column("ed_rec_err", "event.energy.summed_error_s", "s", "its standard error, with that of the level", "error (s)",
+           number(".2g")),
+    Column("ed_rec_limit", "event.is_limit", "", "whether it is a lower limit, because a gap or an end cuts the flare",
+           kind=bool),
+    Column("ed_fit", lambda row: sum(one.equivalent_duration_s for one in row.event.energy.flares), "s", "equivalent "
+           "duration of the flares of the best shape"),
+    Column("shape", "event.energy.shape", "", "shape of the flares that fits best", kind=str),
     Column("half_width", "half_width_s", "s", "t_1/2 of the largest flare fitted to it; nan: none", "half-width (s)",
            number(".3g")),
-    Column("components", lambda row: len(row.event.components), "", "flares fitted together", kind=int),
+    Column("components", lambda row: len(row.event.energy.flares), "", "flares fitted together", kind=int),
     Column("value", "event.value", "", "statistic of the search: S/N of the best template", "S/N", number(".4g")),
-    Column("rate_normal", lambda row: row.rates[0], "1 / d", "false alarms per star-day above this statistic in "
-           "normal noise"),
-    Column("rate_measured", lambda row: row.rates[1], "1 / d", "the same in noise resampled from quiescent frames; an "
-           "upper limit if none reaches it"),
+    Column("rate_modelled", lambda row: row.rates[0], "1 / d", "false alarms per star-day above this statistic in "
+           "light curves of the fitted process"),
+    Column("rate_measured", lambda row: row.rates[1], "1 / d", "the same with residuals resampled from quiescent frames"),
     Column("probability", "probability", "", "probability of such an event from noise anywhere in these frames, by "
            "the larger rate", "from noise", _rate),
     Column("significant", "significant", "", "whether the rate is at most the wanted one", kind=bool),
@@ -258,6 +273,7 @@ FRAMES = (
     Column("time", lambda one: one.frames.time_s / DAY_S, "d", "middle of the frame, from time zero"),
     Column("flux", "flux", "", "light in the unit of the file; for spectra, the sum over wavelength"),
     Column("level", "level.level", "", "quiescent level"),
+    Column("level_error", "level.level_error", "", "standard error of the level"),
     Column("error", "level.error", "", "standard deviation of a quiescent frame"),
     Column("reason", lambda one: np.array([Reason.words(int(value)) for value in one.level.reasons]), "",
            "why the frame is not searched; empty if it is"),

@@ -1,0 +1,245 @@
+"""Detection of events in observed light curves, and the process of the light without them.
+
+The largest statistics above a threshold become events; their frames are taken away, and the rest is searched again.
+Process and events are found in alternation: a process that is fitted to flares would hide them, and a flare that is
+searched with a wrong process would be too long or too short.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.observations.process import Binned, Process, fit_process
+from mauvecl.observations.search import SeriesSurvey
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+#: Statistic of events whose frames take no part in fits of the process.
+PROVISIONAL = 5.0
+#: Largest number of alternations of process and events, of searches, and of events.
+ROUNDS, MAX_PASSES, MAX_EVENTS = 6, 40, 500
+#: Share of the frames in events that may change in the last alternation.
+SETTLED = 0.002
+#: Smallest number of quiescent frames to which a process is fitted; with fewer, the longest events are shortened.
+MIN_QUIET = 20
+#: Share of a template's response to the flux of other events that a further event must exceed, since their shapes are
+#: not exactly known.
+UNCERTAIN = 0.5
+#: Flux of a template, in standard deviations of a frame, to which its tail belongs to the event; the longest tail and
+#: the beginning, in half-widths.
+FAINT, LONGEST_TAIL, BEGINNING = 0.05, 60.0, 1.2
+#: Half-widths, and shortest time scales of the process, around a larger event in which smaller ones wait for the next
+#: search.
+NEAR_WIDTHS, NEAR_SCALES = 20.0, 2.0
+#: Mean of consecutive frames at the end of an event, in standard deviations of a frame, and their number, with which
+#: it goes on.
+STILL_BRIGHT, END_FRAMES = 1.0, 4
+
+
+@dataclass(frozen=True)
+class Detection:
+    """Event above the threshold of the search, before it is measured.
+
+    Attributes
+    ----------
+    value, half_width_s, peak_s, direction : float, float, float, int
+        Statistic, half-width, time of the peak in the stare, and row of the bank's directions, of the best template.
+    amplitude : float
+        Of the template, in the unit of the sums along the direction.
+    first, last : int
+        First and last frame of the event.
+    """
+
+    value: float
+    half_width_s: float
+    peak_s: float
+    direction: int
+    amplitude: float
+    first: int
+    last: int
+
+
+def fit_processes(survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None = None) -> SeriesSurvey:
+    """Return a survey with the processes that fit its sums and its flux outside some frames.
+
+    Parameters
+    ----------
+    taken : ndarray of bool, shape (n_frame,)
+        Frames of events.
+    start : SeriesSurvey, optional
+        Survey of nearly the same frames, with processes; their terms are kept.
+    """
+    quiet = ~taken
+    time, step = survey.stare.start_s[quiet], survey.stare.frame_s
+
+    def fitted(values: Float, variance: Float, before: Process | None) -> Process:
+        return fit_process(Binned.of(time, values[quiet], variance[quiet], step), before)
+
+    processes = tuple(
+        fitted(column, survey.variance, None if start is None else start.processes[k])
+        for k, column in enumerate(survey.sums.T)
+    )
+    flux = processes[0]
+    if survey.flux is not survey.sums[:, 0] and not np.shares_memory(survey.flux, survey.sums):
+        flux = fitted(survey.flux, survey.flux_variance, None if start is None else start.flux_process)
+    return replace(survey, processes=processes, flux_process=flux)
+
+
+def alternate(survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None = None) -> tuple[SeriesSurvey, Bool]:
+    """Fit process and events in alternation.
+
+    Parameters
+    ----------
+    survey : SeriesSurvey
+        Without processes.
+    guessed : ndarray of bool, shape (n_frame,)
+        First guess of the frames of events.
+    before : SeriesSurvey, optional
+        Survey of nearly the same frames, with processes; their terms are kept as long as the events hardly change.
+
+    Returns
+    -------
+    survey : SeriesSurvey
+        With processes.
+    taken : ndarray of bool, shape (n_frame,)
+        Frames of events above `PROVISIONAL`.
+    """
+    taken = guessed
+    for _ in range(ROUNDS):
+        fitted = fit_processes(survey, taken, before)
+        _, now = detect_events(fitted, PROVISIONAL)
+        changed = float((now ^ taken).mean())
+        taken = now
+        if changed <= SETTLED:
+            break
+        # Terms are chosen again as long as many frames change.
+        before = fitted if changed < 10 * SETTLED else None
+    return fitted, taken
+
+
+def detect_events(survey: SeriesSurvey, threshold: float) -> tuple[list[Detection], Bool]:
+    """Detect events above a threshold, the largest first, and return them in order of time with their frames."""
+    n = survey.stare.n_frames
+    taken, found = np.zeros(n, np.bool_), list[Detection]()
+    light = np.zeros_like(survey.sums)
+    for _ in range(MAX_PASSES):
+        left = ~taken
+        if left.sum() < MIN_QUIET or len(found) >= MAX_EVENTS:
+            break
+        new = _search_once(survey, left, light, threshold)
+        if not new:
+            break
+        for one in new:
+            unit = survey.bank.directions[one.direction]
+            light += _template_light(survey, one)[:, None] * unit
+        mine = [_extent(survey, taken, one) for one in new]
+        for first, last in mine:
+            taken[first : last + 1] = True
+        mine = _extended(survey, taken, mine, new)
+        for (first, last), one in zip(mine, new, strict=True):
+            taken[first : last + 1] = True
+            found.append(replace(one, first=first, last=last))
+    return _merged(sorted(found, key=lambda one: one.first)), taken
+
+
+def _merged(found: list[Detection]) -> list[Detection]:
+    """Return the events without those that lie inside the frames of a larger one."""
+    kept: list[Detection] = []
+    for one in found:
+        if kept and one.first <= kept[-1].last:
+            other = kept.pop()
+            larger = max(one, other, key=lambda each: each.value)
+            one = replace(larger, first=min(one.first, other.first), last=max(one.last, other.last))
+        kept.append(one)
+    return kept
+
+
+def _template_light(survey: SeriesSurvey, one: Detection) -> Float:
+    start = survey.stare.start_s
+    edges = np.column_stack([start, start + survey.stare.frame_s])
+    near = slice(*np.searchsorted(start, [one.peak_s - 5 * one.half_width_s, one.peak_s + 80 * one.half_width_s]))
+    light = np.zeros(start.size)
+    light[near] = one.amplitude * survey.bank.shape.mean_over(edges[near], one.peak_s, one.half_width_s)
+    return light
+
+
+def _search_once(survey: SeriesSurvey, left: Bool, light: Float, threshold: float) -> list[Detection]:
+    """Return the largest events among the frames that are left, at most one near another."""
+    part = survey.frames(left)
+    both = np.stack([part.sums, UNCERTAIN * light[left]]) if light.any() else part.sums[None]
+    values, places = [], []
+    for row, rho in part.search.values(both):
+        excess = rho[0] - np.abs(np.where(np.isfinite(rho[1]), rho[1], 0.0)) if len(rho) > 1 else rho[0]
+        direction = excess.argmax(axis=0)
+        best = excess[direction, np.arange(excess.shape[1])]
+        # Local maxima only: neighbours belong to the same event.
+        top = (best >= np.append(best[1:], -np.inf)) & (best >= np.insert(best[:-1], 0, -np.inf))
+        for onset in np.flatnonzero(top & (best >= threshold)):
+            along = int(direction[onset])
+            value = float(rho[0, along, onset])
+            amplitude = value / float(row.per_amplitude[along, onset])
+            peak = float(part.search.peak_s(row, np.array([onset]))[0])
+            places.append(Detection(value, row.template.half_width_s, peak, along, amplitude, 0, 0))
+            values.append(float(best[onset]))
+    accepted: list[Detection] = []
+    order = np.argsort(values)[::-1][: 4 * MAX_EVENTS]
+    scales = min(one.shortest_s for one in part.processes)
+    scale = NEAR_SCALES * scales if np.isfinite(scales) else 0.0
+    waiting: list[tuple[float, float]] = []
+    for k in order:
+        one = places[int(k)]
+        reach = max(NEAR_WIDTHS * one.half_width_s, scale)
+        if not any(abs(one.peak_s - peak) <= max(reach, other) for peak, other in waiting):
+            accepted.append(one)
+        waiting.append((one.peak_s, reach))
+    return accepted
+
+
+def _extent(survey: SeriesSurvey, taken: Bool, one: Detection) -> tuple[int, int]:
+    """Return the first and last frame in which the template of an event is brighter than `FAINT`."""
+    middle = survey.stare.middle_s
+    excess = min(process.excess for process in survey.processes)
+    noise = float(np.sqrt(np.median(survey.variance))) * excess
+    tau = np.linspace(0.0, LONGEST_TAIL, 1200)
+    bright = tau[one.amplitude * survey.bank.shape.at(tau) > FAINT * noise]
+    tail = max(1.0, float(bright[-1]) if bright.size else 0.0)
+    frame_s = survey.stare.frame_s
+    start = one.peak_s - BEGINNING * one.half_width_s - frame_s / 2
+    stop = one.peak_s + tail * one.half_width_s + frame_s / 2
+    first, last = np.searchsorted(middle, [start, stop])
+    peak = int(np.clip(np.searchsorted(middle, one.peak_s), 0, middle.size - 1))
+    first, last = min(int(first), peak), max(int(last) - 1, peak)
+    # Other events end it.
+    before, after = np.flatnonzero(taken[first:peak]), np.flatnonzero(taken[peak : last + 1])
+    if before.size:
+        first = first + int(before[-1]) + 1
+    if after.size and after[0] > 0:
+        last = peak + int(after[0]) - 1
+    return first, max(first, last)
+
+
+def _extended(
+    survey: SeriesSurvey, taken: Bool, extents: list[tuple[int, int]], found: list[Detection]
+) -> list[tuple[int, int]]:
+    """Return events that go on as long as the frames at their ends are brighter than the level."""
+    quiet = ~taken
+    if quiet.sum() < MIN_QUIET:
+        return extents
+    sigmas = {direction: survey.along(direction, quiet) for direction in {one.direction for one in found}}
+    longer = []
+    for (first, last), one in zip(extents, found, strict=True):
+        sigma, length = sigmas[one.direction], last - first + 1
+        stop = min(last + length, sigma.size - 1)
+        while last < stop and not taken[last + 1] and sigma[last + 1 : last + 1 + END_FRAMES].mean() > STILL_BRIGHT:
+            last += 1
+        start = max(first - length, 0)
+        while (
+            first > start and not taken[first - 1] and sigma[max(0, first - END_FRAMES) : first].mean() > STILL_BRIGHT
+        ):
+            first -= 1
+        longer.append((first, last))
+    return longer

@@ -1,0 +1,688 @@
+"""Equivalent durations of events, with intervals that include what is not known of level and shape.
+
+The light near an event is the level, flares of a known shape, and noise:
+
+    y = level + sum_j A_j s((t - p_j) / w_j) (1 + d(t)) + noise
+
+The level has the covariance of the process of the star. The departure d of a flare from its shape is a Gaussian process
+of standard deviation epsilon in the logarithm of the time from the peak (a model discrepancy as of Kennedy & O'Hagan
+2001, doi 10.1111/1467-9868.00294). It makes the sum of the observed light decide where a flare is bright, and the
+shape where it is not observed. Peak and half-width of a single flare are integrated on a grid, amplitudes, level and
+departures in closed form; shapes and epsilon are averaged with the weights of their marginal likelihoods. Several
+flares are fitted by least squares, and their errors are those of the linearised model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from mauvecl.lightcurve.flares.shapes import SHAPES, Shape
+
+if TYPE_CHECKING:
+    from mauvecl.observations.detection import Detection
+    from mauvecl.observations.process import Process
+    from mauvecl.observations.search import SeriesSurvey
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+#: Departures of flares from their shape, and their prior weights (assumed).
+EPSILON, EPSILON_WEIGHTS = (0.0, 0.02, 0.06, 0.2), (0.25, 0.25, 0.25, 0.25)
+#: Correlation of departures in the logarithm of 1 + time from the peak in half-widths (assumed).
+LOG_TIME = 0.7
+#: Shapes that are averaged, besides that of the search.
+AVERAGED = ("davenport2014", "tovarmendoza2022")
+#: Largest number of bins in an event, and on each side of it; growth of the bins with the distance from the peak.
+MAX_INSIDE, MAX_OUTSIDE, GROWTH = 400, 120, 6.0
+#: Bins outside are shorter than this share of the shortest time scale of the process.
+SHORT = 0.2
+#: Nodes of the grid in peak and half-width, and the fall of the log posterior beyond which nodes are neglected.
+NODES, NEGLIGIBLE = 25, 14.0
+#: Largest number of refinements of the grid.
+REFINEMENTS = 6
+#: First range of the peak, in half-widths of the template, and factor on the half-width.
+PEAK_RANGE, WIDTH_RANGE = 2.5, 6.0
+#: Half-widths of a shape before and after the peak beyond which it is neglected.
+REACH = (5.0, 80.0)
+#: Departure with which further flares of an event are searched, the fall of chi-squared that they need, and the
+#: largest number.
+FURTHER_EPSILON, FURTHER_GAIN, MAX_FLARES = 0.2, 36.0, 6
+#: Fall of chi-squared by which a step must fit better than a flare.
+STEP_GAIN = 9.0
+#: Levels of the intervals.
+LEVELS = (0.6826894921370859, 0.95)
+#: Rounds in which the photon noise and the departures follow the fit.
+ROUNDS = 3
+#: Smallest number of quiescent frames for a level.
+MIN_BASELINE = 10
+
+
+@dataclass(frozen=True)
+class FittedFlare:
+    """Flare fitted to an event."""
+
+    peak_s: float  # in the stare
+    amplitude: float  # relative to the level
+    half_width_s: float
+    equivalent_duration_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Energy:
+    """Equivalent duration of an event."""
+
+    summed_s: float  # sum of the light above the level over the frames of the event
+    summed_error_s: float
+    fitted_s: float  # of the whole flares; median of the posterior
+    low_s: tuple[float, float]  # lower ends of the intervals of `LEVELS`
+    high_s: tuple[float, float]
+    flares: tuple[FittedFlare, ...]  # of the shape of the largest weight, the largest first
+    shape: str
+    chi2: float  # of these without departures from the shape
+    dof: int
+    departure: float  # mean of epsilon
+    step: bool  # a step of the level fits better than a flare
+    peak_observed: bool  # the peak lies in or next to an observed frame
+    level: float  # of the star at the peak, in units of the survey's level
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a chi-squared at least as large."""
+        return float(scipy.stats.chi2.sf(self.chi2, self.dof)) if self.dof > 0 else float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Bins of frames around an event.
+
+    Frames in a bin are consecutive. Values are those of the sum along the direction of the event's template.
+    """
+
+    survey: SeriesSurvey
+    one: Detection
+    edges: Float  # shape (n, 2); start and end of each bin
+    values: Float  # shape (n,)
+    noise: Float  # shape (n,); variance of the mean of each bin's frames
+    frames: NDArray[np.int64]  # shape (n,); number of frames of each bin
+    inside: Bool  # shape (n,); bins of the event
+    scale: float  # value of unit amplitude
+    photon: float  # rise of the variance of a frame with the amplitude
+
+    @classmethod
+    def of(cls, survey: SeriesSurvey, taken: Bool, one: Detection, direction: int | None = None) -> Window:
+        """Collect the frames of an event, and those around it that belong to no event."""
+        direction = one.direction if direction is None else direction
+        unit = survey.bank.directions[direction]
+        row = survey.templates.chosen[direction]
+        scale = float(np.linalg.norm(survey.templates.directions[row]))
+        photon = float(unit @ survey.templates.noise[row] @ unit)
+        along = survey.sums @ unit
+        excess = float(unit**2 @ np.array([p.excess for p in survey.processes]) ** 2)
+        numbers, frame_s = survey.stare.numbers, survey.stare.frame_s
+        peak = one.peak_s / frame_s
+        inside = np.zeros(along.size, np.bool_)
+        inside[one.first : one.last + 1] = True
+        at = np.flatnonzero(inside | ~taken)
+        distance = np.abs(numbers[at] - peak)
+        size = np.ones(at.size)
+        length = numbers[one.last] - numbers[one.first] + 1
+        size[inside[at]] = max(1, int(np.ceil(length / MAX_INSIDE)))
+        shortest = min(process.shortest_s for process in survey.processes)
+        ends = np.where(
+            numbers[at] > peak, distance - (numbers[one.last] - peak), distance - (peak - numbers[one.first])
+        )
+        outer = np.clip(np.maximum(ends, 0.0) / GROWTH, 1.0, max(1.0, SHORT * shortest / frame_s))
+        size[~inside[at]] = np.maximum(np.floor(outer), size.min())[~inside[at]]
+        bins = _bins(numbers[at], size, inside[at])
+        first = np.flatnonzero(np.diff(bins, prepend=-1))
+        count = np.diff(np.append(first, at.size))
+        is_inside = inside[at][first]
+        start = survey.stare.start_s[at[first]]
+        stop = survey.stare.start_s[at[first + count - 1]] + frame_s
+        mean = np.add.reduceat(along[at], first) / count
+        noise = np.add.reduceat(survey.variance[at] * excess, first) / count**2
+        # The nearest bins on each side are kept.
+        before = np.flatnonzero(~is_inside & (stop <= survey.stare.start_s[one.first] + frame_s / 2))
+        after = np.flatnonzero(~is_inside & (start >= survey.stare.start_s[one.last] + frame_s / 2))
+        kept = np.sort(np.concatenate([before[-MAX_OUTSIDE:], np.flatnonzero(is_inside), after[:MAX_OUTSIDE]]))
+        return cls(
+            survey, one, np.column_stack([start, stop])[kept], mean[kept], noise[kept], count[kept], is_inside[kept],
+            scale, photon,
+        )  # fmt: skip
+
+    @cached_property
+    def middle(self) -> Float:
+        """Middle of each bin."""
+        return np.asarray(self.edges.mean(axis=1))
+
+    @cached_property
+    def process(self) -> Float:
+        """Covariance of the level in the bins, shape (n, n)."""
+        unit = self.survey.bank.directions[self.one.direction]
+        lags = self.middle[:, None] - self.middle
+        total = np.zeros(lags.shape)
+        for weight, process in zip(unit, self.survey.processes, strict=True):
+            total += weight**2 * process.at(lags)
+        return total
+
+    def model(self, shape: Shape, peak_s: Float, half_width_s: Float) -> Float:
+        """Return the mean of shapes in the bins, in the unit of the values, (n_shape, n)."""
+        peak, width = (np.atleast_1d(one)[:, None] for one in (peak_s, half_width_s))
+        return self.scale * shape.mean_over(self.edges, peak, width)
+
+
+def _bins(numbers: NDArray[np.int64], size: Float, inside: Bool) -> NDArray[np.int64]:
+    """Return the bin of each frame: consecutive frames, at most as many as the smallest size that they allow."""
+    bins = np.empty(numbers.size, np.int64)
+    bin_number, held, limit = -1, 0, 0.0
+    for k in range(numbers.size):
+        breaks = k == 0 or numbers[k] != numbers[k - 1] + 1 or inside[k] != inside[k - 1]
+        limit = size[k] if breaks or held >= limit else min(limit, size[k])
+        if breaks or held >= limit:
+            bin_number, held = bin_number + 1, 0
+            limit = size[k]
+        held += 1
+        bins[k] = bin_number
+    return bins
+
+
+@dataclass(frozen=True, eq=False)
+class Likelihood:
+    """Inverse covariance of the values of a window, with the constant level integrated out."""
+
+    window: Window
+    inverse: Float  # shape (n, n)
+    log_factor: float  # of the likelihood, without the constant
+    # Integral of the departures of the flares from their shape, in amplitude x s: its covariance with the values, and
+    # its variance.
+    departure: Float  # shape (n,)
+    variance: float
+    # Weights of the values in the level of the star at the peak, and its variance with a known flare, relative to the
+    # level; zero where the values are not its light.
+    level: Float  # shape (n,)
+    level_variance: float
+
+    @classmethod
+    def of(cls, window: Window, flares: Sequence[FittedFlare], shape: Shape, epsilon: float) -> Likelihood:
+        """Compute the likelihood for the photon noise of some flares and departures from their shape."""
+        n = window.values.size
+        covariance = window.process + np.diag(window.noise)
+        shared, variance = np.zeros(n), 0.0
+        for one in flares:
+            light = one.amplitude * window.model(shape, np.array([one.peak_s]), np.array([one.half_width_s]))[0]
+            covariance += np.diag(window.photon * light / window.scale / window.frames)
+            if epsilon:
+                cells, cell_light = _unobserved(window, one, shape)
+                place = _log_time(window.middle, one)
+                elsewhere = _log_time(cells, one)
+                near = np.exp(-np.abs(place[:, None] - place) / LOG_TIME)
+                covariance += epsilon**2 * light[:, None] * light * near
+                lengths = window.edges[:, 1] - window.edges[:, 0]
+                whole = np.concatenate([light / window.scale * lengths, cell_light])
+                every = np.concatenate([place, elsewhere])
+                shared += epsilon**2 * light * (np.exp(-np.abs(place[:, None] - every) / LOG_TIME) @ whole)
+                variance += epsilon**2 * float(whole @ np.exp(-np.abs(every[:, None] - every) / LOG_TIME) @ whole)
+        factor = scipy.linalg.cho_factor(covariance, lower=True)
+        inverse = scipy.linalg.cho_solve(factor, np.eye(n))
+        ones = inverse.sum(axis=1)
+        total = float(ones.sum())
+        level, level_variance = np.zeros(n), 0.0
+        if len(window.survey.bank.directions) == 1:
+            at = int(np.argmin(np.abs(window.middle - window.one.peak_s)))
+            toward = inverse @ window.process[at]
+            rest = 1.0 - float(window.process[at] @ ones)
+            level = (toward + rest * ones / total) / window.scale
+            known = float(window.process[at, at] - window.process[at] @ toward) + rest**2 / total
+            level_variance = max(known, 0.0) / window.scale**2
+        inverse = inverse - ones[:, None] * ones / total
+        log_factor = -float(np.log(np.diag(factor[0])).sum()) - 0.5 * float(np.log(total))
+        return cls(window, inverse, log_factor, shared, variance, level, level_variance)
+
+    def chi2(self, model: Float) -> Float:
+        """Return chi-squared of the values with models, of shape (n,) or (k, n), added to the level."""
+        left = self.window.values - model
+        return np.asarray(np.einsum("...i,...i->...", left @ self.inverse, left))
+
+
+def _log_time(time_s: Float, one: FittedFlare) -> Float:
+    tau = (time_s - one.peak_s) / one.half_width_s
+    return np.asarray(np.sign(tau) * np.log1p(np.abs(tau)))
+
+
+def _unobserved(window: Window, one: FittedFlare, shape: Shape) -> tuple[Float, Float]:
+    """Return middles of intervals without bins near a flare, and the light of the flare in them, in amplitude x s."""
+    tau = np.concatenate([-np.geomspace(REACH[0], 0.05, 12), [0.0], np.geomspace(0.05, REACH[1], 24)])
+    edges = np.unique(np.concatenate([one.peak_s + tau * one.half_width_s, window.edges.ravel()]))
+    edges = edges[(edges >= one.peak_s - REACH[0] * one.half_width_s)
+                  & (edges <= one.peak_s + REACH[1] * one.half_width_s)]  # fmt: skip
+    if edges.size < 2:
+        return np.zeros(0), np.zeros(0)
+    middle = (edges[:-1] + edges[1:]) / 2
+    place = np.searchsorted(window.edges[:, 0], middle, side="right") - 1
+    seen = (place >= 0) & (middle < window.edges[np.maximum(place, 0), 1])
+    mean = shape.mean_over(edges, one.peak_s, one.half_width_s)
+    light = one.amplitude * mean * np.diff(edges)
+    return middle[~seen], light[~seen]
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """Mixture of normal distributions of the equivalent duration."""
+
+    log_weight: Float  # shape (n,)
+    mean: Float
+    sd: Float
+
+    @property
+    def log_total(self) -> float:
+        """Logarithm of the sum of the weights."""
+        return float(scipy.special.logsumexp(self.log_weight))
+
+    def quantile(self, probability: float) -> float:
+        """Return a quantile of the part above zero."""
+        weight = np.exp(self.log_weight - self.log_weight.max())
+        kept = weight > 1e-8
+        weight, mean, sd = weight[kept] / weight[kept].sum(), self.mean[kept], np.maximum(self.sd[kept], 1e-300)
+        below = float(weight @ scipy.special.ndtr(-mean / sd))
+        goal = below + probability * (1.0 - below)
+        low, high = max(0.0, float((mean - 10 * sd).min())), float((mean + 10 * sd).max())
+        return float(
+            scipy.optimize.brentq(
+                lambda x: float(weight @ scipy.special.ndtr((x - mean) / sd)) - goal, low, high, xtol=1e-9 * abs(high)
+            )
+        ) if high > low else low  # fmt: skip
+
+
+def _joined(parts: Sequence[Mixture], log_weights: Sequence[float]) -> Mixture:
+    return Mixture(
+        np.concatenate([part.log_weight + w for part, w in zip(parts, log_weights, strict=True)]),
+        np.concatenate([part.mean for part in parts]),
+        np.concatenate([part.sd for part in parts]),
+    )
+
+
+def measure_energy(survey: SeriesSurvey, taken: Bool, one: Detection) -> Energy:
+    """Measure the equivalent duration of an event.
+
+    Parameters
+    ----------
+    taken : ndarray of bool, shape (n_frame,)
+        Frames of all events.
+    one : Detection
+    """
+    shapes = [survey.bank.shape, *(SHAPES[name] for name in AVERAGED if SHAPES[name] is not survey.bank.shape)]
+    shapes = list({shape.name: shape for shape in shapes}.values())
+    window = Window.of(survey, taken, one)
+    level = _level_at(survey, taken, one)
+    directions = _directions(survey, taken, one)
+    parts, weights, fits = [], [], []
+    for shape in shapes:
+        flares, box = _first_fit(window, shape)
+        flares = _further(window, shape, flares)
+        for epsilon, prior in zip(EPSILON, EPSILON_WEIGHTS, strict=True):
+            posterior, flares_of = _posterior(window, shape, flares, epsilon, box)
+            parts.append(posterior)
+            weights.append(float(np.log(prior)) + _log_prior(len(flares_of)))
+            fits.append((shape, flares_of, epsilon))
+    totals = np.array([part.log_total + w for part, w in zip(parts, weights, strict=True)])
+    share = np.exp(totals - totals.max())
+    share /= share.sum()
+    mixture = _joined(parts, weights)
+    best = int(np.argmax(totals))
+    shape, flares, _ = fits[best]
+    if len(directions) > 1:
+        # Flares of other temperatures have another light for the same sum.
+        mixture = _joined([Mixture(mixture.log_weight, factor * mixture.mean, factor * mixture.sd)
+                           for _, factor in directions], [weight for weight, _ in directions])  # fmt: skip
+    plain = Likelihood.of(window, flares, shape, 0.0)
+    model = sum((f.amplitude * window.model(shape, np.array([f.peak_s]), np.array([f.half_width_s]))[0]
+                 for f in flares), np.zeros(window.values.size))  # fmt: skip
+    summed, error = _summed(survey, taken, one)
+    ends = [[mixture.quantile(0.5 + sign * width / 2) / level for width in LEVELS] for sign in (-1, 1)]
+    frame_s = survey.stare.frame_s
+    peak = flares[0].peak_s
+    observed = bool((np.abs(survey.stare.middle_s[one.first : one.last + 1] - peak) <= 1.5 * frame_s).any())
+    return Energy(
+        summed / level, error / level, mixture.quantile(0.5) / level, (ends[0][0], ends[0][1]), (ends[1][0], ends[1][1]),
+        tuple(replace(f, amplitude=f.amplitude / level, equivalent_duration_s=f.equivalent_duration_s / level)
+              for f in flares), shape.name, float(plain.chi2(model)), window.values.size - 1 - 3 * len(flares),
+        float(share @ np.array([epsilon for *_, epsilon in fits])), _is_step(window, plain, float(plain.chi2(model))),
+        observed, level,
+    )  # fmt: skip
+
+
+def _log_prior(n_flares: int) -> float:
+    """Return the logarithm of the prior weight of a number of flares."""
+    return -float(n_flares - 1)
+
+
+def _level_at(survey: SeriesSurvey, taken: Bool, one: Detection) -> float:
+    """Return the level of the star at the peak of an event, in units of the survey's level."""
+    quiet = ~taken
+    if quiet.sum() < MIN_BASELINE:
+        return 1.0
+    at = int(np.clip(np.searchsorted(survey.stare.middle_s, one.peak_s), 0, survey.stare.n_frames - 1))
+    level = float(survey.flux_level(quiet)[at]) * survey.scale / survey.level
+    return level if level > 0 else 1.0
+
+
+def _directions(survey: SeriesSurvey, taken: Bool, one: Detection) -> list[tuple[float, float]]:
+    """Return the log weight of each direction of the bank, and its light relative to that of the event's direction."""
+    if len(survey.bank.directions) == 1:
+        return [(0.0, 1.0)]
+    scores = []
+    for direction in range(len(survey.bank.directions)):
+        window = Window.of(survey, taken, one, direction)
+        noise = np.diag(window.process) + window.noise
+        model = window.model(survey.bank.shape, np.array([one.peak_s]), np.array([one.half_width_s]))[0]
+        weight = model / noise
+        level = window.values[~window.inside]
+        level_mean = (
+            float(level @ (1 / noise)[~window.inside] / (1 / noise)[~window.inside].sum()) if level.size else 0.0
+        )
+        value = float(weight @ (window.values - level_mean)) / np.sqrt(float(weight @ model))
+        scores.append((value, window.scale))
+    mine = scores[one.direction]
+    return [(0.5 * np.sign(value) * value**2 - 0.5 * mine[0] ** 2, mine[1] / scale * value / mine[0])
+            for value, scale in scores if value > 0]  # fmt: skip
+
+
+def _flare(shape: Shape, peak: float, width: float, amplitude: float) -> FittedFlare:
+    return FittedFlare(
+        float(peak), float(amplitude), float(width), float(amplitude * width * shape.equivalent_duration)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Log posterior of a single flare at nodes of peak and half-width."""
+
+    # Peaks, half-widths, log posteriors, amplitudes and their information, shape (n_node,).
+    peaks_s: Float
+    half_widths_s: Float
+    log: Float
+    amplitude: Float
+    information: Float
+    box: Float  # range of the peak and of the logarithm of the half-width outside which it is negligible, (2, 2)
+
+    def best(self, shape: Shape) -> FittedFlare:
+        """Return the flare of the largest posterior."""
+        k = int(np.argmax(self.log))
+        return _flare(shape, self.peaks_s[k], self.half_widths_s[k], max(self.amplitude[k], 1e-12))
+
+    @classmethod
+    def of(cls, likelihood: Likelihood, shape: Shape, box: Float, outer: Float) -> Grid:
+        """Compute the posterior on a grid that is refined or widened until it covers all that is not negligible.
+
+        Parameters
+        ----------
+        box, outer : ndarray, shape (2, 2)
+            First and largest range of the peak and of the logarithm of the half-width.
+        """
+        window = likelihood.window
+        data = likelihood.inverse @ window.values
+        for _ in range(REFINEMENTS):
+            p, w = (grid.ravel() for grid in np.meshgrid(*(np.linspace(*side, NODES) for side in box), indexing="ij"))
+            model = window.model(shape, p, np.exp(w))
+            information = np.maximum(np.einsum("ki,ki->k", model @ likelihood.inverse, model), 1e-300)
+            slope = model @ data
+            step = (box[:, 1] - box[:, 0]) / (NODES - 1)
+            # A flat prior on the equivalent duration and on the logarithm of the half-width.
+            log = np.where(slope > 0, 0.5 * slope**2 / information, -1e300) - 0.5 * np.log(information) - w
+            log += float(np.log(step).sum())
+            found = cls(p, np.exp(w), log, slope / information, information, box)
+            near = log > log.max() - NEGLIGIBLE
+            ends = np.array([[p[near].min(), p[near].max()], [w[near].min(), w[near].max()]])
+            low, high = ends[:, 0] - step, ends[:, 1] + step
+            # Where the posterior reaches an end, the grid is widened.
+            wide = np.diff(box)[:, 0]
+            low = np.where(ends[:, 0] <= box[:, 0] + step / 2, box[:, 0] - wide / 2, low)
+            high = np.where(ends[:, 1] >= box[:, 1] - step / 2, box[:, 1] + wide / 2, high)
+            new = np.column_stack([np.maximum(low, outer[:, 0]), np.minimum(high, outer[:, 1])])
+            size = np.diff(new)[:, 0] / wide
+            if ((size > 0.6) & (size < 1.1)).all():
+                break
+            box = new
+        return found
+
+
+def _ranges(window: Window) -> Float:
+    """Return the largest ranges of the peak and of the logarithm of the half-width of a single flare, shape (2, 2).
+
+    A gap before the event may hold the peak.
+    """
+    one, survey = window.one, window.survey
+    frame_s = survey.stare.frame_s
+    first_s, last_s = survey.stare.start_s[one.first], survey.stare.start_s[one.last] + frame_s
+    low, high = one.peak_s - PEAK_RANGE * one.half_width_s, one.peak_s + PEAK_RANGE * one.half_width_s
+    earlier = survey.stare.start_s[: one.first]
+    low = min(low, max(first_s - 4 * one.half_width_s, (float(earlier[-1]) + frame_s) if earlier.size else -np.inf))
+    high = min(max(high, low + frame_s), last_s)
+    widest = max(survey.bank.half_widths_s[-1], one.half_width_s) * 3
+    width = (max(one.half_width_s / WIDTH_RANGE, 0.2 * frame_s), min(one.half_width_s * WIDTH_RANGE, widest))
+    return np.array([[low, high], np.log(width)])
+
+
+def _first_fit(window: Window, shape: Shape) -> tuple[list[FittedFlare], Float]:
+    """Return the best single flare, and the range of its peak and half-width."""
+    outer = _ranges(window)
+    flares, box = list[FittedFlare](), outer
+    for _ in range(2):
+        grid = Grid.of(Likelihood.of(window, flares, shape, 0.0), shape, box, outer)
+        flares, box = [grid.best(shape)], grid.box
+    return flares, box
+
+
+def _further(window: Window, shape: Shape, flares: list[FittedFlare]) -> list[FittedFlare]:
+    """Add flares to an event as long as they improve the fit, even if each departs from its shape."""
+    frame_s = window.survey.stare.frame_s
+    inside = window.middle[window.inside]
+    if inside.size < 8:
+        return flares
+    widths = np.geomspace(max(frame_s, 0.1 * flares[0].half_width_s), max(2 * frame_s, 3 * flares[0].half_width_s), 8)
+    step = max(frame_s / 2, float(np.ptp(inside)) / 200)
+    p, w = (grid.ravel() for grid in np.meshgrid(np.arange(inside[0], inside[-1], step), widths, indexing="ij"))
+    every = window.model(shape, p, w)
+    while len(flares) < MAX_FLARES:
+        likelihood = Likelihood.of(window, flares, shape, FURTHER_EPSILON)
+        light = _light(window, shape, flares)
+        slope = every @ (likelihood.inverse @ (window.values - light))
+        information = np.maximum(np.einsum("ki,ki->k", every @ likelihood.inverse, every), 1e-300)
+        gain = np.where(slope > 0, slope**2 / information, 0.0)
+        k = int(np.argmax(gain))
+        if gain[k] < FURTHER_GAIN:
+            break
+        more = [*flares, _flare(shape, p[k], w[k], slope[k] / information[k])]
+        refined = _refined(likelihood, shape, more)
+        fall = float(likelihood.chi2(light) - likelihood.chi2(_light(window, shape, refined)))
+        if fall < FURTHER_GAIN:
+            break
+        flares = sorted(refined, key=lambda one: -one.equivalent_duration_s)
+    return flares
+
+
+def _light(window: Window, shape: Shape, flares: Sequence[FittedFlare]) -> Float:
+    peak, width, amplitude = (
+        np.array([getattr(f, name) for f in flares]) for name in ("peak_s", "half_width_s", "amplitude")
+    )
+    return np.asarray(amplitude @ window.model(shape, peak, width))
+
+
+def _parameters(flares: Sequence[FittedFlare]) -> Float:
+    return np.array([[np.log(f.amplitude), f.peak_s, np.log(f.half_width_s)] for f in flares]).ravel()
+
+
+def _refined(likelihood: Likelihood, shape: Shape, flares: Sequence[FittedFlare]) -> list[FittedFlare]:
+    """Return the flares that fit best, by least squares from a starting point."""
+    window = likelihood.window
+    # The inverse has rank n - 1; its root is that of its eigenvalues.
+    value, vector = np.linalg.eigh(likelihood.inverse)
+    root = np.sqrt(np.maximum(value, 0.0))[:, None] * vector.T
+    start = _parameters(flares)
+    scale = np.tile([0.3, 1.0, 0.3], len(flares))
+    scale[1::3] = [0.3 * f.half_width_s for f in flares]
+    span = window.edges[window.inside]
+    low, high = np.full(start.size, -np.inf), np.full(start.size, np.inf)
+    low[0::3], high[0::3] = start[0::3] - 8.0, start[0::3] + 8.0
+    reach = max(f.half_width_s for f in flares)
+    low[1::3], high[1::3] = span[0, 0] - 4 * reach, span[-1, 1]
+    low[2::3], high[2::3] = start[2::3] - 3.0, start[2::3] + 3.0
+
+    def made(x: Float) -> list[FittedFlare]:
+        return [_flare(shape, p, np.exp(w), np.exp(a)) for a, p, w in x.reshape(-1, 3)]
+
+    found = scipy.optimize.least_squares(
+        lambda x: root @ (window.values - _light(window, shape, made(x))), np.clip(start, low, high),
+        bounds=(low, high), x_scale=scale, max_nfev=60,
+    )  # fmt: skip
+    return made(found.x)
+
+
+def _posterior(
+    window: Window, shape: Shape, flares: list[FittedFlare], epsilon: float, box: Float
+) -> tuple[Mixture, list[FittedFlare]]:
+    """Return the distribution of the equivalent duration for a shape and a departure from it, and the best flares.
+
+    `box` is a range of peak and half-width of a single flare from which the grid begins.
+    """
+    if len(flares) > 1:
+        return _linearised(window, shape, flares, epsilon)
+    outer = _ranges(window)
+    for _ in range(ROUNDS if epsilon else 1):
+        likelihood = Likelihood.of(window, flares, shape, epsilon)
+        grid = Grid.of(likelihood, shape, box, outer)
+        new, box = [grid.best(shape)], grid.box
+        moved = abs(np.log(new[0].equivalent_duration_s / flares[0].equivalent_duration_s))
+        flares = new
+        if moved < 0.02:
+            break
+    toward = likelihood.inverse @ likelihood.departure
+    model = window.model(shape, grid.peaks_s, grid.half_widths_s)
+    per_amplitude = grid.half_widths_s * shape.equivalent_duration - model @ toward
+    mean = grid.amplitude * per_amplitude + float(toward @ window.values)
+    left = max(likelihood.variance - float(toward @ likelihood.departure), 0.0)
+    # Durations are relative to the level, which is lower where the flare is brighter.
+    along = per_amplitude + mean * (model @ likelihood.level)
+    sd = np.sqrt(along**2 / grid.information + left + mean**2 * likelihood.level_variance)
+    constant = likelihood.log_factor - 0.5 * float(window.values @ likelihood.inverse @ window.values)
+    return Mixture(grid.log + constant, mean, sd), flares
+
+
+def _linearised(
+    window: Window, shape: Shape, flares: list[FittedFlare], epsilon: float
+) -> tuple[Mixture, list[FittedFlare]]:
+    """Return the normal distribution of the equivalent duration of several flares from the linearised model."""
+    for _ in range(ROUNDS):
+        likelihood = Likelihood.of(window, flares, shape, epsilon)
+        flares = _refined(likelihood, shape, flares)
+    likelihood = Likelihood.of(window, flares, shape, epsilon)
+    start = _parameters(flares)
+    light = _light(window, shape, flares)
+    jacobian = np.empty((start.size, window.values.size))
+    for k in range(start.size):
+        step = 1e-4 * (flares[k // 3].half_width_s if k % 3 == 1 else 1.0)
+        ends = []
+        for sign in (-1, 1):
+            x = start.copy()
+            x[k] += sign * step
+            ends.append(_light(window, shape, [_flare(shape, p, np.exp(w), np.exp(a)) for a, p, w in x.reshape(-1, 3)]))
+        jacobian[k] = (ends[1] - ends[0]) / (2 * step)
+    information = jacobian @ likelihood.inverse @ jacobian.T
+    # Priors as wide as the parameters can be: a factor of e^2 in amplitude and half-width, two half-widths in peak.
+    wide = np.tile([2.0, 1.0, 2.0], len(flares))
+    wide[1::3] = [2 * f.half_width_s for f in flares]
+    covariance = np.linalg.inv(information + np.diag(wide**-2.0))
+    total = np.array([f.equivalent_duration_s for f in flares])
+    gradient = np.zeros(start.size)
+    gradient[0::3] = gradient[2::3] = total
+    toward = likelihood.inverse @ likelihood.departure
+    along = gradient - jacobian @ toward
+    mean = float(total.sum() + toward @ (window.values - light))
+    # Durations are relative to the level, which is lower where the flares are brighter.
+    along += mean * (jacobian @ likelihood.level)
+    left = max(likelihood.variance - float(toward @ likelihood.departure), 0.0)
+    variance = float(along @ covariance @ along) + left + mean**2 * likelihood.level_variance
+    log = likelihood.log_factor - 0.5 * float(likelihood.chi2(light)) + 0.5 * float(np.linalg.slogdet(covariance)[1])
+    return Mixture(np.array([log]), np.array([mean]), np.array([np.sqrt(variance)])), flares
+
+
+def _summed(survey: SeriesSurvey, taken: Bool, one: Detection) -> tuple[float, float]:
+    """Return the sum of the light above the level over the frames of an event, amplitude x s, and its error.
+
+    Missing frames are interpolated. The error includes that of the level given the quiescent frames.
+    """
+    rows = slice(one.first, one.last + 1)
+    quiet = ~taken
+    level = (
+        survey.flux_level(quiet) if quiet.sum() >= MIN_BASELINE else np.full(taken.size, survey.level / survey.scale)
+    )
+    flux, numbers = (survey.flux - level)[rows], survey.stare.numbers[rows]
+    every = np.arange(numbers[0], numbers[-1] + 1)
+    factor = survey.stare.frame_s * survey.scale / survey.level
+    total = float(np.interp(every, numbers, flux).sum()) * factor
+    # Each frame counts for itself and for the missing frames next to it.
+    counts = np.bincount(np.rint(np.interp(every, numbers, np.arange(numbers.size))).astype(np.int64),
+                         minlength=numbers.size)  # fmt: skip
+    process, time = survey.flux_process, survey.stare.start_s
+    noise = survey.flux_variance * process.excess**2
+    photon = survey.photon / survey.scale * np.maximum(flux, 0.0)
+    variance = float(counts**2 @ (noise[rows] + photon))
+    if quiet.sum() >= MIN_BASELINE:
+        # Variance of the sum of the level given quiescent frames: w^T K w less what they say of it.
+        near = np.zeros(taken.size)
+        near[rows] = counts
+        # Durations are relative to the level at the peak.
+        peak = int(np.clip(np.searchsorted(survey.stare.middle_s, one.peak_s), one.first, one.last))
+        near[peak] += total / factor / max(float(level[peak]), 1e-12)
+        variance += _level_variance(process, time, noise, quiet, near)
+    return total, float(np.sqrt(max(variance, 0.0))) * factor
+
+
+def _level_variance(process: Process, time: Float, noise: Float, quiet: Bool, weights: Float) -> float:
+    """Return the variance of a weighted sum of the level given quiescent frames."""
+    one = process.covariance(time[quiet], noise[quiet])
+    level = one.solve(np.ones(int(quiet.sum())))
+    constant = 1.0 / float(level.sum())
+    if not process.terms:
+        return float(weights.sum()) ** 2 * constant
+    # K w at all times, of the sum over the frames of the event, which is short.
+    inside = np.flatnonzero(weights)
+    shared = _times(process, time, time[inside], weights[inside])
+    towards = shared[quiet]
+    solved = one.solve(towards)
+    # The constant level is known to 1 / (1^T C^-1 1).
+    rest = float(weights.sum() - level @ towards)
+    return float(weights[inside] @ shared[inside] - towards @ solved) + rest**2 * constant
+
+
+def _times(process: Process, time: Float, other: Float, weights: Float) -> Float:
+    """Return the covariance of a process at times with its weighted sum at other times, in pieces."""
+    total = np.empty(time.size)
+    step = max(1, 2**22 // max(other.size, 1))
+    for k in range(0, time.size, step):
+        total[k : k + step] = process.at(time[k : k + step, None] - other) @ weights
+    return total
+
+
+def _is_step(window: Window, plain: Likelihood, chi2: float) -> bool:
+    """Return whether a step of the level fits an event better than its flares do."""
+    inside = window.middle[window.inside]
+    if inside.size < 3:
+        return False
+    starts = window.edges[(window.middle > inside[0] - np.ptp(inside)) & (window.middle < inside[-1]), 0]
+    if not starts.size:
+        return False
+    models = (window.middle >= starts[:, None]).astype(np.float64)
+    slope = models @ (plain.inverse @ window.values)
+    information = np.einsum("ki,ki->k", models @ plain.inverse, models)
+    fine = information > 1e-12
+    gain = np.where(fine & (slope > 0), slope**2 / np.where(fine, information, 1.0), 0.0)
+    whole = float(plain.chi2(np.zeros(window.values.size)))
+    return whole - float(gain.max()) < chi2 - STEP_GAIN

@@ -1,0 +1,173 @@
+"""Search of light curves: quiescent level, noise, and the frames that are searched."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.observations.detection import alternate
+from mauvecl.observations.frames import Frames, Reason
+from mauvecl.observations.level import (
+    FAR,
+    MOST_BELOW,
+    PER_MAD,
+    QuiescentLevel,
+    counts_per_unit,
+    guess_flares,
+    level_error,
+    quiet_variance,
+    single_frames,
+)
+from mauvecl.observations.search import SeriesSurvey
+from mauvecl.schema.errors import InputError
+
+if TYPE_CHECKING:
+    from mauvecl.lightcurve.flares.shapes import Shape
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+#: Smallest number of frames without a fault.
+MIN_USABLE = 10
+#: Largest number of times that single frames are left out and the rest is fitted again.
+ROUNDS = 3
+
+
+def survey_light_curve(frames: Frames, shape: Shape, seed: int) -> tuple[SeriesSurvey, QuiescentLevel, Frames]:
+    """Fit the quiescent light of a light curve, and prepare its search.
+
+    Returns
+    -------
+    survey : SeriesSurvey
+    level : QuiescentLevel
+    frames : Frames
+        With a remark, and without errors, if they hold few counts.
+    """
+    counts = counts_per_unit(frames)
+    if counts is not None:
+        remark = "the frames hold few counts: their noise is Poisson noise of the level, and stated errors are not used"
+        frames = replace(frames, error=None).with_remarks((remark,))
+    flux, error = frames.flux, frames.error
+    reasons = frames.faults.copy()
+    check_usable(frames, reasons)
+    used = reasons == 0
+    guessed = np.zeros(flux.size, np.bool_)
+    guessed[used] = guess_flares(frames.numbers[used], flux[used])
+    level = np.full(flux.size, _mean(flux[used & ~guessed]))
+    survey = None
+    for _ in range(ROUNDS):
+        used = reasons == 0
+        quiet = used & ~guessed
+        variance, photon = _noise(frames, flux, error, level, quiet, counts)
+        typical = float(np.median(level[quiet]))
+        new = SeriesSurvey.of(frames, flux, variance, used, typical, photon, shape, counts or 0.0)
+        survey, taken = alternate(new, guessed[used], survey)
+        level = level_of(frames, flux, used, survey, ~taken)
+        sd = np.sqrt(variance) * survey.flux_process.excess
+        guessed = np.zeros(flux.size, np.bool_)
+        guessed[used] = taken
+        flagged = _single(frames, flux, level, sd, used & ~guessed, counts)
+        if not (flagged & used).any():
+            break
+        reasons = np.where(used, reasons | flagged, reasons)
+    used = reasons == 0
+    survey = survey.frames(used[_used_before(survey, frames)])
+    return survey, quiescent_light(frames, flux, error, survey, used, used & ~guessed, reasons, seed), frames
+
+
+def _used_before(survey: SeriesSurvey, frames: Frames) -> NDArray[np.intp]:
+    """Return the frames of a survey among all frames."""
+    return np.searchsorted(frames.time_s, survey.time_s)
+
+
+def check_usable(frames: Frames, reasons: NDArray[np.int64]) -> None:
+    """Raise InputError if too few frames are without a fault, or if most of them have the same flux."""
+    usable = reasons == 0
+    if usable.sum() < MIN_USABLE:
+        raise InputError(
+            f"{frames.name} has {usable.sum()} frames without a fault",
+            f"at least {MIN_USABLE}",
+            key="frames",
+            value=int(usable.sum()),
+        )
+    flux = frames.white_light[0][usable]
+    if (np.diff(flux) == 0).mean() > 0.5 and counts_per_unit(frames) is None:
+        raise InputError(
+            f"{frames.name}: the flux of most frames is the same",
+            "a light curve with noise",
+            key="flux",
+            value=float(np.median(flux)),
+        )
+
+
+def _mean(flux: Float) -> float:
+    """Return the mean without outliers; a median of whole numbers would be one of them."""
+    middle = float(np.median(flux))
+    spread = PER_MAD * float(np.median(np.abs(flux - middle)))
+    near = np.abs(flux - middle) <= max(FAR * spread, 1e-12 * abs(middle))
+    return float(flux[near].mean())
+
+
+def _noise(
+    frames: Frames, flux: Float, error: Float | None, level: Float, quiet: Bool, counts: float | None
+) -> tuple[Float, float]:
+    """Return the variance of the noise of each frame at its level, and its rise with the flux."""
+    if counts is not None:
+        return np.maximum(level, 1e-3 * float(np.median(level[quiet])) + 1e-300) / counts, 1.0 / counts
+    if error is not None:
+        return quiet_variance(flux, error, level, quiet)
+    steps = np.diff(flux[quiet])[np.diff(frames.numbers[quiet]) == 1]
+    spread = PER_MAD * float(np.median(np.abs(steps))) / np.sqrt(2.0) if steps.size else 0.0
+    return np.full(flux.size, (spread if spread > 0 else float(np.std(flux[quiet]))) ** 2), 0.0
+
+
+def level_of(frames: Frames, flux: Float, used: Bool, survey: SeriesSurvey, quiet: Bool) -> Float:
+    """Return the quiescent level of all frames, shape (n_frame,); between searched frames it is interpolated.
+
+    Parameters
+    ----------
+    used : ndarray of bool, shape (n_frame,)
+        Frames of the survey.
+    quiet : ndarray of bool, shape (n_used,)
+    """
+    return np.interp(frames.time_s, frames.time_s[used], survey.flux_level(quiet) * survey.scale)
+
+
+def _single(
+    frames: Frames, flux: Float, level: Float, sd: Float, quiet: Bool, counts: float | None
+) -> NDArray[np.int64]:
+    """Return the reasons not to search single frames: far below the level, or alone far above it."""
+    sigmas = np.where(quiet, (flux - level) / sd, 0.0)
+    flagged = np.zeros(flux.size, np.int64)
+    below = sigmas < -FAR
+    if below.mean() <= MOST_BELOW:
+        flagged[below] = Reason.BELOW
+    if counts is None:
+        flagged[single_frames(frames.numbers, sigmas, quiet)] |= Reason.SPIKE
+    return flagged
+
+
+def quiescent_light(
+    frames: Frames, flux: Float, error: Float | None, survey: SeriesSurvey, used: Bool, quiet: Bool,
+    reasons: NDArray[np.int64], seed: int,
+) -> QuiescentLevel:  # fmt: skip
+    """Return level, its error, and noise of all frames."""
+    process, time = survey.flux_process, survey.stare.start_s
+    part = quiet[used]
+    level = level_of(frames, flux, used, survey, part)
+
+    def everywhere(values: Float) -> Float:
+        return np.interp(frames.time_s, frames.time_s[used], values * survey.scale)
+
+    return QuiescentLevel(
+        level,
+        everywhere(level_error(process, time, survey.flux_variance, part, seed)),
+        everywhere(np.sqrt(survey.flux_variance) * process.excess),
+        process.excess if error is not None else float("nan"),
+        quiet,
+        reasons,
+        process,
+    )

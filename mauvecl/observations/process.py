@@ -1,0 +1,383 @@
+"""Gaussian processes of the quiescent light: rotation, granulation and red noise.
+
+The light without flares is a constant plus a Gaussian process whose covariance is a sum of celerite terms, so that all
+computations take a time proportional to the number of frames (Foreman-Mackey et al. 2017, doi
+10.3847/1538-3881/aa9332; 2018, doi 10.3847/2515-5172/aaaf6c). Terms are added as long as they lower the Bayesian
+information criterion (Schwarz 1978, doi 10.1214/aos/1176344136).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.schema.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+Float = NDArray[np.float64]
+Kind = Literal["correlated", "smooth", "rotation"]
+
+#: Largest number of values to which the parameters of a process are fitted; longer light curves are binned.
+MAX_FITTED = 20_000
+#: Largest number of terms.
+MAX_TERMS = 3
+#: Smallest number of values for each parameter of a process.
+VALUES_PER_PARAMETER = 8
+#: False-alarm probability of the highest peak of the periodogram below which rotation is fitted.
+PERIODIC = 1e-3
+#: Smallest period in steps between values, and largest as a share of the length of the light curve.
+SHORTEST, LONGEST = 4.0, 1.0
+#: Range of standard deviations of a term, in standard deviations of the noise of a value.
+AMPLITUDES = (1e-2, 1e5)
+#: Range of time scales of correlated and smooth terms: in steps between values, and in lengths of the light curve.
+SCALES = (1.5, 3.0)
+#: Quality factor of a smooth term, as of granulation (Foreman-Mackey et al. 2017).
+SMOOTH_QUALITY = 2**-0.5
+#: Largest number of iterations of a fit, and the change of log likelihood at which it has converged.
+ITERATIONS, CONVERGED = 80, 1e-3
+#: Number of parameters of each kind of term.
+SIZES: dict[Kind, int] = {"correlated": 2, "smooth": 2, "rotation": 5}
+
+
+@dataclass(frozen=True)
+class ProcessTerm:
+    """Term of a process, with the logarithms of its parameters.
+
+    A correlated term has standard deviation and time scale, with covariances that fall exponentially; a smooth term has
+    standard deviation and period of a critically damped oscillator; rotation has standard deviation, period, and
+    quality factor, difference of quality factors and share of the first harmonic of celerite2's `RotationTerm`.
+    """
+
+    kind: Kind
+    parameters: tuple[float, ...]
+
+    @property
+    def sd(self) -> float:
+        """Standard deviation, in the unit of the light curve."""
+        return float(np.exp(self.parameters[0]))
+
+    @property
+    def scale_s(self) -> float:
+        """Time scale or period."""
+        return float(np.exp(self.parameters[1]))
+
+    @property
+    def shortest_s(self) -> float:
+        """Shortest time in which the term changes by much of its standard deviation."""
+        divisor = {"correlated": 1.0, "smooth": 2 * np.pi, "rotation": 4 * np.pi}[self.kind]
+        return self.scale_s / divisor
+
+    def kernel(self) -> Any:
+        """Return the term of celerite2."""
+        terms = _terms()
+        values = np.exp(self.parameters)
+        if self.kind == "correlated":
+            return terms.RealTerm(a=values[0] ** 2, c=1.0 / values[1])
+        if self.kind == "smooth":
+            return terms.SHOTerm(sigma=values[0], rho=values[1], Q=SMOOTH_QUALITY)
+        sigma, period, quality, difference, share = values
+        return terms.RotationTerm(sigma=sigma, period=period, Q0=quality, dQ=difference, f=share)
+
+
+def _terms() -> Any:
+    """Return celerite2's terms.
+
+    Raises InputError if celerite2 is not installed, which has no wheels for some machines.
+    """
+    try:
+        from celerite2 import terms
+    except ImportError as error:
+        raise InputError(
+            "celerite2 is not installed, which models the light of stars", "pip install celerite2", key="celerite2"
+        ) from error
+    return terms
+
+
+@dataclass(frozen=True)
+class Process:
+    """Gaussian process of the light without flares."""
+
+    terms: tuple[ProcessTerm, ...]
+    # Factor on the stated standard deviations of frames for which the process fits best.
+    excess: float
+    bic: tuple[tuple[str, float], ...] = ()  # BIC of each combination of terms that was tried, less the smallest
+
+    @property
+    def name(self) -> str:
+        """Name of the combination of terms."""
+        return " + ".join((*(term.kind for term in self.terms), "white"))
+
+    def kernel(self) -> Any:
+        """Return the sum of the terms as a term of celerite2; one of zero variance if there are none."""
+        kernels = [term.kernel() for term in self.terms] or [_terms().RealTerm(a=0.0, c=1.0)]
+        total = kernels[0]
+        for one in kernels[1:]:
+            total = total + one
+        return total
+
+    @property
+    def shortest_s(self) -> float:
+        """Shortest time scale of the terms; infinite without terms."""
+        return min((term.shortest_s for term in self.terms), default=np.inf)
+
+    @property
+    def sd(self) -> float:
+        """Standard deviation of the process, without the noise of frames."""
+        return float(np.sqrt(sum(term.sd**2 for term in self.terms)))
+
+    def describe(self, unit: float) -> str:
+        """Return a description of the terms; `unit` is the light of the star, to which standard deviations relate."""
+        words = {"correlated": "correlated noise", "smooth": "smooth variability", "rotation": "rotation"}
+        parts = [
+            f"{words[term.kind]} of {100 * term.sd / unit:.2g} % "
+            f"({'period' if term.kind == 'rotation' else 'time scale'} {_time(term.scale_s)})"
+            for term in self.terms
+        ]
+        return ", ".join(parts) if parts else "constant light"
+
+    def at(self, lags_s: Float) -> Float:
+        """Return the covariance at time lags, shape of `lags_s`."""
+        if not self.terms:
+            return np.zeros(np.shape(lags_s))
+        return np.asarray(self.kernel().get_value(np.abs(lags_s)))
+
+    def covariance(self, time_s: Float, variance: Float) -> Covariance:
+        """Return the covariance of values at ascending times, with the variance of each value's noise."""
+        return Covariance(self.kernel(), time_s, variance)
+
+
+def _time(seconds: float) -> str:
+    """Return a time in a unit that suits it."""
+    for unit, size in (("d", 86_400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= size:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds:.3g} s"
+
+
+class Covariance:
+    """Covariance of values of a process with independent noise, factorised as L D L^T.
+
+    Parameters
+    ----------
+    kernel
+        Term of celerite2.
+    time_s : ndarray, shape (n,)
+        Ascending.
+    variance : ndarray, shape (n,)
+        Variance of the noise of each value.
+    """
+
+    def __init__(self, kernel: Any, time_s: Float, variance: Float) -> None:
+        from celerite2 import driver
+
+        self._driver = driver
+        self._time = np.ascontiguousarray(time_s, np.float64)
+        self._rates, diagonal, self._u, v = kernel.get_celerite_matrices(
+            self._time, np.ascontiguousarray(variance, np.float64)
+        )
+        self._d, self._w = driver.factor(
+            self._time, self._rates, diagonal, self._u, v, np.array(diagonal), np.array(v, copy=True)
+        )
+        if not (self._d > 0).all():
+            raise np.linalg.LinAlgError("the covariance is not positive definite")
+
+    @property
+    def log_determinant(self) -> float:
+        """Logarithm of the determinant."""
+        return float(np.log(self._d).sum())
+
+    def _solved_lower(self, values: Float) -> Float:
+        out = np.array(values.reshape(len(values), -1), np.float64, order="C")
+        return np.asarray(self._driver.solve_lower(self._time, self._rates, self._u, self._w, out, out))
+
+    def solve(self, values: Float) -> Float:
+        """Return the inverse times values, shape (n,) or (n, k)."""
+        out = self._solved_lower(values) / self._d[:, None]
+        solved = self._driver.solve_upper(self._time, self._rates, self._u, self._w, out, out)
+        return np.asarray(solved).reshape(np.shape(values))
+
+    def whitened(self, values: Float) -> Float:
+        """Return the innovations of values, which are independent and of unit variance, shape (n,) or (n, k)."""
+        return (self._solved_lower(values) / np.sqrt(self._d)[:, None]).reshape(np.shape(values))
+
+    def coloured(self, white: Float) -> Float:
+        """Return values of this covariance from innovations, shape (n,) or (n, k)."""
+        out = np.array(white.reshape(len(white), -1), np.float64, order="C") * np.sqrt(self._d)[:, None]
+        product = np.array(out)
+        made = self._driver.matmul_lower(self._time, self._rates, self._u, self._w, out, product)
+        return np.asarray(made).reshape(np.shape(white))
+
+
+@dataclass(frozen=True, eq=False)
+class LevelFit:
+    """Mean and log likelihood of values under a covariance."""
+
+    mean: float  # generalised least squares
+    mean_variance: float
+    log_likelihood: float
+
+
+def level_fit(covariance: Covariance, values: Float) -> LevelFit:
+    """Return the mean of values, and their likelihood with the mean integrated over a flat prior."""
+    both = covariance.whitened(np.column_stack([values, np.ones(values.size)]))
+    information = float(both[:, 1] @ both[:, 1])
+    mean = float(both[:, 0] @ both[:, 1]) / information
+    left = both[:, 0] - mean * both[:, 1]
+    log_likelihood = -0.5 * (float(left @ left) + covariance.log_determinant + np.log(information))
+    return LevelFit(mean, 1.0 / information, log_likelihood)
+
+
+@dataclass(frozen=True, eq=False)
+class Binned:
+    """Light curve to which the parameters of a process are fitted."""
+
+    time_s: Float
+    values: Float
+    variance: Float  # stated variance of each value
+    step_s: float
+
+    @property
+    def span_s(self) -> float:
+        """Length of the light curve."""
+        return float(self.time_s[-1] - self.time_s[0]) + self.step_s
+
+    @cached_property
+    def noise(self) -> float:
+        """Robust standard deviation of a value, from differences of neighbours."""
+        steps = np.diff(self.values)[np.diff(self.time_s) < 1.5 * self.step_s]
+        steps = steps if steps.size else np.diff(self.values)
+        spread = 1.4826 * float(np.median(np.abs(steps))) / np.sqrt(2.0)
+        return spread if spread > 0 else float(np.std(self.values))
+
+    @classmethod
+    def of(cls, time_s: Float, values: Float, variance: Float, step_s: float, largest: int = MAX_FITTED) -> Binned:
+        """Average consecutive values so that at most `largest` remain; bins hold half of their frames at least."""
+        factor = -(-time_s.size // largest)
+        if factor == 1:
+            return cls(time_s, values, variance, step_s)
+        number = np.floor((time_s - time_s[0]) / (factor * step_s) + 0.5 / factor).astype(np.int64)
+        _, first, count = np.unique(number, return_index=True, return_counts=True)
+        full = count >= factor / 2
+
+        def total(each: Float) -> Float:
+            return np.asarray(np.add.reduceat(each, first)[full])
+
+        count = count[full]
+        return cls(total(time_s) / count, total(values) / count, total(variance) / count**2, factor * step_s)
+
+
+def fit_process(data: Binned, start: Process | None = None) -> Process:
+    """Fit a process to a light curve without flares.
+
+    Parameters
+    ----------
+    data : Binned
+    start : Process, optional
+        Process of nearly the same data: its terms are kept, and their parameters are the starting point.
+    """
+    noise = max(data.noise / float(np.sqrt(np.median(data.variance))), 1e-6)
+    if start is not None:
+        process = _fitted(data, start.terms, np.log(start.excess))[0]
+        return Process(process.terms, process.excess, start.bic)
+    best, value = _fitted(data, (), np.log(noise))
+    tried = {best.name: value}
+    while len(best.terms) < MAX_TERMS:
+        size = 1 + sum(SIZES[term.kind] for term in best.terms)
+        options = [
+            _fitted(data, (*best.terms, term), np.log(best.excess))
+            for term in _starts(data, best)
+            if (size + SIZES[term.kind]) * VALUES_PER_PARAMETER <= data.values.size
+        ]
+        tried |= {one.name: min(bic, tried.get(one.name, np.inf)) for one, bic in options}
+        other, lowest = min(options, key=lambda pair: pair[1], default=(best, np.inf))
+        if not lowest < value:
+            break
+        best, value = other, lowest
+    least = min(tried.values())
+    return Process(best.terms, best.excess, tuple((name, bic - least) for name, bic in tried.items()))
+
+
+def _starts(data: Binned, best: Process) -> Iterator[ProcessTerm]:
+    """Yield starting points of a further term."""
+    covariance = best.covariance(data.time_s, data.variance * best.excess**2)
+    fit = level_fit(covariance, data.values)
+    spread = max(float(np.std(data.values - fit.mean)), data.noise)
+    rotates = any(term.kind == "rotation" for term in best.terms)
+    low, high = SCALES[0] * data.step_s, SCALES[1] * data.span_s
+    for scale in (6 * data.step_s, float(np.sqrt(low * high))):
+        size = data.noise if rotates else spread
+        yield ProcessTerm("correlated", (np.log(size), np.log(np.clip(scale, low, high))))
+    if not rotates:
+        yield ProcessTerm("smooth", (np.log(spread), np.log(0.2 * data.span_s)))
+        if (period := _period(data)) is not None:
+            for factor in (1.0, 2.0):
+                parameters = (spread, factor * period, 10.0, 1.0, 0.3)
+                yield ProcessTerm("rotation", tuple(float(np.log(one)) for one in parameters))
+
+
+def _period(data: Binned) -> float | None:
+    """Return the period of the highest peak of the Lomb-Scargle periodogram in seconds, or None if it is noise."""
+    from astropy.timeseries import LombScargle
+
+    longest, shortest = LONGEST * data.span_s, SHORTEST * data.step_s
+    if data.values.size < 30 or longest <= shortest:
+        return None
+    periodogram = LombScargle(data.time_s, data.values - data.values.mean())
+    frequency, power = periodogram.autopower(
+        minimum_frequency=1 / longest, maximum_frequency=1 / shortest, samples_per_peak=5, method="fast"
+    )
+    if not power.size or not np.isfinite(power).all():
+        return None
+    best = int(np.argmax(power))
+    chance = float(periodogram.false_alarm_probability(power[best], maximum_frequency=1 / shortest))
+    return float(1.0 / frequency[best]) if chance < PERIODIC else None
+
+
+def _bounds(data: Binned, kind: Kind, start: tuple[float, ...]) -> list[tuple[float, float]]:
+    """Return the bounds of the logarithms of a term's parameters."""
+    sizes = tuple(np.log(data.noise) + np.log(AMPLITUDES))
+    if kind != "rotation":
+        return [sizes, (np.log(SCALES[0] * data.step_s), np.log(SCALES[1] * data.span_s))]
+    period = start[1]
+    around = (max(period - 0.4, np.log(SHORTEST * data.step_s)), period + 0.4)
+    return [sizes, around, (np.log(0.6), np.log(1e4)), (np.log(1e-2), np.log(1e3)), (np.log(1e-3), np.log(2.0))]
+
+
+def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> tuple[Process, float]:
+    """Return the process of some terms that fits best, and its BIC."""
+    from scipy.optimize import minimize
+
+    kinds = [term.kind for term in terms]
+    start = np.array([log_excess, *(value for term in terms for value in term.parameters)])
+    bounds = [(log_excess - 3.0, log_excess + 3.0)]
+    for term in terms:
+        bounds += _bounds(data, term.kind, term.parameters)
+    low, high = np.array(bounds).T
+
+    def made(x: Float) -> Process:
+        parts, first = [], 1
+        for kind in kinds:
+            parts.append(ProcessTerm(kind, tuple(float(v) for v in x[first : first + SIZES[kind]])))
+            first += SIZES[kind]
+        return Process(tuple(parts), float(np.exp(x[0])))
+
+    def cost(x: Float) -> float:
+        process = made(x)
+        try:
+            covariance = process.covariance(data.time_s, data.variance * process.excess**2)
+        except (np.linalg.LinAlgError, RuntimeError, ValueError):
+            return 1e25
+        value = -level_fit(covariance, data.values).log_likelihood
+        return value if np.isfinite(value) else 1e25
+
+    found = minimize(
+        cost, np.clip(start, low, high), method="L-BFGS-B", bounds=bounds,
+        options={"maxiter": ITERATIONS, "ftol": CONVERGED / max(abs(cost(np.clip(start, low, high))), 1.0)},
+    )  # fmt: skip
+    return made(found.x), 2 * float(found.fun) + start.size * float(np.log(data.values.size))

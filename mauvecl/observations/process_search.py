@@ -1,0 +1,250 @@
+"""Search for flares with a bank of matched filters under the covariance of the quiescent light.
+
+For a light curve y with covariance C, a constant level of unknown size and a template s, the statistic is that of
+generalised least squares,
+
+    rho = s^T C^-1 (y - level) / sqrt(s^T C^-1 s - (s^T C^-1 1)^2 / (1^T C^-1 1)),
+
+which is normal with unit variance without a flare, and the S/N of the template with one. Numerators of all onsets are
+correlations of the template with C^-1 (y - level), zero in missing frames, and exact over gaps. Denominators are exact
+near gaps, ends and large changes of the noise; elsewhere they follow from one solution, to first order in changes of
+the noise and exactly for single missing frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.lightcurve.search.bank import LEAST_SHARE, Bank, Template
+from mauvecl.lightcurve.search.search import LargestValue
+
+if TYPE_CHECKING:
+    from mauvecl.lightcurve.stares.stare import Stare
+    from mauvecl.observations.process import Covariance, Process
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+#: Flux of a template relative to its peak below which it is neglected.
+NEGLECTED = 1e-4
+#: Frames around a template from which its denominator is computed: a multiple of its length, and the smallest and
+#: largest number.
+MARGIN, LEAST_MARGIN, MOST_MARGIN = 4, 512, 4096
+#: Share of a denominator in frames next to gaps or with other noise from which it is solved exactly.
+IRREGULAR = 1e-3
+#: Relative change of the variance of a frame that is treated exactly.
+OTHER_NOISE = 0.5
+#: Largest number of frames and of templates in one solution.
+CHUNK_FRAMES, CHUNK_TEMPLATES = 4096, 512
+#: Approximate number of values in an array of a batch of light curves.
+BATCH = 2**21
+
+
+@dataclass(frozen=True, eq=False)
+class FilterRow:
+    """Templates of one half-width and phase at all onsets."""
+
+    template: Template
+    phase: int
+    shape: Float  # flux of the template above `NEGLECTED`, shape (n,)
+    first: int  # its first frame, relative to the frame of the peak
+    peaks: NDArray[np.int64]  # frame of the peak at each onset, from the first frame of the stare, including gaps
+    # Shape (n_direction, n_onset); mean of rho for a flare with unit peak along each direction, zero if not searched.
+    per_amplitude: Float
+
+
+class ProcessSearch:
+    """Search of light curves for flares.
+
+    Parameters
+    ----------
+    bank : Bank
+        Its baseline is not used: the level is that of the processes.
+    stare : Stare
+        Only the times of its frames are used.
+    processes : sequence of Process
+        One for each sum of a frame; the sums are independent of each other.
+    variance : ndarray, shape (n_frame,)
+        Variance of the noise of each frame's sums.
+    """
+
+    def __init__(self, bank: Bank, stare: Stare, processes: tuple[Process, ...], variance: Float) -> None:
+        self.bank, self.stare, self.processes, self.variance = bank, stare, processes, variance
+        self.at = stare.numbers - stare.numbers[0]
+        self.n_grid = int(self.at[-1]) + 1
+
+    @cached_property
+    def covariances(self) -> tuple[Covariance, ...]:
+        """Covariance of each sum."""
+        return tuple(
+            process.covariance(self.stare.start_s, self.variance * process.excess**2) for process in self.processes
+        )
+
+    @cached_property
+    def _levels(self) -> tuple[Float, ...]:
+        """C^-1 1 of each sum, shape (n_frame,)."""
+        return tuple(one.solve(np.ones(self.stare.n_frames)) for one in self.covariances)
+
+    @cached_property
+    def rows(self) -> list[FilterRow]:
+        """Templates with everything that does not depend on data."""
+        return [self._row(template, phase) for template in self.bank.templates for phase in range(len(template.phases))]
+
+    @property
+    def n_filters(self) -> int:
+        """Number of searched templates: half-widths, phases, onsets and directions."""
+        return int(sum(np.count_nonzero(row.per_amplitude) for row in self.rows))
+
+    def scores(self, sums: NDArray[Any]) -> Float:
+        """Return C^-1 (sums - level) on the grid of frames with gaps, shape (n_stare, n_sum, n_grid).
+
+        Parameters
+        ----------
+        sums : ndarray, shape (n_stare, n_frame, n_sum)
+        """
+        scores = np.zeros((len(sums), sums.shape[2], self.n_grid))
+        for k, (covariance, level) in enumerate(zip(self.covariances, self._levels, strict=True)):
+            values = np.asarray(sums[:, :, k], np.float64)
+            mean = (values @ level) / level.sum()
+            scores[:, k, self.at] = covariance.solve(values.T).T - mean[:, None] * level
+        return scores
+
+    def values(self, sums: NDArray[Any]) -> Iterator[tuple[FilterRow, Float]]:
+        """Yield each row with rho, shape (n_stare, n_direction, n_onset); minus infinity if not searched."""
+        scores = self.scores(sums)
+        for row in self.rows:
+            tried = row.per_amplitude > 0
+            correlated = _correlated(scores, row.shape, row.first)[..., row.peaks]
+            rho = np.einsum("dk,sko->sdo", self.bank.directions, correlated)
+            yield row, np.where(tried, rho / np.where(tried, row.per_amplitude, 1.0), -np.inf)
+
+    def largest(self, sums: NDArray[Any]) -> LargestValue:
+        """Return the largest value of each light curve and its template.
+
+        Parameters
+        ----------
+        sums : ndarray, shape (n_stare, n_frame, n_sum)
+        """
+        size = max(1, BATCH // (self.n_grid * sums.shape[2]))
+        parts = [self._largest(sums[k : k + size]) for k in range(0, len(sums), size)]
+        return LargestValue(
+            *(np.concatenate([getattr(p, name) for p in parts]) for name in LargestValue.__annotations__)
+        )
+
+    def _largest(self, sums: NDArray[Any]) -> LargestValue:
+        n = len(sums)
+        best, every = np.full(n, -np.inf), np.arange(n)
+        peak, width, amplitude = np.zeros((3, n))
+        temperature = np.zeros(n, np.int64)
+        for row, rho in self.values(sums):
+            flat = rho.reshape(n, -1)
+            which = flat.argmax(axis=1)
+            value = flat[every, which]
+            better = value > best
+            direction, onset = np.divmod(which[better], rho.shape[2])
+            best[better], width[better], temperature[better] = value[better], row.template.half_width_s, direction
+            peak[better] = self.peak_s(row, onset)
+            amplitude[better] = value[better] / row.per_amplitude[direction, onset]
+        return LargestValue(best, peak, width, temperature, amplitude)
+
+    def peak_s(self, row: FilterRow, onset: NDArray[np.int64]) -> Float:
+        """Return the times of the peaks of templates, from the start of the stare's numbering."""
+        frames = self.stare.numbers[0] + row.peaks[onset] + row.template.phases[row.phase]
+        return np.asarray(frames * self.bank.frame_s)
+
+    def _row(self, template: Template, phase: int) -> FilterRow:
+        whole = template.shapes[phase]
+        bright = np.flatnonzero(whole > NEGLECTED * whole.max())
+        shape = whole[bright[0] : bright[-1] + 1]
+        first = template.first + int(bright[0])
+        peaks = np.arange(-int(self.stare.numbers[0]) % template.stride, self.n_grid, template.stride)
+        norms, full = np.zeros((2, len(self.processes), peaks.size))
+        for k in range(len(self.processes)):
+            norms[k], full[k] = self._norms(k, shape, first, peaks)
+        weights = self.bank.directions**2
+        norm, known = weights @ norms, weights @ full
+        tried = norm >= LEAST_SHARE * known
+        return FilterRow(template, phase, shape, first, peaks, np.sqrt(np.where(tried, norm, 0.0)))
+
+    def _norms(self, k: int, shape: Float, first: int, peaks: NDArray[np.int64]) -> tuple[Float, Float]:
+        """Return the squared denominators of rho at peaks, and those without gaps, shape (n_onset,)."""
+        variance = self.variance * self.processes[k].excess ** 2
+        process, level = self.processes[k], self._levels[k]
+        held = np.zeros(self.n_grid)
+        held[self.at] = level
+        shared = _correlated(held, shape, first)[peaks]
+        if not process.terms:
+            held[self.at] = 1.0 / variance
+            norm = _correlated(held, shape**2, first)[peaks]
+            full = np.full(peaks.size, float((shape**2).sum() / np.median(variance)))
+        else:
+            norm, unit = self._process_norms(process, variance, shape, first, peaks)
+            full = np.full(peaks.size, unit)
+        return np.maximum(norm - shared**2 / level.sum(), 0.0), full
+
+    def _process_norms(
+        self, process: Process, variance: Float, shape: Float, first: int, peaks: NDArray[np.int64]
+    ) -> tuple[Float, float]:
+        """Return s^T C^-1 s at peaks, shape (n_onset,), and that without gaps and with constant noise."""
+        margin = int(np.clip(MARGIN * shape.size, LEAST_MARGIN, MOST_MARGIN))
+        typical, frame_s = float(np.median(variance)), self.bank.frame_s
+        size = shape.size + 2 * margin
+        whole = process.covariance(np.arange(size) * frame_s, np.full(size, typical))
+        both = np.zeros((size, 2))
+        both[margin : margin + shape.size, 0] = shape
+        both[size // 2, 1] = 1.0
+        solved = whole.solve(both)
+        response, unit = solved[:, 0], float(solved[margin : margin + shape.size, 0] @ shape)
+        centre = float(solved[size // 2, 1])
+        squares = response**2
+        # Frames at which the solution differs: gaps and ends, other noise; single missing frames are exact.
+        present = np.zeros(self.n_grid + 2, np.bool_)
+        present[1 + self.at] = True
+        single = ~present[1:-1] & present[:-2] & present[2:]
+        bad = ~present[1:-1] & ~single
+        change = variance / typical - 1.0
+        bad[self.at[np.abs(change) > OTHER_NOISE]] = True
+        moved = np.zeros(self.n_grid)
+        moved[self.at] = np.where(np.abs(change) > OTHER_NOISE, 0.0, change * typical)
+        at, start = peaks, first - margin
+        share = _correlated(np.pad(bad, size, constant_values=True).astype(np.float64), squares, start)
+        irregular = share[size + at] > IRREGULAR * float(squares.sum())
+        missing = _correlated(single.astype(np.float64), squares, start)[at] / centre
+        norm = np.maximum(unit - missing, 0.0)
+        norm = norm / np.maximum(1.0 + _correlated(moved, squares, start)[at] / unit, 0.1)
+        chosen = np.flatnonzero(irregular)
+        while chosen.size:
+            near = (peaks[chosen] - peaks[chosen[0]] <= CHUNK_FRAMES) & (np.arange(chosen.size) < CHUNK_TEMPLATES)
+            part, chosen = chosen[near], chosen[~near]
+            norm[part] = self._exact(process, variance, shape, peaks[part] + first, margin)
+        return norm, unit
+
+    def _exact(self, process: Process, variance: Float, shape: Float, starts: NDArray[np.int64], margin: int) -> Float:
+        """Return s^T C^-1 s of a shape that starts at some frames of the grid, shape (n_start,)."""
+        low, high = np.searchsorted(self.at, [starts[0] - margin, starts[-1] + shape.size + margin])
+        if high <= low:
+            return np.zeros(starts.size)
+        place = self.at[low:high, None] - starts
+        inside = (place >= 0) & (place < shape.size)
+        columns = np.where(inside, shape[np.clip(place, 0, shape.size - 1)], 0.0)
+        covariance = process.covariance(self.stare.start_s[low:high], variance[low:high])
+        return np.asarray(np.einsum("to,to->o", columns, covariance.solve(columns)))
+
+
+def _correlated(values: Float, kernel: Float, first: int) -> Float:
+    """Return sum_k values[o + first + k] kernel[k] for every frame o of the last axis; values outside are zero."""
+    from scipy.signal import oaconvolve
+
+    n = values.shape[-1]
+    last = first + kernel.size - 1
+    before, after = max(0, -first), max(0, last)
+    padded = np.pad(values, [(0, 0)] * (values.ndim - 1) + [(before, after)])
+    reverse = kernel[::-1].reshape((1,) * (values.ndim - 1) + (-1,))
+    found = oaconvolve(padded, reverse, mode="valid", axes=-1)
+    return np.asarray(found[..., max(0, first) : max(0, first) + n])
