@@ -44,6 +44,11 @@ class ObservedEvent:
     energy: Energy
 
     @property
+    def equivalent_duration_s(self) -> float:
+        """Recommended equivalent duration."""
+        return self.energy.fitted_s
+
+    @property
     def is_limit(self) -> bool:
         """True if the sum of the light in the frames is a lower limit: a gap or an end cuts the flare."""
         return self.cut and self.energy.summed_s < (1 - UNSEEN) * self.energy.fitted_s

@@ -23,6 +23,8 @@ PER_MAD = 1.0 / float(scipy.special.ndtri(0.75))
 FAR = 5.0
 #: Largest distance of the neighbours of a single bright frame.
 NEAR = 3.0
+#: Number of frames whose median is the level around a single bright frame.
+AROUND = 9
 #: Rise within a few frames, in robust standard deviations of such rises, from which a first guess of the flares begins,
 #: and the numbers of frames.
 JUMP, JUMP_FRAMES = 8.0, (1, 2, 3)
@@ -208,3 +210,24 @@ def single_frames(numbers: NDArray[np.int64], sigmas: Float, fine: Bool) -> Bool
     low = (np.abs(sigmas[before]) < NEAR) & (np.abs(sigmas[after]) < NEAR)
     single[here] = adjacent & low & (sigmas[here] > FAR)
     return single
+
+
+def spikes(numbers: NDArray[np.int64], flux: Float, error: Float | None, fine: Bool) -> Bool:
+    """Return single frames far above the frames around them, of a star whose level is not known yet, shape (n_frame,).
+
+    Parameters
+    ----------
+    error : ndarray, shape (n_frame,), or None
+        Stated errors.
+    fine : ndarray of bool, shape (n_frame,)
+        Frames without another fault.
+    """
+    found = np.zeros(flux.size, np.bool_)
+    at = np.flatnonzero(fine)
+    around = scipy.ndimage.median_filter(flux[at], size=AROUND, mode="nearest")
+    steps = np.diff(flux[at])[np.diff(numbers[at]) == 1]
+    scatter = PER_MAD * float(np.median(np.abs(steps))) / np.sqrt(2.0) if steps.size else 0.0
+    sd = np.full(at.size, scatter) if error is None else np.maximum(error[at], scatter)
+    sigmas = np.divide(flux[at] - around, sd, out=np.zeros(at.size), where=sd > 0)
+    found[at] = single_frames(numbers[at], sigmas, np.ones(at.size, np.bool_))
+    return found

@@ -20,6 +20,7 @@ from mauvecl.observations.level import (
     level_error,
     quiet_variance,
     single_frames,
+    spikes,
 )
 from mauvecl.observations.search import SeriesSurvey
 from mauvecl.schema.errors import InputError
@@ -50,9 +51,11 @@ def survey_light_curve(frames: Frames, shape: Shape, seed: int) -> tuple[SeriesS
     if counts is not None:
         remark = "the frames hold few counts: their noise is Poisson noise of the level, and stated errors are not used"
         frames = replace(frames, error=None).with_remarks((remark,))
-    flux, error = frames.flux, frames.error
+    flux, error = frames.white_light
     reasons = frames.faults.copy()
     check_usable(frames, reasons)
+    if counts is None:
+        reasons[spikes(frames.numbers, flux, error, reasons == 0)] |= Reason.SPIKE
     used = reasons == 0
     guessed = np.zeros(flux.size, np.bool_)
     guessed[used] = guess_flares(frames.numbers[used], flux[used])
@@ -69,10 +72,13 @@ def survey_light_curve(frames: Frames, shape: Shape, seed: int) -> tuple[SeriesS
         sd = np.sqrt(variance) * survey.flux_process.excess
         guessed = np.zeros(flux.size, np.bool_)
         guessed[used] = taken
-        flagged = _single(frames, flux, level, sd, used & ~guessed, counts)
+        flagged = _single(frames, flux, level, sd, used, guessed, counts)
         if not (flagged & used).any():
             break
         reasons = np.where(used, reasons | flagged, reasons)
+    finite = np.isfinite(flux)
+    below = finite & (reasons != 0) & (np.where(finite, flux, 0.0) - level < -FAR * sd)
+    reasons = np.where(below, reasons | Reason.BELOW, reasons)
     used = reasons == 0
     survey = survey.frames(used[_used_before(survey, frames)])
     return survey, quiescent_light(frames, flux, error, survey, used, used & ~guessed, reasons, seed), frames
@@ -137,16 +143,16 @@ def level_of(frames: Frames, flux: Float, used: Bool, survey: SeriesSurvey, quie
 
 
 def _single(
-    frames: Frames, flux: Float, level: Float, sd: Float, quiet: Bool, counts: float | None
+    frames: Frames, flux: Float, level: Float, sd: Float, used: Bool, events: Bool, counts: float | None
 ) -> NDArray[np.int64]:
     """Return the reasons not to search single frames: far below the level, or alone far above it."""
-    sigmas = np.where(quiet, (flux - level) / sd, 0.0)
+    sigmas = np.where(used, (flux - level) / sd, 0.0)
     flagged = np.zeros(flux.size, np.int64)
-    below = sigmas < -FAR
+    below = (sigmas < -FAR) & ~events
     if below.mean() <= MOST_BELOW:
         flagged[below] = Reason.BELOW
     if counts is None:
-        flagged[single_frames(frames.numbers, sigmas, quiet)] |= Reason.SPIKE
+        flagged[single_frames(frames.numbers, sigmas, used)] |= Reason.SPIKE
     return flagged
 
 

@@ -259,7 +259,7 @@ def survey_spectra(
         now[used] = taken
         sigmas = np.zeros(flux.size)
         sigmas[used] = survey.along(len(survey.bank.directions) // 2, ~taken)
-        single = single_frames(frames.numbers, sigmas, used & ~now)
+        single = single_frames(frames.numbers, sigmas, used)
         settled = not single.any() and float((now ^ events).mean()) <= SETTLED_EVENTS
         events = now
         if settled:

@@ -74,7 +74,7 @@ class NeighbourFlare:
     @property
     def equivalent_duration_s(self) -> float:
         """Equivalent duration of the flare."""
-        return self.event.energy.fitted_s / self.event.amplitude * self.amplitude
+        return self.event.equivalent_duration_s / self.event.amplitude * self.amplitude
 
 
 #: Columns of the table.
