@@ -542,6 +542,7 @@ def record_of(trial: Trial, answer: Answer) -> dict[str, Any]:
         "n_frames": int(trial.time_s.size), "cadence": trial.exposure_s, "threshold": answer.threshold,
         "message": answer.message if answer.code else "", "snr": max((one.snr for one in trial.flares), default=np.nan),
         "flares": [asdict(one) for one in trial.flares], "events": [], "further": 0, "candidates": 0, "missed": 0,
+        "expected": np.nan if trial.expected is None else trial.expected,
     }  # fmt: skip
     if answer.code:
         return record
@@ -606,37 +607,60 @@ def run(work: tuple[Trial, list[str], bool, int]) -> dict[str, Any]:
 # ---- sums ---------------------------------------------------------------------------------------------------------
 
 
+#: Columns of the table of results, and what they say.
+RESULTS = {
+    "part": "", "kind": "", "quantity": "",
+    "value": "number, share, or median",
+    "low": "lower end: 95 % of Poisson counts, smallest value, 16 % of ratios, or one error",
+    "high": "upper end, likewise",
+    "holds_68": "share of 68 % intervals that hold the truth",
+    "holds_95": "share of 95 % intervals",
+    "pull_sd": "standard deviation of (value - truth) / (half of the 68 % interval)",
+    "of": "number of trials or events",
+}  # fmt: skip
+#: Bins of S/N for completeness where flares are faint.
+SNR_BINS = ((4, 5), (5, 6), (6, 8), (8, 15))
+
+
 def rows_of(part: str, kind: str, records: list[dict[str, Any]], promise_per_d: float) -> Iterator[tuple[Any, ...]]:
-    """Yield what the trials of a kind amount to: quantity, value, ends of a range, and the number behind them."""
-    n, done = len(records), [one for one in records if one["code"] == 0]
+    """Yield what the trials of a kind amount to, in the columns of `RESULTS`."""
+    done = [one for one in records if one["code"] == 0]
 
-    def row(quantity: str, value: float, low: float = np.nan, high: float = np.nan, of: int = n) -> tuple[Any, ...]:
-        return part, kind, quantity, float(value), float(low), float(high), of
+    def row(quantity: str, value: float, of: int, *more: float) -> tuple[Any, ...]:
+        return part, kind, quantity, float(value), *(float(one) for one in (*more, *[np.nan] * 5)[:5]), of
 
-    def spread(quantity: str, values: list[float]) -> Iterator[tuple[Any, ...]]:
-        finite = np.array(values)[np.isfinite(values)]
-        if finite.size:
-            yield row(quantity, np.median(finite), finite.min(), finite.max(), finite.size)
+    def spread(quantity: str, name: str) -> Iterator[tuple[Any, ...]]:
+        values = np.array([one[name] for one in done], float)
+        values = values[np.isfinite(values)]
+        if values.size:
+            yield row(quantity, np.median(values), values.size, values.min(), values.max())
 
-    yield row("refused", sum(one["code"] == 2 for one in records))
-    yield row("faults", sum(one["code"] not in (0, 2) for one in records))
-    yield from spread("seconds", [one["seconds"] for one in records])
-    yield from spread("share searched", [one["searched"] for one in done])
-    yield from spread("noise / truth", [one["noise"] for one in done])
-    yield from spread("level / truth", [one["level"] for one in done])
-    yield row("without a verdict", sum(one["no_verdict"] for one in done), of=len(done))
+    def complete(quantity: str, some: list[dict[str, Any]]) -> Iterator[tuple[Any, ...]]:
+        if some:
+            share = np.mean([any(e["verdict"] == "detected" and e["flares"] for e in one["events"]) for one in some])
+            error = np.sqrt(max(share * (1 - share), 0.25 / len(some)) / len(some))
+            yield row(quantity, share, len(some), share - error, share + error)
+
+    yield row("refused", sum(one["code"] == 2 for one in records), len(records))
+    yield row("faults", sum(one["code"] not in (0, 2) for one in records), len(records))
+    if not done:
+        return
+    yield from spread("seconds", "seconds")
+    yield from spread("share searched", "searched")
+    yield from spread("noise / truth", "noise")
+    yield from spread("level / truth", "level")
+    yield row("without a verdict", sum(one["no_verdict"] for one in done), len(done))
     promised = promise_per_d * sum(one["days"] for one in done)
-    yield row("promised false detections", promised, *poisson.ppf([0.025, 0.975], promised), of=len(done))
-    yield row("false detections", sum(one["further"] for one in done), of=len(done))
-    yield row("further candidates", sum(one["candidates"] for one in done), of=len(done))
-    flaring = [one for one in done if one["flares"]]
-    for name, bright in (("", True), (" (faint)", False)):
+    name = "detections" if part == "files" else "false detections"
+    yield row(f"promised {name}", promised, len(done), *poisson.ppf([0.025, 0.975], promised))
+    yield row(name, sum(one["further"] for one in done), len(done), *[done[0]["expected"]] * 2)
+    yield row("further candidates", sum(one["candidates"] for one in done), len(done))
+    flaring = [one for one in records if one["flares"]]
+    yield from complete("completeness", flaring)
+    for low, high in SNR_BINS if part == "rotating-flares" else ():
+        yield from complete(f"completeness, S/N {low}-{high}", [one for one in flaring if low <= one["snr"] < high])
+    for faint, bright in (("", True), (", faint", False)):
         some = [one for one in flaring if (one["snr"] >= BRIGHT * one["threshold"]) is bright]
-        if not some:
-            continue
-        found = [any(e["verdict"] == "detected" and e["flares"] for e in one["events"]) for one in some]
-        share, error = np.mean(found), np.sqrt(max(np.mean(found) * (1 - np.mean(found)), 0.25 / len(some)) / len(some))
-        yield row(f"completeness{name}", share, share - error, share + error, len(some))
         main = [event for one in some for event in one["events"] if event["flares"] and event["verdict"] == "detected"]
         for estimate in ESTIMATES:
             for truth in ("total", "inside", "event"):
@@ -644,18 +668,26 @@ def rows_of(part: str, kind: str, records: list[dict[str, Any]], promise_per_d: 
                 table = table[np.isfinite(table[:, 0])]
                 if not len(table):
                     continue
-                value, low, high, low_95, high_95, true = table.T
-                low_ratio, ratio, high_ratio = np.percentile(value / true, [16, 50, 84])
-                label = f"{estimate} / {truth}{name}"
-                yield row(label, ratio, low_ratio, high_ratio, len(table))
-                for level, ends in (("68 %", (low, high)), ("95 %", (low_95, high_95))):
-                    given = np.isfinite(ends).all(axis=0)
-                    if given.any():
-                        inside = ((ends[0] <= true) & (true <= ends[1]))[given]
-                        yield row(f"{label}: {level} interval holds", inside.mean(), of=int(given.sum()))
-                pulls = (value - true) / ((high - low) / 2)
-                if np.isfinite(pulls).sum() > 2:
-                    yield row(f"{label}: sd of pulls", np.nanstd(pulls), of=int(np.isfinite(pulls).sum()))
+                value, low_68, high_68, low_95, high_95, true = table.T
+                holds = [
+                    np.mean(((low <= true) & (true <= high))[np.isfinite(low + high)])
+                    if np.isfinite(low + high).any() else np.nan
+                    for low, high in ((low_68, high_68), (low_95, high_95))
+                ]  # fmt: skip
+                pulls = (value - true) / ((high_68 - low_68) / 2)
+                pull_sd = np.nanstd(pulls) if np.isfinite(pulls).sum() > 2 else np.nan
+                low, ratio, high = np.percentile(value / true, [16, 50, 84])
+                yield row(f"{estimate} / {truth}{faint}", ratio, len(table), low, high, *holds, pull_sd)
+
+
+def table_of(rows: list[tuple[Any, ...]]) -> Table:
+    """Build the table of results."""
+    table = Table(rows=rows, names=list(RESULTS))
+    for name, text in RESULTS.items():
+        table[name].description = text or None
+        if table[name].dtype.kind == "f":
+            table[name].format = ".4g"
+    return table
 
 
 def trials() -> Iterator[Trial]:
@@ -701,23 +733,16 @@ def main() -> None:
                   *(f"{each['verdict']} {each['snr']:.1f}" for each in one["events"]), one["message"][-200:],
                   flush=True)  # fmt: skip
     promise = float(OPTIONS.false_alarms) / {"day": 1.0, "month": 365.25 / 12, "year": 365.25}[OPTIONS.alarms_per]
-    names = ("part", "kind", "quantity", "value", "low", "high", "of")
     rows = [row for (part, kind), some in records.items() for row in rows_of(part, kind, some, promise)]
+    for part in () if OPTIONS.kind else [one for one in PARTS if one not in ("issue", "files")]:
+        whole = [one for (of, _), some in records.items() for one in some if of == part]
+        rows += rows_of(part, "all", whole, promise) if whole else []
     new = {row[:2] for row in rows}
     old = Table.read(OPTIONS.output) if OPTIONS.output.exists() else []
-    kept = [tuple(row) for row in old if (row["part"], row["kind"]) not in new]
-    table = Table(rows=kept + rows, names=names)
-    for name, text in (("low", "lower end: 95 % of Poisson counts, smallest value, 16 % of ratios, or one error"),
-                       ("high", "upper end, likewise"), ("of", "number of trials or events")):  # fmt: skip
-        table[name].description = text
-    for name in ("value", "low", "high"):
-        table[name].format = ".4g"
+    table = table_of([tuple(row) for row in old if (row["part"], row["kind"]) not in new] + rows)
     table.meta = {"date_utc": datetime.now(UTC).date().isoformat(), "false_alarms_per_day": promise}
     table.write(OPTIONS.output, format="ascii.ecsv", overwrite=True)
-    fresh = Table(rows=rows, names=names)
-    for name in ("value", "low", "high"):
-        fresh[name].format = ".4g"
-    fresh.pprint_all()
+    table_of(rows).pprint_all()
 
 
 # Processes that `spawn` starts import this file too, but have no options of their own.
