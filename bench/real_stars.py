@@ -417,14 +417,14 @@ def issue(number: int, seed: int) -> Iterator[Trial]:
 def files(number: int, seed: int) -> Iterator[Trial]:
     """List the files that `--files` and `--cases` name, with the number of flares where it is known."""
     known = {"fast-2min": 0, "slow-30min": 0, "lc": 3}
-    for folder in ("rotating-star", "analyse-fault", "flags-on-flares") if OPTIONS.cases else ():
-        for path in sorted((OPTIONS.cases / folder).glob("*.fits")):
-            toml = path.with_suffix(".toml")
-            mapping = toml if toml.exists() else None
-            yield Trial("files", f"{folder}/{path.stem}", 0, path=path, mapping=mapping, expected=known.get(path.stem))
-    for place in OPTIONS.files:
-        for path in sorted(place.rglob("*lc*.fits")) if place.is_dir() else [place]:
-            yield Trial("files", path.name, 0, path=path)
+    folders = ("rotating-star", "analyse-fault", "flags-on-flares") if OPTIONS.cases else ()
+    cases = [path for folder in folders for path in sorted((OPTIONS.cases / folder).glob("*.fits"))]
+    places = [sorted(place.rglob("*lc*.fits")) if place.is_dir() else [place] for place in OPTIONS.files]
+    for path in (*cases, *(path for paths in places for path in paths)):
+        mapping, name = path.with_suffix(".toml"), f"{path.parent.name}/{path.name}"
+        flares = known.get(path.stem) if path in cases else None
+        mapped = mapping if mapping.exists() else None
+        yield Trial("files", name, 0, path=path, mapping=mapped, expected=flares)
 
 
 PARTS: dict[str, Callable[[int, int], Iterator[Trial]]] = {
@@ -710,7 +710,9 @@ def options(given: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--false-alarms", default="1")
     parser.add_argument("--alarms-per", default="month", choices=("day", "month", "year"))
     parser.add_argument("--limit", type=int, default=600, help="seconds after which a trial counts as a fault")
-    parser.add_argument("--files", type=Path, nargs="+", default=[], help="light curves, or folders of *lc*.fits")
+    parser.add_argument(
+        "--files", type=Path, nargs="+", default=[], help="light curves or folders of *lc*.fits, with NAME.toml"
+    )
     parser.add_argument("--cases", type=Path, help="folder with rotating-star, analyse-fault and flags-on-flares")
     parser.add_argument("--records", type=Path, help="JSON lines, one for each trial")
     parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results" / "real_stars.ecsv")
