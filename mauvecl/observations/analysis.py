@@ -16,7 +16,7 @@ from mauvecl.observations.completeness import Completeness, inject
 from mauvecl.observations.detection import detect_events
 from mauvecl.observations.event_spectrum import EventSpectrum, event_spectrum, measure_flare
 from mauvecl.observations.events import ObservedEvent, measure_events
-from mauvecl.observations.false_alarms import SimulatedRate, innovations, simulated_rates
+from mauvecl.observations.false_alarms import CHANCE_DIP, SimulatedRate, innovations, largest_dip, simulated_rates
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames
 from mauvecl.observations.level import QuiescentLevel
@@ -58,6 +58,7 @@ class Analysis:
     measured: SimulatedRate  # the same with residuals resampled from quiescent frames
     threshold: float  # threshold for the wanted rate: the higher of the thresholds of both
     candidates: float  # threshold for candidates
+    dip: float  # statistic of the largest dip if it is too large for the noise, else NaN
     events: list[ObservedEvent]  # events above the threshold of candidates, in order of time
     completeness: Completeness  # share of flares that the search detects in these frames
     scatter: list[Scatter]
@@ -121,6 +122,11 @@ class Analysis:
                 f"Residuals of the quiescent light are correlated ({self.likeness.correlation:.2f} at a lag of "
                 f"{self.likeness.lag} frames), which the fitted process does not describe: there are no verdicts."
             )
+        if np.isfinite(self.dip):
+            lines.append(
+                f"The light falls suddenly, as by losses of light, with an S/N of {self.dip:.3g}: rises of that size may "
+                "be returns from a loss, and only larger ones are called detected."
+            )
         if self.wanted < self.measured.smallest:
             lines.append(
                 f"Simulated light curves show rates down to {self.measured.smallest:.2g} false alarms per star-day; the "
@@ -174,6 +180,12 @@ def analyse_frames(
     frequent = max(wanted, CANDIDATES)
     modelled, measured = simulated_rates(survey, level.quiet[level.used], wanted, seed)
     threshold, candidates = (max(one.threshold(rate) for one in (modelled, measured)) for rate in (wanted, frequent))
+    dip = largest_dip(survey, level.quiet[level.used])
+    days = survey.stare.observed_s / DAY_S
+    if -np.expm1(-max(one.rate(dip) for one in (modelled, measured)) * days) < CHANCE_DIP:
+        threshold = max(threshold, dip)
+    else:
+        dip = float("nan")
     detected, taken = detect_events(survey, candidates)
     seen = None if series is None else [event_spectrum(survey, series, taken, one) for one in detected]
     causes = None if seen is None else [one.cause for one in seen]
@@ -190,7 +202,7 @@ def analyse_frames(
     middle = survey.bank.directions[len(survey.bank.directions) // 2]
     numbers = survey.stare.numbers[quiet]
     return Analysis(
-        frames, flux, error, level, survey, wanted, modelled, measured, threshold, candidates, events,
+        frames, flux, error, level, survey, wanted, modelled, measured, threshold, candidates, dip, events,
         inject(survey, ~taken, threshold, seed, temperature_k),
         binned_scatter(numbers, residual @ middle), likeness(numbers, residual), spectra,
     )  # fmt: skip

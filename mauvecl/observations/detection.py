@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.observations.process import Binned, Process, fit_process
+from mauvecl.observations.energies import flares_of
+from mauvecl.observations.process import Binned, Process, fit_process, level_fit
 from mauvecl.observations.search import SeriesSurvey
 
 Float = NDArray[np.float64]
@@ -22,6 +23,13 @@ Bool = NDArray[np.bool_]
 PROVISIONAL = 5.0
 #: Largest number of alternations of process and events, of searches, and of events.
 ROUNDS, MAX_PASSES, MAX_EVENTS = 6, 40, 500
+#: Largest number of events in independent noise that are compared with a process, and parameters of a flare.
+MAX_COMPARED, PARAMETERS = 8, 3
+#: Departures of flares from their shape that are tried for the criterion.
+DEPARTURES = (0.0, 0.03, 0.2)
+#: Shortest period of rotation (assumed: 0.2 d), and the rise of the criterion for a faster process of which
+#: the frames show less than three periods (assumed).
+FASTEST_ROTATION_S, SEEN_ONCE = 17_280.0, 20.0
 #: Share of the frames in events that may change in the last alternation.
 SETTLED = 0.002
 #: Smallest number of quiescent frames to which a process is fitted; with fewer, the longest events are shortened.
@@ -89,6 +97,89 @@ def fit_processes(survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None 
     return replace(survey, processes=processes, flux_process=flux)
 
 
+def fit_quiet_light(
+    survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None = None
+) -> tuple[SeriesSurvey, Bool]:
+    """Fit process and events in alternation, from the guess and, if need be, from the events in independent noise.
+
+    A bright, slow flare resembles a process that is seen once. Where that is the result, the one with the events in
+    independent noise is compared, and the smaller Bayesian information criterion decides, with the flares among the
+    parameters.
+
+    Parameters
+    ----------
+    survey, guessed, before
+        As for `alternate`.
+    """
+    fitted, taken = alternate(survey, guessed, before)
+    if not _seen_once(fitted):
+        return fitted, taken
+    noise = tuple(Process((), process.excess) for process in fitted.processes)
+    found, others = detect_events(replace(survey, processes=noise), PROVISIONAL)
+    if len(found) > MAX_COMPARED or not (others & ~taken).any():
+        return fitted, taken
+    other, others = alternate(survey, others)
+    if float((others ^ taken).mean()) <= SETTLED:
+        return fitted, taken
+    first, second = criterion(fitted, taken), criterion(other, others)
+    return (other, others) if second < first else (fitted, taken)
+
+
+def criterion(survey: SeriesSurvey, taken: Bool) -> float:
+    """Return the Bayesian information criterion of a process and the flares of the events above `PROVISIONAL`.
+
+    A process of minutes that is seen once, and no more, costs `SEEN_ONCE`: stars and instruments repeat what they do.
+    """
+    found, _ = detect_events(survey, PROVISIONAL)
+    start, size = survey.stare.start_s, float(np.log(survey.stare.n_frames))
+    edges = np.column_stack([start, start + survey.stare.frame_s])
+    fits = []
+    for one in found:
+        flares, scale, photon = flares_of(survey, taken, one)
+        mine = np.zeros(start.size)
+        for flare in flares:
+            mine += flare.amplitude * survey.bank.shape.mean_over(edges, flare.peak_s, flare.half_width_s)
+        fits.append((one, scale * mine, photon * mine, len(flares)))
+
+    def cost(epsilon: float, fits: list[tuple[Detection, Float, Float, int]], kept: Bool) -> float:
+        """Return the criterion of some frames, with flares that depart by a share from their shape."""
+        light, extra = np.zeros_like(survey.sums), np.zeros(start.size)
+        for one, mine, photons, _ in fits:
+            light += mine[:, None] * survey.bank.directions[one.direction]
+            extra += photons + (epsilon * mine) ** 2
+        total = PARAMETERS * size * sum(count for *_, count in fits)
+        for process, column in zip(survey.processes, (survey.sums - light).T, strict=True):
+            covariance = process.covariance(
+                start[kept], (survey.variance * process.excess**2 + extra)[kept]
+            )
+            total += process.n_parameters * size - 2 * level_fit(covariance, column[kept]).log_likelihood
+        return total
+
+    every = np.ones(start.size, np.bool_)
+    total = min(cost(epsilon, fits, every) for epsilon in DEPARTURES)
+    if fits and not any(process.terms for process in survey.processes) and survey.sums.shape[1] == 1:
+        # The light of an event may have any smooth shape.
+        free = cost(0.0, [], ~taken)
+        for one, *_ in fits:
+            rows = slice(one.first, one.last + 1)
+            data = Binned(start[rows], survey.sums[rows, 0], survey.variance[rows], survey.stare.frame_s)
+            process = fit_process(data) if one.last - one.first >= MIN_QUIET else Process((), 1.0)
+            mine = process.covariance(data.time_s, data.variance * process.excess**2)
+            free += (PARAMETERS + process.n_parameters) * size - 2 * level_fit(mine, data.values).log_likelihood
+        total = min(total, free)
+    return total + (SEEN_ONCE if _seen_once(survey) else 0.0)
+
+
+def _seen_once(survey: SeriesSurvey) -> bool:
+    """Return whether a process is faster than rotation, but shows less than three periods."""
+    span = survey.stare.duration_s
+    return any(
+        term.kind != "correlated" and span / 3 < term.scale_s < FASTEST_ROTATION_S
+        for process in survey.processes
+        for term in process.terms
+    )
+
+
 def alternate(survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None = None) -> tuple[SeriesSurvey, Bool]:
     """Fit process and events in alternation.
 
@@ -136,9 +227,13 @@ def detect_events(survey: SeriesSurvey, threshold: float) -> tuple[list[Detectio
         for one in new:
             unit = survey.bank.directions[one.direction]
             light += _template_light(survey, one)[:, None] * unit
-        mine = [_extent(survey, taken, one) for one in new]
-        for first, last in mine:
-            taken[first : last + 1] = True
+        mine = []
+        for one in new:
+            first, last = _extent(survey, taken, one)
+            # Some frames are left for the level, the faintest of the event.
+            short = MIN_QUIET - int((~taken).sum()) + last - first + 1
+            mine.append((first, max(last - max(short, 0), first)))
+            taken[first : mine[-1][1] + 1] = True
         mine = _extended(survey, taken, mine, new)
         for (first, last), one in zip(mine, new, strict=True):
             taken[first : last + 1] = True
@@ -233,7 +328,7 @@ def _extended(
     longer = []
     for (first, last), one in zip(extents, found, strict=True):
         sigma, length = sigmas[one.direction], last - first + 1
-        stop = min(last + length, sigma.size - 1)
+        stop = min(last + length, sigma.size - 1, last + int(quiet.sum()) - MIN_QUIET)
         while last < stop and not taken[last + 1] and sigma[last + 1 : last + 1 + END_FRAMES].mean() > STILL_BRIGHT:
             last += 1
         start = max(first - length, 0)

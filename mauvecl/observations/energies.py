@@ -358,6 +358,22 @@ def measure_energy(survey: SeriesSurvey, taken: Bool, one: Detection) -> Energy:
     )  # fmt: skip
 
 
+def flares_of(survey: SeriesSurvey, taken: Bool, one: Detection) -> tuple[list[FittedFlare], float, float]:
+    """Return the flares of the shape of the bank that fit an event best.
+
+    Returns
+    -------
+    flares : list of FittedFlare
+    scale : float
+        Light of unit amplitude in the sum along the direction of the event.
+    photon : float
+        Rise of the variance of that sum with the amplitude.
+    """
+    window = Window.of(survey, taken, one)
+    shape = survey.bank.shape
+    return _further(window, shape, _first_fit(window, shape)[0]), window.scale, window.photon
+
+
 def _log_prior(n_flares: int) -> float:
     """Return the logarithm of the prior weight of a number of flares."""
     return -float(n_flares - 1)

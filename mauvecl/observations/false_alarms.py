@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,6 +25,8 @@ MAX_VALUES, MAX_LENGTH = 2**23, 2**16
 BATCH = 2**20
 #: Probability of the upper end of the rate that sets thresholds: one standard error above it.
 UPPER = 0.8413447460685429
+#: Probability of a dip as large as the largest from noise below which the noise of the light is not symmetric.
+CHANCE_DIP = 1e-3
 #: Second half of the generator's key, which makes the draws independent of others.
 SIMULATION_KEY = 0x73696D75
 
@@ -132,6 +134,21 @@ def simulated_rates(survey: SeriesSurvey, quiet: Bool, rate: float, seed: int) -
             found.append(part.search.largest(drawn).maximum)
     modelled, measured = (np.sort(np.concatenate(values)) for values in largest)
     return SimulatedRate(modelled, days, bool(survey.counts)), SimulatedRate(measured, days, True)
+
+
+def largest_dip(survey: SeriesSurvey, quiet: Bool) -> float:
+    """Return the largest statistic of events that no flare can be: sudden dips, and slow ones that end suddenly.
+
+    Quiescent frames are searched upside down, in both directions of time. Noise that is as likely to rise as to fall has
+    dips as large as its false alarms; losses of light have larger ones, and end as suddenly as flares begin.
+    """
+    part = survey.frames(quiet)
+    largest = [part.search.largest(-part.sums[None]).maximum[0]]
+    stare = part.stare
+    start = (stare.start_s[-1] + stare.start_s[0]) - stare.start_s[::-1]
+    back = replace(part, stare=replace(stare, start_s=start), sums=part.sums[::-1], variance=part.variance[::-1])
+    largest.append(back.search.largest(-back.sums[None]).maximum[0])
+    return float(max(largest))
 
 
 def _mean_counts(survey: SeriesSurvey, quiet: Bool) -> Float:

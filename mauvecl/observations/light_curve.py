@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.observations.detection import alternate
+from mauvecl.observations.detection import fit_quiet_light
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import (
     FAR,
@@ -67,7 +67,7 @@ def survey_light_curve(frames: Frames, shape: Shape, seed: int) -> tuple[SeriesS
         variance, photon = _noise(frames, flux, error, level, quiet, counts)
         typical = float(np.median(level[quiet]))
         new = SeriesSurvey.of(frames, flux, variance, used, typical, photon, shape, counts or 0.0)
-        survey, taken = alternate(new, guessed[used], survey)
+        survey, taken = fit_quiet_light(new, guessed[used], survey)
         level = level_of(frames, flux, used, survey, ~taken)
         sd = np.sqrt(variance) * survey.flux_process.excess
         guessed = np.zeros(flux.size, np.bool_)

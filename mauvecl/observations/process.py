@@ -28,7 +28,10 @@ MAX_FITTED = 20_000
 #: Largest number of terms.
 MAX_TERMS = 3
 #: Smallest number of values for each parameter of a process.
-VALUES_PER_PARAMETER = 8
+VALUES_PER_PARAMETER = 12
+#: Standard deviation of the logarithm of the noise about that of differences of neighbours (assumed), which includes
+#: the changes of the star between two values.
+NOISE_PRIOR = 0.3
 #: False-alarm probability of the highest peak of the periodogram below which rotation is fitted.
 PERIODIC = 1e-3
 #: Smallest period in steps between values, and largest as a share of the length of the light curve.
@@ -125,6 +128,11 @@ class Process:
     def shortest_s(self) -> float:
         """Shortest time scale of the terms; infinite without terms."""
         return min((term.shortest_s for term in self.terms), default=np.inf)
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of fitted parameters, with that of the noise."""
+        return 1 + sum(SIZES[term.kind] for term in self.terms)
 
     @property
     def sd(self) -> float:
@@ -288,7 +296,7 @@ def fit_process(data: Binned, start: Process | None = None) -> Process:
     best, value = _fitted(data, (), np.log(noise))
     tried = {best.name: value}
     while len(best.terms) < MAX_TERMS:
-        size = 1 + sum(SIZES[term.kind] for term in best.terms)
+        size = best.n_parameters
         options = [
             _fitted(data, (*best.terms, term), np.log(best.excess))
             for term in _starts(data, best)
@@ -354,6 +362,7 @@ def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> 
     from scipy.optimize import minimize
 
     kinds = [term.kind for term in terms]
+    expected = float(np.log(max(data.noise / float(np.sqrt(np.median(data.variance))), 1e-6)))
     start = np.array([log_excess, *(value for term in terms for value in term.parameters)])
     bounds = [(log_excess - 3.0, log_excess + 3.0)]
     for term in terms:
@@ -373,7 +382,7 @@ def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> 
             covariance = process.covariance(data.time_s, data.variance * process.excess**2)
         except (np.linalg.LinAlgError, RuntimeError, ValueError):
             return 1e25
-        value = -level_fit(covariance, data.values).log_likelihood
+        value = 0.5 * ((x[0] - expected) / NOISE_PRIOR) ** 2 - level_fit(covariance, data.values).log_likelihood
         return value if np.isfinite(value) else 1e25
 
     found = minimize(

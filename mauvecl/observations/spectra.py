@@ -15,7 +15,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates
-from mauvecl.observations.detection import alternate
+from mauvecl.observations.detection import fit_quiet_light
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Reason
 from mauvecl.observations.level import PER_MAD, QuiescentLevel, guess_flares, single_frames
@@ -254,7 +254,7 @@ def survey_spectra(
             flux[used] / scale, variance, WHITE, scale, abs(float(np.median(flux[used & ~events]))), photon,
             frames.time_s[used],
         )  # fmt: skip
-        survey, taken = alternate(survey, events[used])
+        survey, taken = fit_quiet_light(survey, events[used])
         now = np.zeros(flux.size, np.bool_)
         now[used] = taken
         sigmas = np.zeros(flux.size)

@@ -9,9 +9,11 @@ from scipy import stats
 
 from mauvecl.lightcurve.flares.shapes import shape_of
 from mauvecl.observations.analysis import analyse_frames
-from mauvecl.observations.events import FITTED_BINS, detect_events, measure_event, measure_events
+from mauvecl.observations.detection import detect_events
+from mauvecl.observations.events import measure_event, measure_events
+from mauvecl.observations.false_alarms import simulated_rates
 from mauvecl.observations.frames import Frames, Reason
-from mauvecl.observations.level import quiescent_level
+from mauvecl.observations.light_curve import survey_light_curve
 from mauvecl.observations.noise import binned_scatter
 from mauvecl.observations.search import SeriesSurvey
 
@@ -21,7 +23,7 @@ TIME = np.arange(FRAMES) * CADENCE_S
 
 
 def survey_of(frames: Frames) -> SeriesSurvey:
-    return SeriesSurvey.of(frames, frames.flux, frames.error, quiescent_level(frames, frames.flux, frames.error), SHAPE)
+    return survey_light_curve(frames, SHAPE, 1)[0]
 
 
 def light_curve(rng: np.random.Generator, mean: NDArray[np.float64] | float = LEVEL) -> Frames:
@@ -35,7 +37,9 @@ def flare(peak_s: float, half_width_s: float) -> NDArray[np.float64]:
 
 @pytest.fixture(scope="module")
 def threshold() -> float:
-    return survey_of(light_curve(np.random.default_rng(1))).normal_rate(2.0, 1).threshold(2.0).value
+    survey = survey_of(light_curve(np.random.default_rng(1)))
+    rates = simulated_rates(survey, np.ones(survey.stare.n_frames, np.bool_), 2.0, 1)
+    return max(rate.threshold(2.0) for rate in rates)
 
 
 @pytest.mark.long
@@ -63,8 +67,8 @@ def test_intervals_of_the_fitted_equivalent_duration_cover(threshold: float) -> 
         survey = survey_of(light_curve(rng, LEVEL * (1 + amplitude * flare(peak, width))))
         found, taken = detect_events(survey, threshold)
         nearest = max(found, key=lambda one: one.value)
-        (fitted, *_) = measure_event(survey, taken, threshold, nearest).components
-        low, high = fitted.intervals["equivalent_duration_s"]
+        energy = measure_event(survey, taken, nearest).energy
+        low, high = energy.low_s[0], energy.high_s[0]
         inside += low <= amplitude * width * SHAPE.equivalent_duration <= high
     assert stats.binom.ppf(0.0005, number, 0.6827) <= inside <= stats.binom.ppf(0.9995, number, 0.6827)
 
@@ -74,30 +78,26 @@ def test_long_flares_are_fitted_in_bins_with_the_same_result(threshold: float, m
     found, taken = detect_events(survey, threshold)
     (best,) = found
     fits = []
-    for bins in (FITTED_BINS, 10**9):
-        monkeypatch.setattr("mauvecl.observations.events.FITTED_BINS", bins)
-        (fitted,) = measure_event(survey, taken, threshold, best).components
-        fits.append((fitted, *fitted.intervals["equivalent_duration_s"]))
-    (binned, low, high), (whole, *ends) = fits
-    # A fifth of the frames, so that fits of long flares of short frames do not take minutes.
-    assert whole.dof > 4.5 * binned.dof
-    # A few per cent of the information are lost: both fits differ by a part of the standard error.
-    assert [low, high] == pytest.approx(ends, abs=0.15 * (high - low))
-    assert high - low == pytest.approx(ends[1] - ends[0], rel=0.05)
-    assert binned.recovered.peak_s == pytest.approx(whole.recovered.peak_s, abs=60)
-    assert np.isnan(binned.intervals["peak_s"]).all()
+    for bins in (400, 60):
+        monkeypatch.setattr("mauvecl.observations.energies.MAX_INSIDE", bins)
+        fits.append(measure_event(survey, taken, best).energy)
+    whole, binned = fits
+    assert whole.dof > 2 * binned.dof
+    width = whole.high_s[0] - whole.low_s[0]
+    assert binned.fitted_s == pytest.approx(whole.fitted_s, abs=0.2 * width)
+    assert binned.high_s[0] - binned.low_s[0] == pytest.approx(width, rel=0.1)
 
 
 def test_a_flare_is_found_at_its_time_and_a_step_is_a_step(threshold: float) -> None:
     rng = np.random.default_rng(292)
     survey = survey_of(light_curve(rng, LEVEL * (1 + 0.1 * flare(15_000, 400))))
     found, taken = detect_events(survey, 5.0)
-    (event,) = (measure_event(survey, taken, 5.0, one) for one in found)
+    (event,) = (measure_event(survey, taken, one) for one in found)
     assert event.kind == "flare"
     assert abs(survey.time_s[event.brightest] - 15_000) < 300
     stepped = survey_of(light_curve(rng, LEVEL + np.where(TIME > 24_000, 40.0, 0.0)))
     found, taken = detect_events(stepped, 6.0)
-    assert {one.kind for one in measure_events(stepped, taken, 6.0, found)} == {"step"}
+    assert {one.kind for one in measure_events(stepped, taken, found)} == {"step"}
 
 
 def test_single_frames_and_dips_are_flagged_and_a_flare_of_three_frames_is_not() -> None:
@@ -107,7 +107,7 @@ def test_single_frames_and_dips_are_flagged_and_a_flare_of_three_frames_is_not()
     mean[200] -= 100
     mean[300:303] += (100, 60, 40)
     frames = light_curve(rng, mean)
-    reasons = quiescent_level(frames, frames.flux, frames.error).reasons
+    reasons = survey_light_curve(frames, SHAPE, 1)[1].reasons
     assert {int(k): int(reasons[k]) for k in np.flatnonzero(reasons)} == {100: Reason.SPIKE, 200: Reason.BELOW}
 
 
@@ -116,9 +116,10 @@ def test_the_level_follows_rotation_and_the_noise_does_not() -> None:
     time = np.arange(8000) * 120.0
     rotation = LEVEL * (1 + 0.02 * np.sin(2 * np.pi * time / 2.6e5))
     frames = Frames.of(time, rng.normal(rotation, SD), np.full(time.size, SD / 2))
-    level = quiescent_level(frames, frames.flux, frames.error)
-    # The median of n values has a standard error of 1.25 / sqrt(n).
-    assert np.abs(level.level - rotation)[200:-200].max() < 6 * 1.25 * SD / np.sqrt(216)
+    level = survey_light_curve(frames, SHAPE, 1)[1]
+    # Six standard errors of the level, which are those of its departures from the truth.
+    assert np.abs((level.level - rotation) / level.level_error).max() < 6
+    assert np.sqrt(np.mean(((level.level - rotation) / level.level_error) ** 2)) == pytest.approx(1.0, abs=0.5)
     # The stated errors are half of the true ones; their estimate has a standard error of 1.4 %.
     assert level.excess == pytest.approx(2.0, rel=0.06)
 
@@ -156,7 +157,7 @@ def test_flares_at_the_limit_are_detected_nine_times_in_ten() -> None:
     for _ in range(number):
         peak = float(rng.uniform(4000, 32_000))
         survey = survey_of(light_curve(rng, LEVEL * (1 + amplitude * flare(peak, width))))
-        best = survey.search.largest(survey.net(survey.sums)[None])
+        best = survey.search.largest(survey.sums[None])
         seen += best.maximum[0] >= analysis.candidates and abs(best.peak_s[0] - peak) < 4 * width + 300
     # The limit itself comes from forty injections per size: its completeness is known to some 5 %.
     low, high = stats.binom.ppf([0.0005, 0.9995], number, [0.78, 0.97])

@@ -16,11 +16,11 @@ from mauvecl.answers.observations.analyse import frame_model
 from mauvecl.lightcurve.flares.shapes import shape_of
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K
 from mauvecl.observations.analysis import analyse_frames
+from mauvecl.observations.detection import detect_events
 from mauvecl.observations.event_spectrum import drifts, event_spectrum, measure_flare
-from mauvecl.observations.events import detect_events
+from mauvecl.observations.false_alarms import simulated_rates
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames, Reason
-from mauvecl.observations.level import quiescent_level
 from mauvecl.observations.search import SeriesSurvey
 from mauvecl.observations.spectra import CleanedSpectra, SpectralSeries, clean_spectra, survey_spectra
 from tests.refusals import refused
@@ -70,14 +70,15 @@ def drawn(rng: np.random.Generator, added: Float | float = 0.0, scale: float | F
 
 def prepared(frames: Frames, **how: Any) -> Prepared:
     cleaned = clean_spectra(frames, model())
-    flux, error = cleaned.frames.white_light
-    survey, series, _ = survey_spectra(cleaned, flux, quiescent_level(cleaned.frames, flux, error), SHAPE, 3, **how)
+    survey, series, _ = survey_spectra(cleaned, SHAPE, 3, 1, **how)
     return cleaned, survey, series
 
 
 @pytest.fixture(scope="module")
 def threshold() -> float:
-    return prepared(drawn(np.random.default_rng(1)))[1].normal_rate(20.0, 1).threshold(20.0).value
+    survey = prepared(drawn(np.random.default_rng(1)))[1]
+    rates = simulated_rates(survey, np.ones(survey.stare.n_frames, np.bool_), 20.0, 1)
+    return max(rate.threshold(20.0) for rate in rates)
 
 
 @pytest.fixture(scope="module")
@@ -300,14 +301,14 @@ def test_detection_rate_follows_the_signal_to_noise(rare: float) -> None:
     _, survey, _ = prepared(drawn(rng))
     unit = survey.templates.directions[np.argmin(np.abs(np.array(survey.templates.temperatures_k) - 10_000))]
     # The template of 48 s is near enough to flares of 48 s; the line under the flare is fitted, which costs S/N.
-    row = min(survey.search.grid, key=lambda each: abs(each.template.half_width_s - 48.0))
+    row = min(survey.search.rows, key=lambda each: abs(each.template.half_width_s - 48.0))
     power = float(np.median(row.per_amplitude[row.per_amplitude > 0]))
     size = (rare + 0.5) / (power * float(np.linalg.norm(unit)))
     seen, number = 0, 60
     for _ in range(number):
         peak = rng.uniform(900, 2700)
         _, survey, _ = prepared(drawn(rng, flare(peak, row.template.half_width_s, size)))
-        best = survey.search.largest(survey.net(survey.sums)[None])
+        best = survey.search.largest(survey.sums[None])
         seen += best.maximum[0] >= rare and abs(best.peak_s[0] - peak) < 120
     expected = stats.norm.sf(-0.5)
     low, high = stats.binom.ppf([0.0005, 0.9995], number, [expected - 0.03, expected + 0.12])
