@@ -26,7 +26,9 @@ Bool = NDArray[np.bool_]
 
 #: Step between half-widths of a bank: the same as that of `lightcurve.defaults.HALF_WIDTHS_S`.
 WIDTH_STEP = 1.86
-#: Narrowest template in frames, and widest as a share of the light curve's length and in seconds.
+#: Longest gap between searched frames, in frames; longer ones are shortened to it.
+MAX_GAP = 2**15
+#: Narrowest template in frames, and widest as a share of the time in all frames and in seconds.
 NARROWEST, WIDEST, WIDEST_S = 1.5, 0.15, 7200.0
 #: Smallest window around an event, in cadences and seconds.
 WINDOW_FRAMES, WINDOW_S = 120, 1800.0
@@ -117,10 +119,12 @@ class SeriesSurvey:
 
 
 def stare_of(frames: Frames, used: Bool) -> Stare:
-    """Return the frames that are searched as a stare on the regular grid of the cadence."""
+    """Return the frames that are searched as a stare on the regular grid of the cadence; long gaps are shortened."""
     numbers = frames.numbers[used]
+    # Nothing is shared over long gaps, whose frames would only take memory.
+    numbers = np.concatenate([[0], np.cumsum(np.minimum(np.diff(numbers), MAX_GAP))])
     ones = np.ones(numbers.size)
-    return Stare((numbers - numbers[0]) * frames.cadence_s, frames.cadence_s, ones, ones, ones, np.zeros(numbers.size))
+    return Stare(numbers * frames.cadence_s, frames.cadence_s, ones, ones, ones, np.zeros(numbers.size))
 
 
 def bank_of(stare: Stare, directions: Float, shape: Shape) -> Bank:
@@ -132,6 +136,6 @@ def bank_of(stare: Stare, directions: Float, shape: Shape) -> Bank:
 def half_widths(stare: Stare) -> tuple[float, ...]:
     """Return the half-widths of a bank for a light curve, s."""
     low = NARROWEST * stare.frame_s
-    high = max(low, min(WIDEST * stare.duration_s, WIDEST_S))
+    high = max(low, min(WIDEST * stare.n_frames * stare.frame_s, WIDEST_S))
     steps = max(1, round(np.log(high / low) / np.log(WIDTH_STEP)) + 1)
     return tuple(float(w) for w in low * WIDTH_STEP ** np.arange(steps))
