@@ -7,7 +7,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,8 @@ ENERGIES = ("injections.low", "injections.high")
 WHOLE = (-(2**63), 2**64 - 1)
 #: Longest text and deepest nesting of a study or an instrument.
 LONGEST, DEEPEST = 4096, 32
+#: Place in a file, in messages of parsers.
+PLACE = re.compile(r"\b(?:line|row|column) \d{1,9}(?:,? (?:line|row|column) \d{1,9})*")
 #: Largest number of parts of a dotted TOML key.
 MOST_PARTS = 512
 
@@ -53,10 +55,29 @@ def parsing(what: str, expected: str) -> Iterator[None]:
     except MemoryError as error:
         raise InputError(f"{what} needs more memory than is available", expected, key="file") from error
     except Exception as error:
-        reason = next((line.strip() for line in str(error).splitlines() if line.strip()), "") or type(error).__name__
-        raise InputError(
-            f"{what} cannot be read ({printable(reason, 160)})", expected, key="file", value=reason
-        ) from error
+        # Other libraries' messages are for their programmers, but may state the place.
+        place = PLACE.search(str(error))
+        fault = f"{what} cannot be read{f' ({place[0]})' if place else ''}"
+        raise InputError(fault, expected, key="file", value=str(error)[:200] or type(error).__name__) from error
+
+
+#: Names that can be typed between the brackets of ``FILE[name]``.
+TYPED = re.compile(r"[^\[\],\"'\s](?:[^\[\],\"'\n\r\t]{0,38}[^\[\],\"'\s])?")
+
+
+def part_to_name(names: Iterable[str], otherwise: str) -> str:
+    """Return how to name a part of a file on the command line, as the end of a sentence.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Names of parts, of which the first that can be typed and is not repeated is the example.
+    otherwise : str
+        What is accepted if none can be typed.
+    """
+    held = [name.strip() for name in names]
+    typed = next((one for one in held if TYPED.fullmatch(one) and one.isprintable() and held.count(one) == 1), None)
+    return otherwise if typed is None else f"one: name it as in FILE[{typed}]"
 
 
 def read_text(path: Path, what: str) -> str:

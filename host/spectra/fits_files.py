@@ -8,6 +8,8 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
+import numpy as np
+
 from mauvecl.schema.errors import InputError
 
 from ..files.parsing import parsing
@@ -19,6 +21,8 @@ from .fits_images import axis_of, is_spectrum_image, paired_images, rows_of
 IMPLIED_UNITS = ("Angstrom", "erg / (s cm2 Angstrom)")
 #: Bytes of a block (FITS standard 4.0, section 3.1), and largest numbers of cards of a header and of extensions.
 BLOCK, MAX_CARDS, MAX_EXTENSIONS = 2880, 100_000, 1000
+#: Largest number of bytes after the last extension.
+MAX_AFTER = 2**20
 #: Keywords whose text may mention air, vacuum, the star's surface or its dust.
 _REMARKS = ("AIRORVAC", "VACUUM", "WAVEMED", "WAVETYPE", "VACWAVE", "COMMENT", "HISTORY", "DESCRIP")
 WHOLE = "a whole FITS file"
@@ -36,6 +40,7 @@ def fits_tables(content: bytes, name: str, origin: str, asked: Sequence[str]) ->
         # astropy warns of the headers of old archive files that it can read.
         warnings.simplefilter("ignore")
         hdus = fits.open(io.BytesIO(content), memmap=False, lazy_load_hdus=False, disable_image_compression=True)
+        check_extensions(hdus)
         check_sums(hdus)
         return _Reader(hdus, name, origin, asked).tables()
 
@@ -58,6 +63,10 @@ def check_sizes(content: Content) -> None:
     place = 0
     for number in range(MAX_EXTENSIONS + 1):
         if content[place : place + 8] not in (b"SIMPLE  ", b"XTENSION"):
+            if len(content) - place > MAX_AFTER:
+                # astropy would search all of it for the end of a header.
+                fault = f"has {len(content) - place} bytes after its extension {number - 1}"
+                raise InputError(fault, f"at most {MAX_AFTER}", key="file", value=len(content) - place)
             return
         if number == MAX_EXTENSIONS:
             break
@@ -95,6 +104,43 @@ def check_sizes(content: Content) -> None:
             )
         place = start + -(-size // BLOCK) * BLOCK
     raise InputError(f"has more than {MAX_EXTENSIONS} extensions", "fewer", key="file", value=MAX_EXTENSIONS)
+
+
+#: astropy's classes of extensions whose headers it cannot interpret.
+DAMAGED = ("_ValidHDU", "_NonstandardHDU", "_CorruptedHDU")
+
+
+def check_extensions(hdus: Any) -> None:
+    """Raise InputError for an extension whose header is damaged, such as a second primary header.
+
+    astropy reads rows by the formats of their columns, also where they do not take NAXIS1 bytes.
+    """
+    from astropy.io import fits
+
+    for number, hdu in enumerate(hdus):
+        if type(hdu).__name__ in DAMAGED or (number > 0 and "SIMPLE" in hdu.header):
+            raise InputError(f"has a damaged header in extension {number}", WHOLE, key="file", value=number)
+        if not isinstance(hdu, fits.BinTableHDU):
+            continue
+        names = hdu.columns.names
+        if odd := next((name for name in names if name is not None and names.count(name) > 1), None):
+            fault = f"has several columns named {odd!r} in extension {number}"
+            raise InputError(fault, "another name for each", key="columns", value=odd)
+        if None in names:
+            raise InputError(
+                f"has a column whose TTYPE{names.index(None) + 1} is empty in extension {number}",
+                "a name for each column",
+                key="columns",
+                value=number,
+            )
+        size = sum(np.dtype(column.format.recformat).itemsize for column in hdu.columns)
+        if size != hdu.header["NAXIS1"]:
+            raise InputError(
+                f"has rows of {hdu.header['NAXIS1']} bytes in extension {number}, whose columns take {size}",
+                WHOLE,
+                key="file",
+                value=number,
+            )
 
 
 def check_sums(hdus: Any) -> None:

@@ -248,7 +248,9 @@ def survey_spectra(
         # The noise follows that of the whole light in time.
         variance = (error[used] / scale) ** 2
         light = series.light
-        photon = float(series.model.gain @ np.maximum(light, 0.0) / np.maximum(light, 0.0).sum())
+        lit = np.maximum(light, 0.0)
+        # Frames without light, such as dark frames, have no photon noise to weight by.
+        photon = float(np.average(series.model.gain, weights=lit if lit.any() else None))
         survey = SeriesSurvey(
             stare, bank_of(stare, directions, shape), templates, sums[used], variance, (WHITE,) * sums.shape[1],
             flux[used] / scale, variance, WHITE, scale, abs(float(np.median(flux[used & ~events]))), photon,
