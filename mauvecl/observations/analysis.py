@@ -124,13 +124,13 @@ class Analysis:
             )
         if np.isfinite(self.dip):
             lines.append(
-                f"The light falls suddenly, as by losses of light, with an S/N of {self.dip:.3g}: rises of that size may "
-                "be returns from a loss, and only larger ones are called detected."
+                f"The light falls suddenly, as by losses of light, with an S/N of {self.dip:.3g}: rises of that size "
+                "may be returns from a loss, and only larger ones are called detected."
             )
         if self.wanted < self.measured.smallest:
             lines.append(
-                f"Simulated light curves show rates down to {self.measured.smallest:.2g} false alarms per star-day; the "
-                "threshold for fewer is extrapolated with the tail of their noise."
+                f"Simulated light curves show rates down to {self.measured.smallest:.2g} false alarms per star-day; "
+                "the threshold for fewer is extrapolated with the tail of their noise."
             )
         return lines
 

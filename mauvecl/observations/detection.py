@@ -149,9 +149,7 @@ def criterion(survey: SeriesSurvey, taken: Bool) -> float:
             extra += photons + (epsilon * mine) ** 2
         total = PARAMETERS * size * sum(count for *_, count in fits)
         for process, column in zip(survey.processes, (survey.sums - light).T, strict=True):
-            covariance = process.covariance(
-                start[kept], (survey.variance * process.excess**2 + extra)[kept]
-            )
+            covariance = process.covariance(start[kept], (survey.variance * process.excess**2 + extra)[kept])
             total += process.n_parameters * size - 2 * level_fit(covariance, column[kept]).log_likelihood
         return total
 
@@ -164,8 +162,8 @@ def criterion(survey: SeriesSurvey, taken: Bool) -> float:
             rows = slice(one.first, one.last + 1)
             data = Binned(start[rows], survey.sums[rows, 0], survey.variance[rows], survey.stare.frame_s)
             process = fit_process(data) if one.last - one.first >= MIN_QUIET else Process((), 1.0)
-            mine = process.covariance(data.time_s, data.variance * process.excess**2)
-            free += (PARAMETERS + process.n_parameters) * size - 2 * level_fit(mine, data.values).log_likelihood
+            alone = process.covariance(data.time_s, data.variance * process.excess**2)
+            free += (PARAMETERS + process.n_parameters) * size - 2 * level_fit(alone, data.values).log_likelihood
         total = min(total, free)
     return total + (SEEN_ONCE if _seen_once(survey) else 0.0)
 

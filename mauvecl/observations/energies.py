@@ -350,7 +350,8 @@ def measure_energy(survey: SeriesSurvey, taken: Bool, one: Detection) -> Energy:
     peak = flares[0].peak_s
     observed = bool((np.abs(survey.stare.middle_s[one.first : one.last + 1] - peak) <= 1.5 * frame_s).any())
     return Energy(
-        summed / level, error / level, mixture.quantile(0.5) / level, (ends[0][0], ends[0][1]), (ends[1][0], ends[1][1]),
+        summed / level, error / level, mixture.quantile(0.5) / level, (ends[0][0], ends[0][1]),
+        (ends[1][0], ends[1][1]),
         tuple(replace(f, amplitude=f.amplitude / level, equivalent_duration_s=f.equivalent_duration_s / level)
               for f in flares), shape.name, float(plain.chi2(model)), window.values.size - 1 - 3 * len(flares),
         float(share @ np.array([epsilon for *_, epsilon in fits])), _is_step(window, plain, float(plain.chi2(model))),
@@ -445,7 +446,8 @@ class Grid:
         window = likelihood.window
         data = likelihood.inverse @ window.values
         for _ in range(REFINEMENTS):
-            p, w = (grid.ravel() for grid in np.meshgrid(*(np.linspace(*side, NODES) for side in box), indexing="ij"))
+            axes = [np.linspace(low, high, NODES) for low, high in box]
+            p, w = (each.ravel() for each in np.meshgrid(axes[0], axes[1], indexing="ij"))
             model = window.model(shape, p, np.exp(w))
             information = np.maximum(np.einsum("ki,ki->k", model @ likelihood.inverse, model), 1e-300)
             slope = model @ data
@@ -554,9 +556,11 @@ def _refined(likelihood: Likelihood, shape: Shape, flares: Sequence[FittedFlare]
     def made(x: Float) -> list[FittedFlare]:
         return [_flare(shape, p, np.exp(w), np.exp(a)) for a, p, w in x.reshape(-1, 3)]
 
+    def residual(x: Float) -> Float:
+        return np.asarray(root @ (window.values - _light(window, shape, made(x))))
+
     found = scipy.optimize.least_squares(
-        lambda x: root @ (window.values - _light(window, shape, made(x))), np.clip(start, low, high),
-        bounds=(low, high), x_scale=scale, max_nfev=60,
+        residual, np.clip(start, low, high), bounds=(low, high), x_scale=scale, max_nfev=60,
     )  # fmt: skip
     return made(found.x)
 

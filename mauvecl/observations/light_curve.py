@@ -60,7 +60,7 @@ def survey_light_curve(frames: Frames, shape: Shape, seed: int) -> tuple[SeriesS
     guessed = np.zeros(flux.size, np.bool_)
     guessed[used] = guess_flares(frames.numbers[used], flux[used])
     level = np.full(flux.size, _mean(flux[used & ~guessed]))
-    survey = None
+    survey: SeriesSurvey | None = None
     for _ in range(ROUNDS):
         used = reasons == 0
         quiet = used & ~guessed
@@ -76,6 +76,7 @@ def survey_light_curve(frames: Frames, shape: Shape, seed: int) -> tuple[SeriesS
         if not (flagged & used).any():
             break
         reasons = np.where(used, reasons | flagged, reasons)
+    assert survey is not None
     finite = np.isfinite(flux)
     below = finite & (reasons != 0) & (np.where(finite, flux, 0.0) - level < -FAR * sd)
     reasons = np.where(below, reasons | Reason.BELOW, reasons)

@@ -212,7 +212,7 @@ class Covariance:
 
     def whitened(self, values: Float) -> Float:
         """Return the innovations of values, which are independent and of unit variance, shape (n,) or (n, k)."""
-        return (self._solved_lower(values) / np.sqrt(self._d)[:, None]).reshape(np.shape(values))
+        return np.asarray(self._solved_lower(values) / np.sqrt(self._d)[:, None]).reshape(np.shape(values))
 
     def coloured(self, white: Float) -> Float:
         """Return values of this covariance from innovations, shape (n,) or (n, k)."""

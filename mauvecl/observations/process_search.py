@@ -195,7 +195,7 @@ class ProcessSearch:
         margin = int(np.clip(MARGIN * shape.size, LEAST_MARGIN, MOST_MARGIN))
         typical, frame_s = float(np.median(variance)), self.bank.frame_s
         size = shape.size + 2 * margin
-        whole = process.covariance(np.arange(size) * frame_s, np.full(size, typical))
+        whole = process.covariance(np.arange(size, dtype=np.float64) * frame_s, np.full(size, typical))
         both = np.zeros((size, 2))
         both[margin : margin + shape.size, 0] = shape
         both[size // 2, 1] = 1.0

@@ -124,7 +124,9 @@ def stare_of(frames: Frames, used: Bool) -> Stare:
     # Nothing is shared over long gaps, whose frames would only take memory.
     numbers = np.concatenate([[0], np.cumsum(np.minimum(np.diff(numbers), MAX_GAP))])
     ones = np.ones(numbers.size)
-    return Stare(numbers * frames.cadence_s, frames.cadence_s, ones, ones, ones, np.zeros(numbers.size))
+    return Stare(
+        np.asarray(numbers * frames.cadence_s, np.float64), frames.cadence_s, ones, ones, ones, np.zeros(numbers.size)
+    )
 
 
 def bank_of(stare: Stare, directions: Float, shape: Shape) -> Bank:

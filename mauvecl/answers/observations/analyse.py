@@ -145,7 +145,7 @@ class EventRow:
 
     @property
     def fitted_s(self) -> tuple[float, float, float, float, float]:
-        """Equivalent duration of the whole flare, and the ends of its 68 % and 95 % intervals; NaN if it is no flare."""
+        """Equivalent duration of the whole flare and the ends of its 68 and 95 % intervals; NaN if it is no flare."""
         energy = self.event.energy
         if self.event.kind != "flare":
             return (float("nan"),) * 5
@@ -218,8 +218,8 @@ EVENTS = (
            lambda days: f"{1440 * days:.3g}"),
     Column("ampl_rec", "event.amplitude", "", "largest flux above the level, relative to the level", "peak",
            percent(".3g")),
-    Column("ed", lambda row: row.fitted_s[0], "s", "recommended equivalent duration, of the whole flare: the light that "
-           "is observed, and the shape where it is not; proportional to the energy; nan: no flare", "ED (s)",
+    Column("ed", lambda row: row.fitted_s[0], "s", "recommended equivalent duration, of the whole flare: the light "
+           "that is observed, and the shape where it is not; proportional to the energy; nan: no flare", "ED (s)",
            number(".4g")),
     Column("ed_low", lambda row: row.fitted_s[1], "s", "lower end of its 68 % interval, which includes the errors of "
            "level and shape", "68 %", interval(".4g"), ("ed_high",)),
@@ -241,7 +241,8 @@ EVENTS = (
     Column("value", "event.value", "", "statistic of the search: S/N of the best template", "S/N", number(".4g")),
     Column("rate_modelled", lambda row: row.rates[0], "1 / d", "false alarms per star-day above this statistic in "
            "light curves of the fitted process"),
-    Column("rate_measured", lambda row: row.rates[1], "1 / d", "the same with residuals resampled from quiescent frames"),
+    Column("rate_measured", lambda row: row.rates[1], "1 / d", "the same with residuals resampled from quiescent "
+           "frames"),
     Column("probability", "probability", "", "probability of such an event from noise anywhere in these frames, by "
            "the larger rate", "from noise", _rate),
     Column("significant", "significant", "", "whether the rate is at most the wanted one", kind=bool),
