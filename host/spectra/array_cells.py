@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 
 from mauvecl.schema.errors import InputError
 
-from .column_choice import Choice, listed, plain
+from .column_choice import Choice, as_typed, listed, numbered, plain
 from .file_table import FileTable
 
 #: Columns whose presence shows that rows are parts of one spectrum: detector segments and echelle orders.
@@ -131,11 +130,10 @@ def _row_asked(identifiers: Sequence[Sequence[str]], asked: Sequence[str], names
     """Return the selected row: the only one, the one with the requested identifier, or ``row 3``."""
     fitting = list(range(len(identifiers)))
     for word in asked:
-        if match := re.fullmatch(r"row\s+(\d{1,9})", word.strip(), re.IGNORECASE):
-            number = int(match[1])
-            if not 1 <= number <= len(identifiers):
-                raise InputError.of("row", number, f"1 to {len(identifiers)}")
-            fits = [number - 1]
+        if (place := numbered("row", word)) is not None:
+            if place >= len(identifiers):
+                raise InputError.of("row", place + 1, f"1 to {len(identifiers)}")
+            fits = [place]
         else:
             fits = [row for row in fitting if word.strip() in identifiers[row]]
         if not fits:
@@ -148,7 +146,7 @@ def _row_asked(identifiers: Sequence[Sequence[str]], asked: Sequence[str], names
         labels = [f"row {row + 1}" for row in fitting]
     raise InputError(
         f"{len(fitting)} spectra are in it, one in each row ({listed(labels)})",
-        f"one: name it as in FILE[{(labels or ['row 1'])[0][:30]}]",
+        f"one: name it as in {as_typed((labels or ['row 1'])[0], 'row', (fitting or [0])[0], labels)}",
         key="rows",
         value=labels,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,10 +21,24 @@ def plain(name: str) -> str:
     return " ".join(name.strip().strip("\"'").lower().split())
 
 
+def numbered(kind: str, word: str) -> int | None:
+    """Return the index in a word such as ``row 3``, or None."""
+    match = re.fullmatch(rf"{kind}\s+(\d{{1,9}})", word.strip(), re.IGNORECASE)
+    return int(match[1]) - 1 if match and int(match[1]) > 0 else None
+
+
 def listed(names: Sequence[str]) -> str:
     """Join names for a message; a long list ends with the number of omitted names."""
     shown = [name.strip()[:40] for name in names]
     return ", ".join(shown[:MAX_LISTED]) + (f" and {len(shown) - MAX_LISTED} more" if len(shown) > MAX_LISTED else "")
+
+
+def as_typed(name: str, kind: str, place: int, names: Sequence[str] = ()) -> str:
+    """Return ``FILE[name]`` for a message, or ``FILE[row 3]`` where the name cannot be typed or is not the only one."""
+    word = name.strip()
+    typed = re.fullmatch(r"[^\[\],\n]{1,60}", word) is not None
+    alone = sum(plain(one) == plain(word) for one in names) < 2
+    return f"FILE[{word}]" if typed and alone else f"FILE[{kind} {place + 1}]"
 
 
 @dataclass(frozen=True)
@@ -59,6 +74,8 @@ def choose(names: Sequence[str], roles: Sequence[Role], asked: Sequence[str] = (
 
 def _named(name: str, names: Sequence[str]) -> int:
     indices = [i for i, one in enumerate(names) if one.strip() == name]
+    if not indices and (place := numbered("column", name)) is not None and place < len(names):
+        return place
     indices = indices or [i for i, one in enumerate(names) if plain(one) == plain(name)]
     if len(indices) != 1:
         raise InputError(
@@ -92,10 +109,11 @@ def _flux(names: Sequence[str], roles: Sequence[Role], wavelength: tuple[int, ..
     unknown = [i for i in rest if roles[i].kind == "unknown"]
     if len(rest) == len(unknown) == 1:
         return unknown[0]
+    shown = (unknown or rest or [0])[0]
     held = [f"{names[i].strip()[:40]} ({roles[i].kind})" for i in rest]
     raise InputError(
         f"no column is recognised as a star's flux, only {listed(held) or 'the wavelength'}",
-        f"one named flux: name the column as in FILE[{names[(unknown or rest or [0])[0]].strip()[:40]}]",
+        f"one named flux: name the column as in {as_typed(names[shown], 'column', shown, names)}",
         key="columns",
         value=held,
     )
@@ -119,7 +137,7 @@ def _only(what: str, names: Sequence[str], indices: Sequence[int]) -> int:
     several = [names[i].strip() for i in indices]
     raise InputError(
         f"{len(several)} columns may be the {what}: {listed(several)}",
-        f"one: name it as in FILE[{several[-1][:40]}]",
+        f"one: name it as in {as_typed(several[-1], 'column', indices[-1], names)}",
         key="columns",
         value=several,
     )

@@ -32,7 +32,11 @@ def without_columns(path: str | Path) -> tuple[Path, tuple[str, ...]]:
 
 
 def read_spectrum(
-    path: Path, *, wavelength_unit: str | u.UnitBase | None = None, flux_unit: str | u.UnitBase | None = None
+    path: Path,
+    *,
+    wavelength_unit: str | u.UnitBase | None = None,
+    flux_unit: str | u.UnitBase | None = None,
+    ignore_checksum: bool = False,
 ) -> ReadSpectrum:
     """Read a spectrum from text, ECSV, VOTable or FITS, which may be compressed by gzip, bzip2 or xz.
 
@@ -45,6 +49,8 @@ def read_spectrum(
         state their units.
     wavelength_unit, flux_unit : str or Unit, optional
         Units that override those of the file; a unit of wavelength may end in " air" or " vacuum".
+    ignore_checksum : bool
+        Whether a FITS file is read that its CHECKSUM or DATASUM contradicts.
     """
     import numpy as np
 
@@ -59,7 +65,8 @@ def read_spectrum(
     content = read_bytes(place, "spectrum file")
     shown = place.name if len(place.name) <= 80 else shortened(place.name)
     try:
-        tables = _tables(unpacked(content, "it"), _stem(place.name), f"file {shown}", asked, wavelength_unit, flux_unit)
+        units = (wavelength_unit is None, flux_unit is None)
+        tables = _tables(unpacked(content, "it"), _stem(place.name), f"file {shown}", asked, units, not ignore_checksum)
         # Overflows become infinities, which the check of points rejects.
         with np.errstate(all="ignore"):
             return converted(spectrum_in(tables, asked), wavelength_unit, flux_unit)
@@ -73,14 +80,14 @@ def _stem(name: str) -> str:
 
 
 def _tables(
-    content: bytes, name: str, origin: str, asked: Sequence[str], wavelength_unit: object, flux_unit: object
+    content: bytes, name: str, origin: str, asked: Sequence[str], units: tuple[bool, bool], check: bool
 ) -> list[FileTable]:
     from .fits_files import fits_tables
     from .table_files import ecsv_tables, votable_tables
     from .text import text_of, text_tables
 
     if content[:9] == b"SIMPLE  =":
-        return fits_tables(content, name, origin, asked)
+        return fits_tables(content, name, origin, asked, check)
     start = content[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")
     if re.match(rb"<(\?xml|votable|vot:)", start, re.IGNORECASE) and b"VOTABLE" in content[:4096].upper():
         return votable_tables(content, name, origin)
@@ -94,4 +101,4 @@ def _tables(
     text = text_of(content)
     if re.match(r"#\s*%ECSV", text):
         return ecsv_tables(text, name, origin)
-    return text_tables(text, name, f"text {origin}", asked, wavelength_unit is None, flux_unit is None)
+    return text_tables(text, name, f"text {origin}", asked, *units)

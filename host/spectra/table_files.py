@@ -11,7 +11,8 @@ from typing import Any
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
-from ..files.ecsv import parse_ecsv
+from ..tables.ecsv import parse_ecsv
+from ..tables.medium import medium_of
 from .file_table import Column, FileTable
 
 #: Largest number and length of messages in the table of a kept star.
@@ -35,6 +36,7 @@ def ecsv_tables(text: str, name: str, origin: str) -> list[FileTable]:
             own.strip()[:80] if isinstance(own, str) and own.strip() else name,
             origin,
             remarks="\n".join(_texts(meta.get("comments"))),
+            medium=partial(medium_of, meta),
             messages=_texts(meta.get("told")),
         )
     ]
@@ -60,7 +62,9 @@ def votable_tables(content: bytes, name: str, origin: str) -> list[FileTable]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            tables = list(votable.parse(io.BytesIO(content), verify="ignore").iter_tables())
+            file = votable.parse(io.BytesIO(content), verify="ignore")
+            tables = list(file.iter_tables())
+            shared = {param.name or param.ID: param.value for one in file.resources for param in one.params}
     except Exception as error:  # the parser raises many kinds
         raise InputError(
             f"cannot be read as a VOTable ({shortened(str(error))})", "a complete VOTable", key="file", value=str(error)
@@ -80,6 +84,7 @@ def votable_tables(content: bytes, name: str, origin: str) -> list[FileTable]:
             origin,
             label=str(table.name or table.ID or i + 1),
             remarks="\n".join(f"{field.ucd or ''} {field.description or ''}" for field in table.fields)[:5000],
+            medium=partial(medium_of, shared, {param.name or param.ID: param.value for param in table.params}),
         )
         for i, table in enumerate(tables)
     ]

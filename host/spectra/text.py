@@ -13,6 +13,8 @@ import numpy as np
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
+from ..tables.medium import medium_of
+from ..tables.text_table import keywords_of
 from .column_choice import AXES
 from .column_roles import Role
 from .file_table import Column, FileTable
@@ -78,7 +80,11 @@ def text_tables(
     else:
         columns = _unnamed(rows, n, asked, messages)
     columns = _with_units_of(remarks, columns, wavelength, flux, is_named=bool(names))
-    return [FileTable(columns, name, origin, implied_units=IMPLIED_UNITS, remarks=remarks, messages=tuple(messages))]
+    keywords = keywords_of([f"# {line}" for line, _ in header])
+    return [
+        FileTable(columns, name, origin, implied_units=IMPLIED_UNITS, remarks=remarks, messages=tuple(messages),
+                  medium=partial(medium_of, keywords))
+    ]  # fmt: skip
 
 
 Row = tuple[int, str, list[str]]

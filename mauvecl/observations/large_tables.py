@@ -10,8 +10,8 @@ from typing import IO, Any
 
 import numpy as np
 
-from mauvecl.host.files.text_table import text_table
-from mauvecl.observations.folder_frames import keywords_of
+from mauvecl.host.tables.names import matched
+from mauvecl.host.tables.text_table import keywords_of, text_table
 from mauvecl.observations.values import FrameFile, TableFile, Values
 from mauvecl.schema.errors import InputError
 
@@ -66,7 +66,7 @@ class LargeTable(FrameFile):
 
     def named(self, name: str) -> Values | None:
         """Return a column."""
-        found = next((one for one in self.names if one.lower() == name.lower()), None)
+        found = matched(name, self.names, self.what)
         if found is None:
             return None
         return Values(name, (self.n_rows,), lambda start, stop: self._rows(start, stop)[found],

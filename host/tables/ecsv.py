@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
-from .parsing import as_text, parsing
-from .size_limits import limit_bytes, read_bytes, unpacked
+from ..files.parsing import as_text, parsing
+from ..files.size_limits import limit_bytes, read_bytes, unpacked
+from .times import with_mission_formats
 
 if TYPE_CHECKING:
     import numpy as np
@@ -50,6 +51,8 @@ def parse_ecsv(text: str, what: str, expected: str = "an ECSV table") -> Table:
     lines = text.splitlines()
     check_header(lines, what)
     check_cells([line for line in lines if not line.startswith("#")], what)
+    # Those of lightkurve have times in the days of the missions.
+    with_mission_formats()
     with parsing(what, expected), warnings.catch_warnings():
         # astropy warns of many headers that it can read.
         warnings.simplefilter("ignore")

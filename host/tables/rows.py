@@ -1,0 +1,193 @@
+"""Small tables of users with a row for each star or flare, in any common format: text, ECSV, FITS or VOTable."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Collection, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
+
+from ..files.parsing import as_text, parsing
+from ..files.size_limits import read_bytes, unpacked
+from .coordinates import angle, angle_unit, unit_in_name
+from .fits import column_values, open_fits, reading
+from .names import STARS, divided_unit, first_of
+from .text_table import MISSING, text_table
+from .times import time_unit
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+FORMATS = "CSV, ECSV, FITS or VOTable"
+
+
+def read_table(
+    path: str | Path, what: str, expected: str = FORMATS, *, texts: Collection[str] = STARS, commas: bool = False
+) -> Table:
+    """Read the table in a text file, the first table of a FITS file, or that of a VOTable.
+
+    Parameters
+    ----------
+    path : str or Path
+        Packed by gzip, bzip2 or xz or not.
+    what, expected : str
+        What the file should be, for messages: "flare table", "CSV or FITS".
+    texts : collection of str
+        Names of columns whose cells stay text, such as "0012".
+    commas : bool
+        Whether text is CSV in any case, instead of by the file's extension.
+    """
+    path = Path(path)
+    named = f"{what} {shortened(str(path))}"
+    content = unpacked(read_bytes(path, what), named)
+    if content.startswith(b"SIMPLE  ="):
+        return _fits_table(content, named, expected)
+    if b"<VOTABLE" in content[:4096]:
+        return votable(content, named, expected)
+    commas |= ".csv" in (suffix.lower() for suffix in path.suffixes[-2:])
+    return text_table(as_text(content, named), named, commas, expected, texts=texts)
+
+
+def _fits_table(content: bytes, named: str, expected: str) -> Table:
+    """Read the first table of a FITS file."""
+    from astropy.io import fits
+    from astropy.table import MaskedColumn, Table
+
+    with open_fits(io.BytesIO(content), named) as hdus, reading(named):
+        for hdu in hdus:
+            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU):
+                return Table(
+                    [MaskedColumn(np.ma.array(column_values(hdu.data, column), copy=True), str(column.name),
+                                  unit=column.unit) for column in hdu.columns],
+                    meta=dict(hdu.header),
+                )  # fmt: skip
+        raise InputError(f"{named} has no table", expected, key="file")
+
+
+def votable(content: bytes, named: str, expected: str) -> Table:
+    """Read the first table of a VOTable; raises InputError if it defines entities."""
+    from astropy.table import Table
+
+    if b"<!ENTITY" in content or b"<!DOCTYPE" in content:
+        raise InputError(f"{named} defines entities", "a VOTable without them", key="file")
+    with parsing(named, expected), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return Table.read(io.BytesIO(content), format="votable", table_id=0, use_names_over_ids=True)
+
+
+class Rows:
+    """Cells of a small table by the names of its columns, in any case.
+
+    Parameters
+    ----------
+    table : Table
+    named : str
+        The table, for messages.
+    key : str
+        Key of errors; by default that of the column.
+    """
+
+    def __init__(self, table: Table, named: str, key: str | None = None) -> None:
+        self.table, self.named, self.key, self.n = table, named, key, len(table)
+
+    @cached_property
+    def names(self) -> list[str]:
+        """Names of the columns."""
+        return [str(name) for name in self.table.colnames]
+
+    def first(self, wanted: Sequence[str]) -> str | None:
+        """Return the column that has the first of some names."""
+        return first_of(wanted, self.names, self.named)
+
+    def text(self, name: str | None, row: int) -> str:
+        """Return the text of a cell; empty for a missing one."""
+        if name is None:
+            return ""
+        value = self.table[name][row]
+        if np.ma.is_masked(value):
+            return ""
+        text = (
+            value.decode("utf-8", "replace") if isinstance(value, bytes) else str(getattr(value, "value", value))
+        ).strip()
+        return "" if text in MISSING or text.lower() == "nan" else text
+
+    def unit(self, name: str) -> str:
+        """Return the unit of a column as the table states it, or in its name, as in ``distance (pc)``; or nothing."""
+        stated = getattr(self.table[name], "unit", None)
+        return divided_unit(name)[1] if stated is None else str(stated).strip()
+
+    def number(self, name: str | None, row: int, unit: str = "", *, above: float = -np.inf) -> float | None:
+        """Return the number of a cell in a unit, None for a missing one; raise InputError for anything else.
+
+        Parameters
+        ----------
+        unit : str
+            Unit of the result, which the column is in if it states none.
+        above : float
+            Exclusive lower bound.
+        """
+        text = self.text(name, row)
+        if name is None or not text:
+            return None
+        cell = self.table[name][row]
+        try:
+            # Numbers of single precision are those that the file holds, not their shortest text.
+            value = float(getattr(cell, "value", cell) if self.table[name].dtype.kind in "iuf" else text)
+            value *= self._factor(name, unit)
+        except InputError:
+            raise
+        except ValueError:
+            value = np.nan
+        if not (np.isfinite(value) and above < value):
+            expected = "a number" if np.isinf(above) else f"a number above {above:g}"
+            raise self.error(f"row {row + 1} has {name} = {shortened(text)}", expected, name, text)
+        return value
+
+    def degrees(self, name: str, row: int, *, right_ascension: bool) -> float | None:
+        """Return an angle in degrees, None for a missing one: numbers, or sexagesimal text."""
+        text = self.text(name, row)
+        if not text:
+            return None
+        stated = getattr(self.table[name], "unit", None)
+        unit = unit_in_name(name) if stated is None else angle_unit(str(stated))
+        if unit is None:
+            raise self.error(f"{name} has the unit {shortened(str(stated))}", "an angle", name, str(stated))
+        try:
+            return angle(text, unit, right_ascension=right_ascension)
+        except ValueError as error:
+            expected = getattr(error, "expected", None) or "degrees, or sexagesimal text such as 10h30m00s or 10:30:00"
+            raise self.error(f"row {row + 1} has {name} = {shortened(text)}", expected, name, text) from error
+
+    def error(self, fault: str, expected: str, name: str, value: Any = None) -> InputError:
+        """Return the error of a column or cell."""
+        return InputError(f"{self.named}: {fault}", expected, key=self.key or name, value=value)
+
+    def _factor(self, name: str, unit: str) -> float:
+        """Return the factor from the unit of a column to another."""
+        import astropy.units as u
+
+        stated = self.unit(name)
+        if not stated or stated == unit or not unit:
+            return 1.0
+        try:
+            days = time_unit(stated)
+            return float(u.Unit(days.unit if days else _SPELT.get(stated.lower(), stated)).to(unit))
+        except (ValueError, TypeError, u.UnitsError) as error:
+            if getattr(self.table[name], "unit", None) is None:
+                # Words in brackets that are no unit, as in ``mass (this work)``.
+                return 1.0
+            raise self.error(
+                f"{name} has the unit {shortened(stated)}", f"a unit such as {unit}", name, stated
+            ) from error
+
+
+#: Units of stars as catalogues spell them.
+_SPELT = {"msun": "solMass", "m_sun": "solMass", "solmass": "solMass", "rsun": "solRad", "k": "K", "years": "yr",
+          "gyr": "Gyr", "myr": "Myr", "/d": "1/d", "1/day": "1/d", "d-1": "1/d", "per day": "1/d"}  # fmt: skip
