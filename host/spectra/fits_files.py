@@ -36,6 +36,7 @@ def fits_tables(content: bytes, name: str, origin: str, asked: Sequence[str]) ->
         # astropy warns of the headers of old archive files that it can read.
         warnings.simplefilter("ignore")
         hdus = fits.open(io.BytesIO(content), memmap=False, lazy_load_hdus=False, disable_image_compression=True)
+        check_extensions(hdus)
         check_sums(hdus)
         return _Reader(hdus, name, origin, asked).tables()
 
@@ -95,6 +96,17 @@ def check_sizes(content: Content) -> None:
             )
         place = start + -(-size // BLOCK) * BLOCK
     raise InputError(f"has more than {MAX_EXTENSIONS} extensions", "fewer", key="file", value=MAX_EXTENSIONS)
+
+
+#: astropy's classes of extensions whose headers it cannot interpret.
+DAMAGED = ("_ValidHDU", "_NonstandardHDU", "_CorruptedHDU")
+
+
+def check_extensions(hdus: Any) -> None:
+    """Raise InputError for an extension whose header is damaged, such as a second primary header."""
+    for number, hdu in enumerate(hdus):
+        if type(hdu).__name__ in DAMAGED:
+            raise InputError(f"has a damaged header in extension {number}", WHOLE, key="file", value=number)
 
 
 def check_sums(hdus: Any) -> None:

@@ -9,9 +9,9 @@ from functools import partial
 from typing import Any
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
 
 from ..files.ecsv import parse_ecsv
+from ..files.parsing import parsing
 from .file_table import Column, FileTable
 
 #: Largest number and length of messages in the table of a kept star.
@@ -57,14 +57,9 @@ def votable_tables(content: bytes, name: str, origin: str) -> list[FileTable]:
 
     if b"<!ENTITY" in content or b"<!DOCTYPE" in content:
         raise InputError("defines entities", "a VOTable without entities", key="file")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            tables = list(votable.parse(io.BytesIO(content), verify="ignore").iter_tables())
-    except Exception as error:  # the parser raises many kinds
-        raise InputError(
-            f"cannot be read as a VOTable ({shortened(str(error))})", "a complete VOTable", key="file", value=str(error)
-        ) from error
+    with parsing("it", "a complete VOTable"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        tables = list(votable.parse(io.BytesIO(content), verify="ignore").iter_tables())
     return [
         FileTable(
             [

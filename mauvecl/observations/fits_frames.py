@@ -12,7 +12,7 @@ import numpy as np
 
 from mauvecl.host.files.parsing import parsing
 from mauvecl.host.spectra.air import vacuum_from_air
-from mauvecl.host.spectra.fits_files import BLOCK, check_sizes, text_at
+from mauvecl.host.spectra.fits_files import BLOCK, check_extensions, check_sizes, text_at
 from mauvecl.host.spectra.fits_images import axis_of
 from mauvecl.observations.values import PIECE_BYTES, FrameFile, Values
 from mauvecl.schema.errors import InputError
@@ -43,7 +43,9 @@ class FitsFile(FrameFile):
     ) -> None:
         self.hdus = hdus
         self.tables = [k for k, one in enumerate(hdus) if hasattr(one, "columns") and not one.is_image]
-        self.images = [k for k, one in enumerate(hdus) if one.is_image and one.header.get("NAXIS", 0)]
+        self.images = [
+            k for k, one in enumerate(hdus) if getattr(one, "is_image", False) and one.header.get("NAXIS", 0)
+        ]
         columns = {k: {str(name).lower() for name in hdus[k].columns.names} for k in self.tables}
         fitting = [k for k in self.tables if all(columns[k] & {name.lower() for name in names} for names in wanted)]
         self.chosen = next(iter(fitting or self.tables), None)
@@ -67,7 +69,7 @@ class FitsFile(FrameFile):
     @property
     def names(self) -> list[str]:
         """Names of the columns of the chosen table, of images, and of the columns of other tables."""
-        chosen = [] if self.chosen is None else list(self.hdus[self.chosen].columns.names)
+        chosen = [] if self.chosen is None else [str(name) for name in self.hdus[self.chosen].columns.names]
         others = [f"{self._label(k)}/{name}" for k in self.tables if k != self.chosen
                   for name in self.hdus[k].columns.names]  # fmt: skip
         return [*chosen, *(self._label(k) for k in self.images), *others]
@@ -154,10 +156,14 @@ class FitsFile(FrameFile):
                              f"than {PIECE_BYTES >> 20} MiB", "columns of fixed length", key="hdu")  # fmt: skip
         pair = str(self.header.get(f"TCTYP{hdu.columns.names.index(found.name) + 1}", "")).upper() in SCALES
         missing = found.null
+        bits = str(found.format).endswith("X")
 
         def read(start: int, stop: int) -> Any:
             with _reading(self.what):
                 values = (hdu.data[start:stop] if small else _piece(hdu, start, stop)).field(found.name)
+            if bits:
+                # Flags: a number that is zero if no bit is set.
+                return np.count_nonzero(values.reshape(len(values), -1), axis=1)
             if pair and values.ndim == 2 and number == self.chosen:
                 return (values[:, 0] - 2_400_000.5) + values[:, 1]
             return np.ma.masked_equal(values, missing) if isinstance(missing, int) else values
@@ -201,6 +207,10 @@ def open_fits(file: IO[bytes], what: str) -> Iterator[fits.HDUList]:
     with _reading(what):
         hdus = fits.open(file, mode="readonly", memmap=False, lazy_load_hdus=False)
     with hdus:
+        try:
+            check_extensions(hdus)
+        except InputError as error:
+            raise error.within(what) from error
         yield hdus
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.files.parsing import parsing
-from mauvecl.host.files.size_limits import limit_bytes, open_regular, packed, read_bytes, unpacked
+from mauvecl.host.files.size_limits import check_size, limit_bytes, open_regular, packed, read_bytes, unpacked
 from mauvecl.host.files.text_table import text_table
 from mauvecl.host.spectra.air import vacuum_from_air
 from mauvecl.host.spectra.fits_files import check_sums
@@ -66,7 +66,7 @@ def read_frames(path: str | Path, mapping: FrameMapping | str | Path | None = No
     mapping : FrameMapping or path, optional
         Places of the quantities. Files of mauvecl, TESS, Kepler and lightkurve need none.
     """
-    with _frame_file(path, mapping) as (file, how, stem):
+    with _parsing(path), _frame_file(path, mapping) as (file, how, stem):
         return _frames_in(file, how, stem)
 
 
@@ -149,7 +149,7 @@ def reduce_frames(
         Weights of the pixels, in the order of the file; by default the sum over all pixels.
     mapping : FrameMapping or path, optional
     """
-    with _frame_file(path, mapping) as (file, how, stem):
+    with _parsing(path), _frame_file(path, mapping) as (file, how, stem):
         _, flux, error, _ = _light(found := Quantities.of(file, how), how)
         if len(flux.shape) != 2:
             raise InputError.of("flux", flux.shape, "spectra, shape (n_frame, n_pixel)", where=file.what)
@@ -160,6 +160,11 @@ def reduce_frames(
             for k in range(sums.sums.shape[1])
         )
         return ReducedFrames(curves, sums.pixels)
+
+
+def _parsing(path: str | Path) -> AbstractContextManager[None]:
+    """Return a context in which exceptions of other libraries become errors of a file."""
+    return parsing(f"file {shortened(Path(path).name)}", FORMATS)
 
 
 @contextmanager
@@ -191,13 +196,17 @@ def _open_frames(
         else:
             yield FolderFile(path, mapping, what, lambda one: _opened(one, f"file {one.name!r}", name)), mapping
         return
-    with _opened(path, what, name, mapping) as file:
+    with _opened(path, what, name, mapping, large=True) as file:
         yield file, mapping or (file.mapping if isinstance(file, StoredFile) else _recognised(file))
 
 
 @contextmanager
-def _opened(path: Path, what: str, name: str | None, mapping: FrameMapping | None = None) -> Iterator[FrameFile]:
-    """Open a file by its first bytes."""
+def _opened(
+    path: Path, what: str, name: str | None, mapping: FrameMapping | None = None, *, large: bool = False
+) -> Iterator[FrameFile]:
+    """Open a file by its first bytes; only `large` ones may exceed MAUVECL_LARGEST_FILE_MIB."""
+    if not large:
+        check_size(path, "file")
     with open_regular(path, "file") as raw:
         start = raw.read(16)
         raw.seek(0)
