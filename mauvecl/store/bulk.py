@@ -166,6 +166,7 @@ def _complete(store: Store, engine: Engine | Pool, resume: bool, restart: bool, 
             value=str(store.path),
         )
     _fill(store, todo, engine, progress)
+    store.sort_digests()
 
 
 @validated
@@ -360,6 +361,8 @@ def verify(
                 faults.append(fault)
             if progress is not None:
                 progress(number + 1, total)
+        if repair:
+            store.sort_digests()
         faults += [Fault(key, "not of this store", False) for key, own in files if not own]
     return faults
 
