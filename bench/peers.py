@@ -6,6 +6,7 @@ and returns sum((raw - mean)^2 / variance). A peer that is not installed is left
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import multiprocessing
 import time
@@ -13,6 +14,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from typing import Any
 
 import numpy as np
 
@@ -164,7 +166,10 @@ class Child:
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, make, model), daemon=True)
         self._process.start()
-        found = self._pipe.recv()
+        # The pipe ends with the child only if nobody else holds its end.
+        theirs.close()
+        self.name = make.__name__
+        found = self._received()
         if isinstance(found, str):
             raise ImportError(found)
         self.name, self.realisations, mean = found
@@ -172,14 +177,24 @@ class Child:
         if abs(mean - pixels) > 6 * np.sqrt(2 * pixels / 1024):
             print(f"CAUTION: {self.name} has a mean chi2 of {mean:.1f} for {pixels} pixels")
 
+    def _received(self) -> Any:
+        """Return what the child sends; raises ChildProcessError if it has ended."""
+        try:
+            return self._pipe.recv()
+        except (EOFError, ConnectionError) as error:
+            self._process.join()
+            raise ChildProcessError(f"{self.name} ended with exit code {self._process.exitcode}") from error
+
     def seconds(self) -> float:
-        """Return the time of one run, s."""
-        self._pipe.send(True)
-        return float(self._pipe.recv())
+        """Return the time of one run, s; raises ChildProcessError if the child has ended."""
+        with contextlib.suppress(ConnectionError):
+            self._pipe.send(True)
+        return float(self._received())
 
     def close(self) -> None:
         """End the process."""
-        self._pipe.send(False)
+        with contextlib.suppress(ConnectionError):
+            self._pipe.send(False)
         self._process.join()
 
 
@@ -202,6 +217,6 @@ def children(x: Expectation) -> list[Child]:
     for make in MAKERS:
         try:
             found.append(Child(make, Model.of(x)))
-        except ImportError as error:
+        except (ImportError, ChildProcessError) as error:
             print(f"left out: {error}")
     return found

@@ -26,6 +26,8 @@ ENERGIES = ("injections.low", "injections.high")
 WHOLE = (-(2**63), 2**64 - 1)
 #: Longest text and deepest nesting of a study or an instrument.
 LONGEST, DEEPEST = 4096, 32
+#: Place in a file, in messages of parsers.
+PLACE = re.compile(r"\b(?:line|row|column) \d{1,9}(?:,? (?:line|row|column) \d{1,9})*")
 #: Largest number of parts of a dotted TOML key.
 MOST_PARTS = 512
 
@@ -53,10 +55,10 @@ def parsing(what: str, expected: str) -> Iterator[None]:
     except MemoryError as error:
         raise InputError(f"{what} needs more memory than is available", expected, key="file") from error
     except Exception as error:
-        reason = next((line.strip() for line in str(error).splitlines() if line.strip()), "") or type(error).__name__
-        raise InputError(
-            f"{what} cannot be read ({printable(reason, 160)})", expected, key="file", value=reason
-        ) from error
+        # Other libraries' messages are for their programmers, but may state the place.
+        place = PLACE.search(str(error))
+        fault = f"{what} cannot be read{f' ({place[0]})' if place else ''}"
+        raise InputError(fault, expected, key="file", value=str(error)[:200] or type(error).__name__) from error
 
 
 def read_text(path: Path, what: str) -> str:

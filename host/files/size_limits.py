@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import bz2
+import io
 import lzma
 import os
 import stat
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -33,7 +34,11 @@ def limit_bytes(variable: str) -> int:
     return int(text) << 20
 
 
-def open_regular(path: Path, what: str) -> IO[bytes]:
+#: Largest number of characters of a line of text.
+LONGEST_LINE = 2**17
+
+
+def open_regular(path: Path, what: str) -> io.BufferedReader:
     """Open a regular file for reading.
 
     Parameters
@@ -89,6 +94,60 @@ def read_bytes(path: Path, what: str) -> bytes:
     return content
 
 
+def check_size(path: Path, what: str, most: int | None = None) -> int:
+    """Return the size of a regular file in bytes, without reading it.
+
+    Parameters
+    ----------
+    most : int, optional
+        Largest size, bytes; by default MAUVECL_LARGEST_FILE_MIB.
+
+    Raises InputError if the file is larger, or as `open_regular`.
+    """
+    with open_regular(path, what) as file:
+        size = os.fstat(file.fileno()).st_size
+    largest = limit_bytes("MAUVECL_LARGEST_FILE_MIB") if most is None else most
+    if size > largest:
+        remedy = "less; MAUVECL_LARGEST_FILE_MIB sets the limit" if most is None else "less"
+        raise InputError(
+            f"{what} {shortened(str(path))} has more than {largest >> 20} MiB",
+            remedy,
+            key="MAUVECL_LARGEST_FILE_MIB" if most is None else "file",
+            value=largest >> 20,
+        )
+    return size
+
+
+def check_folder(path: Path, what: str, most_json: int = 16 << 20) -> None:
+    """Check the files of a folder before another library reads them.
+
+    Raises InputError for anything but regular files and folders, a file above MAUVECL_LARGEST_FILE_MIB, or JSON of more
+    than `most_json` bytes.
+    """
+    for folder, _, names in os.walk(path):
+        for name in names:
+            file = Path(folder) / name
+            check_size(file, what, most_json if name.endswith(".json") else None)
+
+
+def lines_in(file: IO[str], what: str) -> Iterator[str]:
+    """Yield the lines of a text, with their ends.
+
+    Raises InputError for a line of more than `LONGEST_LINE` characters, of which no more is read.
+    """
+    number = 1
+    while line := file.readline(LONGEST_LINE + 2):
+        if len(line.rstrip("\r\n")) > LONGEST_LINE:
+            raise InputError(
+                f"{what} has more than {LONGEST_LINE} characters in line {number}",
+                f"at most {LONGEST_LINE}",
+                key="file",
+                value=number,
+            )
+        yield line
+        number += 1
+
+
 def packed(start: bytes) -> bool:
     """Return whether content is compressed by gzip, bzip2 or xz, by its first bytes."""
     return start.startswith((b"\x1f\x8b", b"BZh", b"\xfd7zXZ\x00"))
@@ -139,5 +198,5 @@ def _unpack(content: bytes, start: Callable[[], Any], form: str, what: str) -> b
                     raise EOFError("it ends too early")
             content = stream.unused_data.lstrip(b"\0")
     except (OSError, EOFError, zlib.error, lzma.LZMAError, MemoryError) as error:
-        raise InputError(f"{what} is damaged {form} ({error})", "a whole file", key="file", value=str(error)) from error
+        raise InputError(f"{what} is damaged {form}", "a whole file", key="file", value=str(error)) from error
     return b"".join(pieces)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
+from ..files.parsing import parsing
 from ..files.size_limits import read_bytes, unpacked
 
 if TYPE_CHECKING:
@@ -66,9 +67,11 @@ def read_spectrum(
     shown = place.name if len(place.name) <= 80 else shortened(place.name)
     try:
         units = (wavelength_unit is None, flux_unit is None)
-        tables = _tables(unpacked(content, "it"), _stem(place.name), f"file {shown}", asked, units, not ignore_checksum)
+        with parsing("it", "a spectrum"):
+            content, origin = unpacked(content, "it"), f"file {shown}"
+            tables = _tables(content, _stem(place.name), origin, asked, units, not ignore_checksum)
         # Overflows become infinities, which the check of points rejects.
-        with np.errstate(all="ignore"):
+        with parsing("it", "a spectrum"), np.errstate(all="ignore"):
             return converted(spectrum_in(tables, asked), wavelength_unit, flux_unit)
     except InputError as error:
         raise error.within(shown) from error

@@ -9,8 +9,8 @@ from functools import partial
 from typing import Any
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
 
+from ..files.parsing import parsing
 from ..tables.ecsv import parse_ecsv
 from ..tables.medium import medium_of
 from .file_table import Column, FileTable
@@ -59,16 +59,11 @@ def votable_tables(content: bytes, name: str, origin: str) -> list[FileTable]:
 
     if b"<!ENTITY" in content or b"<!DOCTYPE" in content:
         raise InputError("defines entities", "a VOTable without entities", key="file")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            file = votable.parse(io.BytesIO(content), verify="ignore")
-            tables = list(file.iter_tables())
-            shared = {param.name or param.ID: param.value for one in file.resources for param in one.params}
-    except Exception as error:  # the parser raises many kinds
-        raise InputError(
-            f"cannot be read as a VOTable ({shortened(str(error))})", "a complete VOTable", key="file", value=str(error)
-        ) from error
+    with parsing("it", "a complete VOTable"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        file = votable.parse(io.BytesIO(content), verify="ignore")
+        tables = list(file.iter_tables())
+        shared = {param.name or param.ID: param.value for one in file.resources for param in one.params}
     return [
         FileTable(
             [

@@ -11,7 +11,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
 from ..files.parsing import as_text, parsing
-from ..files.size_limits import limit_bytes, read_bytes, unpacked
+from ..files.size_limits import LONGEST_LINE, limit_bytes, read_bytes, unpacked
 from .times import with_mission_formats
 
 if TYPE_CHECKING:
@@ -162,8 +162,9 @@ def check_cells(lines: list[str], what: str) -> None:
             key="MAUVECL_LARGEST_CONTENT_MIB",
             value=widest,
         )
-    if widest > 2**17:
-        raise InputError(f"{what} has a line of {widest} characters", f"at most {2**17}", key="file", value=widest)
+    if widest > LONGEST_LINE:
+        fault = f"{what} has a line of {widest} characters"
+        raise InputError(fault, f"at most {LONGEST_LINE}", key="file", value=widest)
     odd = next((number for number, line in enumerate(lines, 1) if line.count('"') % 2), None)
     if odd is not None:
         raise InputError(f"{what} has a cell that extends beyond row {odd}", "one line per row", key="file", value=odd)

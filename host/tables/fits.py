@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 #: Bytes of a block (FITS standard 4.0, section 3.1), and largest numbers of cards of a header and of extensions.
 BLOCK, MAX_CARDS, MAX_EXTENSIONS = 2880, 100_000, 1000
 WHOLE = "a whole FITS file"
+#: astropy's classes of extensions whose headers it cannot interpret.
+DAMAGED = ("_ValidHDU", "_NonstandardHDU", "_CorruptedHDU")
 #: Bytes that are summed at a time.
 PIECE = 2**12 * BLOCK
 
@@ -112,6 +114,9 @@ def open_fits(file: IO[bytes], what: str = "", *, check: bool = True) -> fits.HD
         file.seek(0)
         with reading("it"):
             hdus = fits.open(file, mode="readonly", memmap=False, lazy_load_hdus=False, disable_image_compression=True)
+        for number, hdu in enumerate(hdus):
+            if type(hdu).__name__ in DAMAGED:
+                raise InputError(f"has a damaged header in extension {number}", WHOLE, key="file", value=number)
         if check:
             check_sums(hdus, content)
     except InputError as error:

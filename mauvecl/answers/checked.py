@@ -11,6 +11,7 @@ from typing import Any
 
 from mauvecl.host.files.json_text import json_text
 from mauvecl.host.files.parsing import read_text
+from mauvecl.host.files.size_limits import check_size, open_regular
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column
@@ -28,13 +29,16 @@ class FileFault:
     state: str  # "changed", "missing" or another fault
 
 
+#: Largest size of a file of an answer, bytes.
+LARGEST = 2**30
+
 #: Columns of the table of faults.
 FAULT_COLUMNS = (Column("file", heading="file"), Column("state", heading="what"))
 
 
 def digest_of(path: Path) -> str:
-    """Return the SHA-256 of a file, in hexadecimal."""
-    with path.open("rb") as opened:
+    """Return the SHA-256 of a file, in hexadecimal; raise InputError if it is no regular file."""
+    with open_regular(path, "file") as opened:
         return hashlib.file_digest(opened, "sha256").hexdigest()
 
 
@@ -98,8 +102,11 @@ def verify_answer(folder: str | Path) -> list[FileFault]:
         faults.append(FileFault(RECORD, "changed"))
     for name, digest in files.items():
         path = folder / name
-        if not path.is_file():
-            faults.append(FileFault(name, "missing"))
-        elif digest_of(path) != digest:
-            faults.append(FileFault(name, "changed"))
+        try:
+            same = path.exists() and check_size(path, "file", LARGEST) and digest_of(path) == digest
+        except (InputError, OSError):
+            faults.append(FileFault(name, f"no regular file of at most {LARGEST >> 30} GiB"))
+            continue
+        if not same:
+            faults.append(FileFault(name, "changed" if path.exists() else "missing"))
     return faults

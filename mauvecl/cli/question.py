@@ -63,9 +63,11 @@ def _is_toml(file: Path) -> bool:
     """Return whether a file contains TOML, that is a study, regardless of its name."""
     import tomllib
 
+    from mauvecl.host.files.size_limits import read_bytes
+
     try:
-        tomllib.loads(file.read_bytes()[:1_000_000].decode())
-    except (OSError, ValueError):
+        tomllib.loads(read_bytes(file, "file")[:1_000_000].decode())
+    except (ValueError, RecursionError):
         return False
     return True
 

@@ -12,22 +12,33 @@ import numpy as np
 
 from mauvecl.device import first_build, processor
 from mauvecl.device.engine import Engine
-from mauvecl.device.program import SAME_BITS, choose_device
+from mauvecl.device.errors import BuildError, DeviceError
+from mauvecl.device.program import SAME_BITS, choose_device, load_opencl, out_of_memory
 from mauvecl.device.toy_exposure import toy
 from mauvecl.noise import reference
 from mauvecl.noise.scene import prepare
 
 
 def child(request: dict[str, Any]) -> None:
-    """Build and run kernels within the limits and exit with 0, or print the reason of a failure and exit with 1."""
+    """Build and run kernels within the limits; print the reason of a failure, and exit with a code that says whose."""
     limit(request)
+    code = first_build.DRIVER_FAILED
     try:
         why = _build(request)
     except Exception as error:
         why = str(error).splitlines()[0] if str(error) else type(error).__name__
+        if not _is_drivers(error):
+            code = first_build.OTHER_FAILED
     if why:
         print(why)
-    sys.exit(1 if why else 0)
+    sys.exit(code if why else 0)
+
+
+def _is_drivers(error: Exception) -> bool:
+    """Return whether the driver is at fault for an exception, and not memory, disk or another device."""
+    if isinstance(error, DeviceError):
+        return isinstance(error, BuildError) or error.kind == "processor"
+    return isinstance(error, load_opencl().Error) and not out_of_memory(error)
 
 
 def limit(request: dict[str, Any]) -> None:
@@ -55,7 +66,7 @@ def _build(request: dict[str, Any]) -> str:
     """Draw a small scene and return a message if its counts are wrong, or an empty string."""
     handle, record = choose_device(str(request["number"]))
     if record.label != request["label"]:
-        return f"device {request['number']} is {record.label} in a new process, expected {request['label']}"
+        raise DeviceError(f"device {request['number']} is {record.label} in a new process, not {request['label']}")
     name = request["name"]
     if name is not None and not processor.set_processor_name(handle, name):
         return "PoCL's record of the device is not understood"

@@ -134,6 +134,13 @@ class KernelCache:
             new.write_text(f"{hashlib.sha256(text.encode()).hexdigest()}\n{text}", encoding="utf-8")
             new.replace(path)
 
+    def forget(self, prefix: str) -> int:
+        """Remove stored texts whose keys begin with `prefix`, and return their number."""
+        texts = list(self.store.glob(f"{prefix}*.txt"))
+        for path in texts:
+            path.unlink(missing_ok=True)
+        return len(texts)
+
     def publish(self) -> None:
         """Store programs built since the last call, and limit the size of the store."""
         self._store_new()

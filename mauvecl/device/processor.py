@@ -31,6 +31,9 @@ LEVELS = {
     "x86-64-v3": ("avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe"),
     "x86-64-v4": ("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"),
 }
+#: Bits of the registers in which each level passes vectors. They must agree with those of the library, which PoCL
+#: chooses by the processor: kernels for x86-64-v3 with the library for AVX-512 are not built within ten minutes.
+WIDTHS = {"x86-64": 128, "x86-64-v2": 128, "sandybridge": 256, "x86-64-v3": 256, "x86-64-v4": 512}
 #: LLVM's name of an unknown processor.
 UNKNOWN = "generic"
 #: Part of the version of a PoCL that chooses among libraries.
@@ -45,9 +48,9 @@ _names: dict[str, Any] = {}
 
 
 def levels(flags: frozenset[str]) -> tuple[str, ...]:
-    """Return the names that a processor with these flags can run, highest first."""
-    fitting = itertools.takewhile(lambda name: flags.issuperset(LEVELS[name]), LEVELS)
-    return tuple(fitting)[::-1]
+    """Return the names that a processor with these flags can run with the library that PoCL loads, highest first."""
+    fitting = tuple(itertools.takewhile(lambda name: flags.issuperset(LEVELS[name]), LEVELS))[::-1]
+    return tuple(name for name in fitting if WIDTHS[name] == WIDTHS[fitting[0]])
 
 
 @cache

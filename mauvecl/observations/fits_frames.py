@@ -37,7 +37,9 @@ class FitsFile(FrameFile):
     ) -> None:
         self.hdus = hdus
         self.tables = [k for k, one in enumerate(hdus) if hasattr(one, "columns") and not one.is_image]
-        self.images = [k for k, one in enumerate(hdus) if one.is_image and one.header.get("NAXIS", 0)]
+        self.images = [
+            k for k, one in enumerate(hdus) if getattr(one, "is_image", False) and one.header.get("NAXIS", 0)
+        ]
         columns = {k: {str(name).lower() for name in hdus[k].columns.names} for k in self.tables}
         fitting = [k for k in self.tables if all(columns[k] & {name.lower() for name in names} for names in wanted)]
         self.chosen = next(iter(fitting or self.tables), None)
@@ -61,7 +63,7 @@ class FitsFile(FrameFile):
     @property
     def names(self) -> list[str]:
         """Names of the columns of the chosen table, of images, and of the columns of other tables."""
-        chosen = [] if self.chosen is None else list(self.hdus[self.chosen].columns.names)
+        chosen = [] if self.chosen is None else [str(name) for name in self.hdus[self.chosen].columns.names]
         others = [f"{self._label(k)}/{name}" for k in self.tables if k != self.chosen
                   for name in self.hdus[k].columns.names]  # fmt: skip
         return [*chosen, *(self._label(k) for k in self.images), *others]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +11,8 @@ from typing import IO, Any
 
 import numpy as np
 
+from mauvecl.host.files.size_limits import lines_in
+from mauvecl.host.tables.ecsv import MOST_HEADER
 from mauvecl.host.tables.names import matched
 from mauvecl.host.tables.text_table import keywords_of, text_table
 from mauvecl.observations.values import FrameFile, TableFile, Values
@@ -112,19 +115,31 @@ def open_large(file: IO[bytes], what: str, commas: bool, expected: str) -> Itera
 
 def _pieces(text: IO[str], what: str, commas: bool, expected: str) -> Iterator[Any]:
     """Yield tables of consecutive rows, of which the first has the header's comments as keywords."""
+    lines = lines_in(text, what)
     head: list[str] = []
-    line = text.readline()
+    size = 0
+    line = next(lines, "")
     while line and (line.startswith("#") or not line.strip()):
         head.append(line)
-        line = text.readline()
+        size += len(line)
+        if size > MOST_HEADER:
+            fault = f"{what} has more than {MOST_HEADER} characters of comments and empty lines before its rows"
+            raise InputError(fault, "fewer", key="file", value=size)
+        line = next(lines, "")
     # A comment may hold the names; then this line is one of the rows.
     if len(text_table("".join([*head, line]), what, commas, expected)) == 0:
         head.append(line)
         line = ""
     first, header = 0, keywords_of([one.rstrip("\n") for one in head])
-    while lines := [*([line] if line else []), *text.readlines(PIECE)]:
-        line = ""
-        piece = text_table("".join([*head, *lines]), what, commas, expected, first)
+    rows = [line] if line else []
+    size = 0
+    for line in itertools.chain(lines, [""]):
+        rows += [line] if line else []
+        size += len(line)
+        if not rows or (line and size < PIECE):
+            continue
+        piece = text_table("".join([*head, *rows]), what, commas, expected, first)
+        rows, size = [], 0
         piece.meta |= {key: value for key, value in header.items() if key not in piece.meta}
         first += len(piece)
         yield piece

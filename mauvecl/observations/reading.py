@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.files.parsing import parsing
-from mauvecl.host.files.size_limits import limit_bytes, open_regular, packed, read_bytes, unpacked
+from mauvecl.host.files.size_limits import check_size, limit_bytes, open_regular, packed, read_bytes, unpacked
 from mauvecl.host.spectra.column_roles import words_of
 from mauvecl.host.spectra.formats import without_columns
 from mauvecl.host.spectra.text import text_of
@@ -96,7 +96,7 @@ def read_frames(
     ignore_checksum : bool
         Whether FITS files are read that their CHECKSUM or DATASUM contradicts.
     """
-    with _frame_file(path, mapping, check=not ignore_checksum) as (file, how, stem):
+    with _parsing(path), _frame_file(path, mapping, check=not ignore_checksum) as (file, how, stem):
         if quality_bits is not None:
             how = how.model_copy(update={"quality_bits": quality_bits})
         return _frames_in(file, how, stem)
@@ -181,7 +181,7 @@ def reduce_frames(
         Weights of the pixels, in the order of the file; by default the sum over all pixels.
     mapping : FrameMapping or path, optional
     """
-    with _frame_file(path, mapping) as (file, how, stem):
+    with _parsing(path), _frame_file(path, mapping) as (file, how, stem):
         _, flux, error, _ = _light(found := Quantities.of(file, how), how)
         if len(flux.shape) != 2:
             raise InputError.of("flux", flux.shape, "spectra, shape (n_frame, n_pixel)", where=file.what)
@@ -193,6 +193,11 @@ def reduce_frames(
             for k in range(sums.sums.shape[1])
         )
         return ReducedFrames(curves, sums.pixels)
+
+
+def _parsing(path: str | Path) -> AbstractContextManager[None]:
+    """Return a context in which exceptions of other libraries become errors of a file."""
+    return parsing(f"file {shortened(Path(path).name)}", FORMATS)
 
 
 @contextmanager
@@ -225,15 +230,23 @@ def _open_frames(
             open_one = partial(_opened, name=name, check=check)
             yield FolderFile(path, mapping, what, lambda one: open_one(one, f"file {one.name!r}")), mapping
         return
-    with _opened(path, what, name, mapping, check) as file:
+    with _opened(path, what, name, mapping, check, large=True) as file:
         yield file, mapping or (file.mapping if isinstance(file, StoredFile) else _recognised(file))
 
 
 @contextmanager
 def _opened(
-    path: Path, what: str, name: str | None, mapping: FrameMapping | None = None, check: bool = True
+    path: Path,
+    what: str,
+    name: str | None,
+    mapping: FrameMapping | None = None,
+    check: bool = True,
+    *,
+    large: bool = False,
 ) -> Iterator[FrameFile]:
-    """Open a file by its first bytes."""
+    """Open a file by its first bytes; only `large` ones may exceed MAUVECL_LARGEST_FILE_MIB."""
+    if not large:
+        check_size(path, "file")
     with open_regular(path, "file") as raw:
         start = raw.read(16)
         raw.seek(0)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.files.parsing import parsing
+from mauvecl.host.files.size_limits import check_folder
 from mauvecl.observations.fits_frames import FitsFile
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.observations.values import FrameFile, Values
@@ -88,7 +89,8 @@ class StoredFile(FrameFile):
 
     def _raw(self, start: int, stop: int) -> Float:
         first, last = start // self.per_row, -(-stop // self.per_row)
-        raw = np.asarray(self.scene.rows[first:last], np.float64).reshape(-1, self.parts["flux"].shape[1])
+        with parsing(self.what, EXPECTED):
+            raw = np.asarray(self.scene.rows[first:last], np.float64).reshape(-1, self.parts["flux"].shape[1])
         skipped = first * self.per_row
         return raw[start - skipped : stop - skipped]
 
@@ -117,6 +119,7 @@ def is_store(path: Path) -> bool:
 def open_store(path: Path, name: str | None, what: str) -> Iterator[StoredFile]:
     """Open a scene of a Zarr store."""
     zarr = _module("zarr")
+    check_folder(path, "file")
     with parsing(what, EXPECTED):
         group = zarr.open_group(path, mode="r")
     yield _in_groups(group, name, what)

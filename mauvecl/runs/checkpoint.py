@@ -168,15 +168,15 @@ class Checkpoint:
     def get(self, name: str) -> Arrays | None:
         """Return a shard that was counted before, or None."""
         path = self.folder / f"{name}.npz"
+        if not path.exists():
+            return None
         try:
-            data = path.read_bytes()
+            data = read_bytes(path, "shard")
             body, digest = data[:-DIGEST_BYTES], data[-DIGEST_BYTES:]
             if _named(name, body) != digest:
                 raise ValueError
             with np.load(io.BytesIO(body)) as arrays:
                 shard = {key: arrays[key] for key in arrays.files}
-        except FileNotFoundError:
-            return None
         except (OSError, ValueError, KeyError, zipfile.BadZipFile):
             with self._lock:
                 self.damaged += 1

@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import pickle
 import signal
 import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future
-from functools import partial
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -23,7 +25,7 @@ from mauvecl.host.version import VERSION
 from mauvecl.results.requests.requests import Countable, Shard
 from mauvecl.results.shard_sums import Arrays
 from mauvecl.runs.pool import Stopped
-from mauvecl.runs.shards import Task
+from mauvecl.runs.shards import Task, code_identity
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
@@ -42,6 +44,27 @@ MAX_TRIES = 8
 RECOUNT_S, MAX_REQUESTS = 5.0, 32
 
 
+@dataclass(eq=False)
+class _Attempt:
+    """A shard that is awaited."""
+
+    awaited: Future[Arrays]
+    task: Task
+    #: Number of the attempt, of at most `MAX_TRIES`.
+    tried: int = 1
+    #: Workers that may count it; None for all.
+    workers: list[str] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Counted:
+    """Answer of a worker."""
+
+    sums: Arrays
+    #: See `code_identity`.
+    code: tuple[str, str]
+
+
 @validated
 class DaskWorkers:
     """Workers of a Dask cluster, each with its own engine.
@@ -57,7 +80,8 @@ class DaskWorkers:
     Raises
     ------
     DeviceError
-        If no scheduler or worker answers, a worker has another version of mauvecl, or has no such device.
+        If no scheduler or worker answers, a worker has other code of mauvecl, or has no such device. Shards of workers
+        with other code that join later are refused and counted again by others.
     """
 
     first: Engine | None = None
@@ -69,12 +93,15 @@ class DaskWorkers:
             raise InputError(
                 "Dask is missing", "the package for Dask workers: pip install 'mauvecl[cluster]'", key="dask"
             ) from error
-        self._where, self._device, self.retries = where, device, 0
+        self._where, self._device, self.retries, self._sends = where, device, 0, 0
         self._lock = threading.Lock()
         self._closing = False
         self._given: dict[str, DaskFuture[Any]] = {}
         # Futures of submitted tasks.
-        self._sent: dict[DaskFuture[Any], Future[Arrays]] = {}
+        self._sent: dict[DaskFuture[Any], _Attempt] = {}
+        # Addresses of workers with other code, which may have joined after the start.
+        self._strangers: set[str] = set()
+        self._watching = False
         self._open = contextlib.ExitStack()
         try:
             self._client: Client = self._open.enter_context(_client(where, distributed))
@@ -90,8 +117,12 @@ class DaskWorkers:
                     raise DeviceError(
                         f"worker {worker} cannot work ({answer}), expected mauvecl {VERSION} and OpenCL there"
                     )
-                if answer[0] != VERSION:
-                    raise DeviceError(f"worker {worker} has mauvecl {answer[0]}, expected {VERSION} as here")
+                if answer[0] != code_identity():
+                    version, code = answer[0]
+                    raise DeviceError(
+                        f"worker {worker} has mauvecl {version} (code {code}), expected "
+                        f"{VERSION} (code {code_identity()[1]}) as here"
+                    )
             self._devices = [record for _, record in introduced.values()]
             self._counted = len(introduced), time.monotonic()
         except BaseException:
@@ -118,31 +149,92 @@ class DaskWorkers:
     def submit(self, task: Task) -> Future[Arrays]:
         """Submit a shard to any free worker; raw spectra are returned, and the task's `out` is not used."""
         awaited: Future[Arrays] = Future()
-        self._send(awaited, task, 1)
+        self._send(_Attempt(awaited, task))
         return awaited
 
-    def _send(self, awaited: Future[Arrays], task: Task, tried: int) -> None:
-        key = task.key
+    def _send(self, attempt: _Attempt) -> None:
+        awaited, task = attempt.awaited, attempt.task
         with self._lock:
             if self._closing:
                 awaited.set_exception(Stopped())
                 return
             try:
-                if key not in self._given:
-                    # A task instead of scattered data, since the scheduler can repeat it if its worker is lost.
-                    self._given[key] = self._client.submit(_keep, task.request, key=f"mauvecl-request-{key}")
+                attempt.workers = self._ours()
+                if task.key not in self._given:
+                    # A task instead of scattered data, since the scheduler can repeat it if its worker is lost. Bytes,
+                    # because a worker with other code might read and write a request differently.
+                    content, key = pickle.dumps(task.request), f"mauvecl-request-{task.key}-{self._sends}"
+                    self._given[task.key] = self._client.submit(_keep, content, key=key, workers=attempt.workers)
                     if len(self._given) > MAX_REQUESTS:
                         del self._given[next(iter(self._given))]
-                name = f"mauvecl-{task.name}-{tried}"
-                sent = self._client.submit(_count, self._given[key], task.shard, self._device, key=name, pure=False)
+                self._sends += 1
+                sent = self._client.submit(
+                    _count,
+                    self._given[task.key],
+                    task.shard,
+                    self._device,
+                    key=f"mauvecl-{task.name}-{self._sends}",
+                    workers=attempt.workers,
+                    pure=False,
+                )
             except (OSError, RuntimeError) as error:
                 # Dask raises either if its client has lost the scheduler.
                 awaited.set_exception(self._gone().with_traceback(error.__traceback__))
                 return
-            self._sent[sent] = awaited
-        sent.add_done_callback(partial(self._came, awaited, task, tried))
+            self._sent[sent] = attempt
+        sent.add_done_callback(partial(self._came, attempt))
 
-    def _came(self, awaited: Future[Arrays], task: Task, tried: int, sent: DaskFuture[Any]) -> None:
+    def _ours(self) -> list[str] | None:
+        """Return the addresses of workers with our code; None for all, also if those with our code have left."""
+        present = self._client.nthreads() if self._strangers else ()
+        return [worker for worker in present if worker not in self._strangers] or None
+
+    def _find_strangers(self) -> bool:
+        """Ask all workers for their code, and return whether more of them have other code than before."""
+        answers = self._client.run(code_identity, on_error="return")
+        # A worker that leaves raises OSError.
+        strangers = {worker for worker, code in answers.items() if not isinstance(code, OSError | tuple)}
+        strangers |= {worker for worker, code in answers.items() if isinstance(code, tuple) and code != code_identity()}
+        with self._lock:
+            new = not strangers <= self._strangers
+            self._strangers |= strangers
+            if new:
+                # Requests may be on workers with other code.
+                self._given.clear()
+            start, self._watching = new and not self._watching, self._watching or new
+        if start:
+            threading.Thread(target=self._watch, name="mauvecl-strangers", daemon=True).start()
+        return new
+
+    def _watch(self) -> None:
+        """Send shards again whose workers have all left, since Dask gives them to no others."""
+        while True:
+            time.sleep(RECOUNT_S)
+            try:
+                present = set(self._client.nthreads())
+            except (OSError, RuntimeError, AttributeError):
+                # The client is closed or has lost the scheduler.
+                return
+            with self._lock:
+                left = {
+                    sent: one for sent, one in self._sent.items() if one.workers and present.isdisjoint(one.workers)
+                }
+                for sent, attempt in left.items():
+                    del self._sent[sent]
+                    # The request was given to the same workers.
+                    self._given.pop(attempt.task.key, None)
+            for attempt in left.values():
+                self._again(attempt)
+
+    def _again(self, attempt: _Attempt, *, tried: int = 0) -> None:
+        """Send a shard again, after so many more failures that count."""
+        with self._lock:
+            self.retries += 1
+        attempt.tried += tried
+        self._send(attempt)
+
+    def _came(self, attempt: _Attempt, sent: DaskFuture[Any]) -> None:
+        awaited, task = attempt.awaited, attempt.task
         with self._lock:
             if self._sent.pop(sent, None) is None:
                 # The result is no longer needed.
@@ -150,30 +242,34 @@ class DaskWorkers:
         try:
             if sent.status == "finished":
                 try:
-                    counts = sent.result()
+                    answer = sent.result()
                 except OSError as broken:
                     # The connection may break between the end of a shard and the transfer of its counts.
                     awaited.set_exception(self._gone().with_traceback(broken.__traceback__))
                     return
-                awaited.set_result(counts)
-                return
+                if isinstance(answer, Counted) and answer.code == code_identity():
+                    awaited.set_result(answer.sums)
+                    return
             error = sent.exception() if sent.status == "error" else None
+            if sent.status in ("finished", "error") and self._find_strangers():
+                # Counted by a worker with other code.
+                self._again(attempt)
+                return
             known = isinstance(error, InputError | DeviceError)
-            if known or tried == MAX_TRIES:
-                reason = error if known else f"{error or 'the scheduler is gone'}"
+            if known or attempt.tried == MAX_TRIES:
+                reason = error or ("workers with other code" if sent.status == "finished" else "the scheduler is gone")
                 awaited.set_exception(DeviceError(f"cluster {self._where} failed at {task.shard}: {reason}", "failed"))
             elif sent.status in ("cancelled", "lost") and self._client.status != "running":
                 awaited.set_exception(self._gone())
             else:
-                with self._lock:
-                    self.retries += 1
-                    if error is None:
-                        # The request was lost with its worker.
+                if error is None:
+                    # The request was lost with its worker.
+                    with self._lock:
                         self._given.pop(task.key, None)
-                self._send(awaited, task, tried + 1)
+                self._again(attempt, tried=1)
         except BaseException as error:
             if not awaited.done():
-                awaited.set_exception(error)
+                awaited.set_exception(self._gone() if isinstance(error, OSError) else error)
 
     def stop(self) -> None:
         """Cancel submitted shards; workers of other machines complete the shard in progress."""
@@ -181,8 +277,8 @@ class DaskWorkers:
             self._closing = True
             sent, self._sent = self._sent, {}
         # Set the exception here, because neither Dask nor a cancelled future wakes concurrent.futures.wait.
-        for awaited in sent.values():
-            awaited.set_exception(Stopped())
+        for attempt in sent.values():
+            attempt.awaited.set_exception(Stopped())
         with contextlib.suppress(OSError, RuntimeError, TimeoutError):
             self._client.cancel(list(sent))
         # Kill workers of this machine, since completing a shard takes seconds.
@@ -303,7 +399,14 @@ _engine: Engine | None = None
 _one_at_a_time = threading.Lock()
 
 
-def _keep(request: Countable) -> Countable:
+def _keep(content: bytes) -> bytes:
+    return content
+
+
+@lru_cache(maxsize=4)
+def _request(content: bytes) -> Countable:
+    # A request keeps what it has computed for earlier shards.
+    request: Countable = pickle.loads(content)
     return request
 
 
@@ -319,14 +422,14 @@ def _engine_here(device: str | None, threads: int) -> Engine:
     return _engine
 
 
-def _introduce(device: str | None, dask_worker: Any = None) -> tuple[str, DeviceRecord]:
+def _introduce(device: str | None, dask_worker: Any = None) -> tuple[tuple[str, str], DeviceRecord]:
     with _one_at_a_time:
-        return VERSION, _engine_here(device, dask_worker.state.nthreads).device
+        return code_identity(), _engine_here(device, dask_worker.state.nthreads).device
 
 
-def _count(request: Countable, shard: Shard, device: str | None) -> Arrays:
+def _count(content: bytes, shard: Shard, device: str | None) -> Counted:
     from distributed import get_worker
 
     with _one_at_a_time:
         engine = _engine_here(device, get_worker().state.nthreads)
-        return engine.count(request, shard)
+        return Counted(engine.count(_request(content), shard), code_identity())

@@ -6,12 +6,15 @@ import hashlib
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from mauvecl.host.version import VERSION
 from mauvecl.results.requests.requests import Countable, Divisible, Shard
 
 #: Version of the content of a shard, raised with every change, so that shards of older versions are never added.
@@ -46,6 +49,21 @@ class Task:
     def name(self) -> str:
         """Name in a checkpoint."""
         return f"{self.key}-{self.shard.name}"
+
+
+#: Packages whose code affects the counts of a shard.
+DRAWING_PACKAGES = ("device", "kernels", "lightcurve", "noise", "results", "statistics")
+
+
+@cache
+def code_identity() -> tuple[str, str]:
+    """Return mauvecl's version, and a digest of the kernels and other code on which the counts of a shard depend."""
+    package, digest = Path(__file__).parents[1], hashlib.sha256()
+    for name in DRAWING_PACKAGES:
+        for path in sorted((package / name).rglob("*")):
+            if path.suffix in (".py", ".mako"):
+                digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return VERSION, digest.hexdigest()[:16]
 
 
 #: Fields that do not affect a draw.

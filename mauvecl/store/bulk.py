@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.files.atomic import UNFINISHED, write_whole
+from mauvecl.host.files.size_limits import check_size, read_bytes
 from mauvecl.runs.locks import locked
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
@@ -165,6 +166,7 @@ def _complete(store: Store, engine: Engine | Pool, resume: bool, restart: bool, 
             value=str(store.path),
         )
     _fill(store, todo, engine, progress)
+    store.sort_digests()
 
 
 @validated
@@ -281,11 +283,15 @@ FAULT_COLUMNS = (
 @validated
 def state(store: Store, chunk: Chunk) -> str:
     """Return ``good``, or the fault of a chunk's file; see `Fault`."""
-    try:
-        data = (store.path / chunk.key).read_bytes()
-    except FileNotFoundError:
+    place, size = store.path / chunk.key, store.chunk_bytes(chunk)
+    if not place.exists():
         return "missing"
-    if len(data) != store.chunk_bytes(chunk) or crc(data[:-CRC_BYTES]) != data[-CRC_BYTES:]:
+    try:
+        data = read_bytes(place, "chunk") if check_size(place, "chunk") == size else b""
+    except InputError:
+        # Too large, or no regular file.
+        return "damaged"
+    if len(data) != size or crc(data[:-CRC_BYTES]) != data[-CRC_BYTES:]:
         return "damaged"
     known = store.digests.get(chunk.key)
     if known is None:
@@ -355,6 +361,8 @@ def verify(
                 faults.append(fault)
             if progress is not None:
                 progress(number + 1, total)
+        if repair:
+            store.sort_digests()
         faults += [Fault(key, "not of this store", False) for key, own in files if not own]
     return faults
 
@@ -392,16 +400,14 @@ def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
     for name, content in sorted(store.description().items()):
         there = store.path / name
         try:
-            data = there.read_bytes()
+            data = read_bytes(there, "description")
             if name.endswith("zarr.json"):
                 found, made = (without_version(json.loads(one)) for one in (data, content))
                 same, seen = found in (made, without_later_attributes(made)), "foreign"
             else:
                 same, seen = data == content, "damaged"
-        except FileNotFoundError:
-            same, seen = False, "missing"
-        except ValueError:
-            same, seen = False, "damaged"
+        except (ValueError, TypeError, AttributeError, RecursionError):
+            same, seen = False, "damaged" if there.exists() else "missing"
         if not same:
             if repair:
                 write_whole(there, content)

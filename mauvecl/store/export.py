@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.files.atomic import UNFINISHED, write_whole, writing
+from mauvecl.host.files.parsing import parsing
+from mauvecl.host.files.size_limits import check_folder
 from mauvecl.host.version import VERSION
 from mauvecl.schema.errors import InputError
 from mauvecl.store.description import CALIBRATION, COMMON_DRAWS, NOMINAL, exposure_attributes
@@ -84,8 +86,20 @@ class Selection:
         """Read the spectra of an array."""
         import zarr
 
-        array = zarr.open_array(self.store.path / scene.path, mode="r")
-        return np.asarray(array[self.first : self.stop])
+        place = self.store.path / scene.path
+        check_folder(place, "file")
+        with parsing(
+            f"array {scene.path} of store {str(self.store.path)!r}", "an intact one: `mauvecl verify` checks it"
+        ):
+            rows = np.asarray(zarr.open_array(place, mode="r")[self.first : self.stop])
+        if rows.shape != (self.stop - self.first, *scene.row) or rows.dtype != scene.dtype:
+            raise InputError(
+                f"array {scene.path} has the shape {rows.shape} and the type {rows.dtype}",
+                f"{(self.stop - self.first, *scene.row)} and {scene.dtype} as its study says",
+                key="store",
+                value=rows.shape,
+            )
+        return rows
 
 
 def export(selection: Selection, path: str | Path, *, replace: bool = False) -> Path:

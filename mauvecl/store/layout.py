@@ -224,7 +224,7 @@ class Store:
     def note(self, chunk: Chunk, digest_text: str) -> None:
         """Add a chunk's digest to its array's list."""
         self.digests[chunk.key] = digest_text
-        line = f"{chunk.name} {digest_text} {_check(chunk.name, digest_text)}\n"
+        line = _line(chunk.name, digest_text)
         what = f"{chunk.scene.path}/{DIGESTS} of {self.path.name}"
         # A single short write at the end. A line that a full disk cut short is terminated first.
         with (
@@ -236,6 +236,19 @@ class Store:
                 file.seek(-1, 2)
                 line = line if file.read(1) == b"\n" else "\n" + line
             file.write(line.encode())
+
+    def sort_digests(self) -> None:
+        """Write the lists of digests in the order of their chunks, which may have been written in another."""
+        for scene in self.scenes:
+            place = self.path / scene.path / DIGESTS
+            keys = sorted(
+                (key for key in self.digests if key.startswith(f"{scene.path}/c/")),
+                key=lambda key: int(key.removeprefix(f"{scene.path}/c/").partition("/")[0]),
+            )
+            names = [(key.removeprefix(f"{scene.path}/"), self.digests[key]) for key in keys]
+            text = "".join(_line(name, digest_text) for name, digest_text in names).encode()
+            if names and place.read_bytes() != text:
+                write_whole(place, text)
 
     def encode(self, chunk: Chunk, rows: NDArray[Any]) -> tuple[memoryview, bytes]:
         """Encode a chunk by Zarr's codecs `bytes` and `crc32c`, padding the last chunk with zeros."""
@@ -320,6 +333,11 @@ def digest(*parts: bytes | memoryview) -> str:
     for part in parts:
         hashed.update(part)
     return hashed.hexdigest()
+
+
+def _line(name: str, digest_text: str) -> str:
+    """Return the line of a chunk in a list of digests."""
+    return f"{name} {digest_text} {_check(name, digest_text)}\n"
 
 
 def _check(*words: str) -> str:

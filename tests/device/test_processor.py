@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import ctypes
+import importlib.util
 import os
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -53,13 +56,72 @@ def library(flags: set[str]) -> str:
     return best
 
 
+#: Sets of instructions for which PoCL loads different libraries.
+STEPS = [set(), {"ssse3", "cx16"}, V2, AVX, AVX | {"f16c"}, V3, V4]
+
+
 def test_compiled_vectors_are_as_wide_as_those_of_library() -> None:
     """Compare the register widths of the library and of the kernels, which must agree to pass vectors."""
-    wide = {"x86-64": 128, "x86-64-v2": 128, "sandybridge": 256, "x86-64-v3": 256, "x86-64-v4": 512}
     passed = {"sse2": 128, "ssse3": 128, "sse41": 128, "avx": 256, "avx_f16c": 256, "avx2": 256, "avx512": 512}
-    steps = [set(), {"ssse3", "cx16"}, V2, AVX, AVX | {"f16c"}, V3, V4]
-    for flags in steps:
-        assert wide[processor.levels(frozenset(flags))[0]] == passed[library(flags)], sorted(flags)
+    for flags in STEPS:
+        offered = processor.levels(frozenset(flags))
+        assert offered
+        assert {processor.WIDTHS[level] for level in offered} == {passed[library(flags)]}, sorted(flags)
+
+
+@pytest.fixture(scope="module")
+def with_library(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Return a function that makes a copy of PoCL load a library, and returns the folder of its .icd file."""
+    spec = importlib.util.find_spec("pocl_binary_distribution")
+    if spec is None or spec.origin is None or not processor.flags():
+        pytest.skip("PoCL is not from a wheel")
+    top, wheels = tmp_path_factory.mktemp("pocl"), Path(spec.origin).parents[1]
+    (driver,) = (wheels / "pyopencl" / ".libs").glob("libpocl*.so")
+    for folder in ("pyopencl/.libs", "vendors"):
+        (top / folder).mkdir(parents=True)
+    shutil.copy(driver, top / "pyopencl/.libs/libpocl.so")
+    shutil.copytree(wheels / "pocl_binary_distribution", top / "pocl_binary_distribution")
+    (top / "vendors/pocl.icd").write_text(f"{top}/pyopencl/.libs/libpocl.so\n")
+    (loaded,) = top.rglob(f"kernel-*-{library(set(processor.flags()))}.bc")
+
+    def use(name: str) -> Path:
+        (original,) = wheels.glob(f"pocl_binary_distribution/.libs/share/pocl/kernel-*-{name}.bc")
+        shutil.copy(original, loaded)
+        return top / "vendors"
+
+    return use
+
+
+#: Script that builds for a level in a first build's child, and prints the failure and the driver's path.
+BUILD = """
+import sys
+from mauvecl.device import first_build, program
+device, _ = program.choose_device(None)
+print(first_build._try(sys.argv[1], 0, device, 60.0))
+print({line.split()[-1] for line in open("/proc/self/maps") if "libpocl" in line})
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("name", "level"),
+    [(library(flags), level) for flags in STEPS for level in processor.levels(frozenset(flags))],
+)
+def test_every_offered_level_builds_and_draws(name: str, level: str, with_library, tmp_path: Path) -> None:
+    """Build kernels for each level with the library for which it is offered, in place of this processor's library."""
+    levels = list(processor.LEVELS)
+    needed = [flag for lower in levels[: levels.index(level) + 1] for flag in processor.LEVELS[lower]]
+    if not processor.flags().issuperset(needed):
+        pytest.skip("this processor lacks instructions of the level")
+    vendors = with_library(name)
+    run = subprocess.run(
+        [sys.executable, "-c", BUILD, level],
+        env=os.environ | {"MAUVECL_CACHE_DIR": str(tmp_path), "OCL_ICD_VENDORS": str(vendors)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert run.stdout.splitlines() == ["None", str({f"{vendors.parent}/pyopencl/.libs/libpocl.so"})]
 
 
 class Record:

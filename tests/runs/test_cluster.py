@@ -31,7 +31,7 @@ from mauvecl.device.engine import DeviceError, Engine
 from mauvecl.device.stare_engine import Stares
 from mauvecl.host.expectation import Expectation
 from mauvecl.results.requests.requests import RealiseRequest, Shard
-from mauvecl.runs.cluster import DaskWorkers
+from mauvecl.runs.cluster import DaskWorkers, _Attempt
 from mauvecl.runs.pool import Pool, Stopped, map_in_order
 from mauvecl.runs.shards import Task
 from mauvecl.store import bulk
@@ -271,6 +271,93 @@ def by_hand(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], Path]]:
             process.wait(20)
 
 
+#: Changes of the code of a worker that joins later, whose counts are wrong.
+OTHER_CODE = {
+    "version": "shards.VERSION = '0.9.0'; identity.cache_clear()",
+    "kernels": "shards.DRAWING_PACKAGES = ('kernels',); identity.cache_clear()",
+    "none stated": "cluster.Counted = lambda sums, code: sums; del shards.code_identity",
+    "request unreadable": "count = None; shards.VERSION = '0.9.0'; identity.cache_clear()",
+}
+#: Script that a worker reads when it starts; Dask runs it twice.
+PRELOAD = """
+from mauvecl.runs import cluster, shards
+if not hasattr(cluster, "changed"):
+    cluster.changed, count, identity = True, cluster._count, shards.code_identity
+    {change}
+    def wrong(*given):
+        counted = count(*given)
+        return answer({{key: value + 1 for key, value in getattr(counted, "sums", counted).items()}}, identity())
+    cluster._count, answer = wrong, cluster.Counted
+"""
+
+
+@pytest.mark.parametrize("change", OTHER_CODE)
+def test_shards_of_workers_with_other_code_are_drawn_again(
+    change: str, tmp_path: Path, engine: Engine, scene: list[Expectation]
+) -> None:
+    """Let a worker with other code join a running cluster: its counts are not used."""
+    quiet, *flares = scene
+    (tmp_path / "other_code.py").write_text(PRELOAD.format(change=OTHER_CODE[change]))
+    n = 200_000
+    with by_hand(tmp_path) as (_, file):
+        workers = DaskWorkers(str(file))
+        pool = Pool(workers)
+        dask = Path(sys.executable).with_name("dask")
+        command = [dask, "worker", "--nthreads", "1", "--no-nanny", "--preload", tmp_path / "other_code.py"]
+        other = subprocess.Popen(
+            [*command, "--scheduler-file", file, "--no-dashboard"],
+            cwd=tmp_path,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            workers._client.wait_for_workers(2, timeout=60)
+            found = pool.detect(quiet, flares, realisations=n, seed=6)
+            assert len(workers._strangers) == 1
+            assert workers.retries >= 1
+        finally:
+            other.terminate()
+            other.wait(20)
+            workers.close()
+    same(found, engine.detect(quiet, flares, realisations=n, seed=6))
+
+
+def test_cluster_of_workers_with_other_code_raises(
+    tmp_path: Path, scene: list[Expectation], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Replace the only worker by one with other code."""
+    with by_hand(tmp_path) as (_, file):
+        workers = DaskWorkers(str(file))
+        monkeypatch.setattr("mauvecl.runs.cluster.code_identity", lambda: ("1.0.0", "another"))
+        with pytest.raises(DeviceError, match="workers with other code"):
+            Pool(workers).detect(scene[0], scene[1:], realisations=N, seed=1)
+        workers.close()
+
+
+def test_shards_whose_workers_have_left_are_sent_to_others(
+    tmp_path: Path, engine: Engine, scene: list[Expectation], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Restrict shards to a worker that ends and is replaced under another address."""
+    monkeypatch.setattr("mauvecl.runs.cluster.RECOUNT_S", 0.5)
+    quiet, *flares = scene
+    with by_hand(tmp_path) as (_, file):
+        workers = DaskWorkers(str(file))
+        workers._strangers.add("tcp://127.0.0.1:1")
+        threading.Thread(target=workers._watch, daemon=True).start()
+        pool = Pool(workers)
+        (pid,) = workers._client.run(os.getpid).values()
+
+        def kill() -> None:
+            while pool.standing.shards < 5:
+                time.sleep(0.005)
+            os.kill(pid, signal.SIGKILL)
+
+        threading.Thread(target=kill).start()
+        found = pool.detect(quiet, flares, realisations=150_000, seed=6)
+        workers.close()
+    same(found, engine.detect(quiet, flares, realisations=150_000, seed=6))
+
+
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
     """Start the documentation's example for batch systems; return its address and its file."""
@@ -346,8 +433,9 @@ def test_scheduler_lost_during_a_fetch_raises() -> None:
             raise ConnectionResetError("Connection reset by peer")
 
     sent: Any = Lost()
-    workers._sent = {sent: awaited}
-    workers._came(awaited, None, 1, sent)  # type: ignore[arg-type]
+    attempt = _Attempt(awaited, None)  # type: ignore[arg-type]
+    workers._sent = {sent: attempt}
+    workers._came(attempt, sent)
     with pytest.raises(DeviceError) as error:
         awaited.result(timeout=1)
     assert error.value.kind == "lost"

@@ -19,6 +19,7 @@ WhereFlag = Annotated[
 
 def devices(
     rate: Annotated[bool, typer.Option("--rate/--no-rate", help="Measure each device for a second.")] = True,
+    forget: Annotated[bool, typer.Option("--forget", help="Try drivers again that failed to build kernels.")] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """List the OpenCL devices that can run the kernels, and rates.
@@ -29,8 +30,11 @@ def devices(
     Example: mauvecl devices
     """
     from mauvecl.device.benchmark import COLUMNS, list_devices
+    from mauvecl.device.first_build import forget_outcomes
     from mauvecl.schema.tables import View
 
+    if forget:
+        forget_outcomes()
     records = list_devices() if rate else list_devices(measure=False)
     if as_json:
         print(json.dumps(records, indent=2))
