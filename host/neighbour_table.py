@@ -13,7 +13,8 @@ from mauvecl.schema.text import shortened, shown
 from .neighbours import Neighbour
 from .stars.band_names import known_band
 from .tables.names import DECLINATIONS, RIGHT_ASCENSIONS, SPECTRAL_TYPES, STARS, key_of
-from .tables.rows import Rows, read_table
+from .tables.opening import read_table
+from .tables.rows import Rows
 
 Float = NDArray[np.float64]
 

@@ -11,10 +11,10 @@ from typing import Any
 from mauvecl.schema.errors import InputError
 
 from ..tables.fits import column_values, open_fits, reading, text_at
+from ..tables.fits_images import axis_of, is_spectrum_image, is_survey_image, paired_images, rows_of
 from ..tables.medium import medium_of
 from .column_roles import role_of
 from .file_table import Column, FileTable
-from .fits_images import axis_of, is_spectrum_image, is_survey_image, paired_images, rows_of
 
 #: Units implied by the archives' tables, those of CALSPEC.
 IMPLIED_UNITS = ("Angstrom", "erg / (s cm2 Angstrom)")

@@ -12,6 +12,8 @@ from mauvecl.schema.text import shortened
 
 from ..files.parsing import parsing
 from ..files.size_limits import read_bytes, unpacked
+from ..tables.opening import form_of
+from ..tables.text_table import text_of
 
 if TYPE_CHECKING:
     import astropy.units as u
@@ -87,21 +89,20 @@ def _tables(
 ) -> list[FileTable]:
     from .fits_files import fits_tables
     from .table_files import ecsv_tables, votable_tables
-    from .text import text_of, text_tables
+    from .text import text_tables
 
-    if content[:9] == b"SIMPLE  =":
+    form = form_of(content[:4096])
+    if form == "FITS":
         return fits_tables(content, name, origin, asked, check)
-    start = content[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")
-    if re.match(rb"<(\?xml|votable|vot:)", start, re.IGNORECASE) and b"VOTABLE" in content[:4096].upper():
+    if form == "VOTable":
         return votable_tables(content, name, origin)
-    if start[:1] == b"<":
+    if form == "XML":
+        start = content[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")[:20]
         raise InputError(
-            f"is a page or XML that begins with {shortened(start[:20].decode('ascii', 'replace'))}",
-            "a spectrum",
-            key="file",
-            value=start[:20],
-        )
+            f"is a page or XML that begins with {shortened(start.decode('ascii', 'replace'))}",
+            "a spectrum", key="file", value=start,
+        )  # fmt: skip
     text = text_of(content)
-    if re.match(r"#\s*%ECSV", text):
+    if form == "ECSV":
         return ecsv_tables(text, name, origin)
     return text_tables(text, name, f"text {origin}", asked, *units)

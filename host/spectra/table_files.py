@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import operator
-import warnings
 from functools import partial
 from typing import Any
 
-from mauvecl.schema.errors import InputError
-
-from ..files.parsing import parsing
 from ..tables.ecsv import parse_ecsv
 from ..tables.medium import medium_of
+from ..tables.opening import votable_in
 from .file_table import Column, FileTable
 
 #: Largest number and length of messages in the table of a kept star.
@@ -55,15 +51,9 @@ def _texts(given: Any) -> tuple[str, ...]:
 
 def votable_tables(content: bytes, name: str, origin: str) -> list[FileTable]:
     """Read the tables of a VOTable file."""
-    from astropy.io import votable
-
-    if b"<!ENTITY" in content or b"<!DOCTYPE" in content:
-        raise InputError("defines entities", "a VOTable without entities", key="file")
-    with parsing("it", "a complete VOTable"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        file = votable.parse(io.BytesIO(content), verify="ignore")
-        tables = list(file.iter_tables())
-        shared = {param.name or param.ID: param.value for one in file.resources for param in one.params}
+    file = votable_in(content, "it")
+    tables = list(file.iter_tables())
+    shared = {param.name or param.ID: param.value for one in file.resources for param in one.params}
     return [
         FileTable(
             [

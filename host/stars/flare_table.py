@@ -10,7 +10,8 @@ import numpy as np
 from mauvecl.schema.text import shortened, shown
 
 from ..files.parsing import LARGEST, SMALLEST
-from ..tables.rows import Rows, read_table
+from ..tables.opening import read_table
+from ..tables.rows import Rows
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table

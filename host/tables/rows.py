@@ -1,12 +1,9 @@
-"""Small tables of users with a row for each star or flare, in any common format: text, ECSV, FITS or VOTable."""
+"""Cells of small tables of users, with a row for each star or flare."""
 
 from __future__ import annotations
 
-import io
-import warnings
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,72 +11,13 @@ import numpy as np
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
-from ..files.parsing import as_text, parsing
-from ..files.size_limits import read_bytes, unpacked
 from .coordinates import angle, angle_unit, unit_in_name
-from .fits import column_values, open_fits, reading
-from .names import STARS, divided_unit, first_of
-from .text_table import MISSING, text_table
+from .names import divided_unit, first_of
+from .text_table import MISSING
 from .times import time_unit
 
 if TYPE_CHECKING:
     from astropy.table import Table
-
-FORMATS = "CSV, ECSV, FITS or VOTable"
-
-
-def read_table(
-    path: str | Path, what: str, expected: str = FORMATS, *, texts: Collection[str] = STARS, commas: bool = False
-) -> Table:
-    """Read the table in a text file, the first table of a FITS file, or that of a VOTable.
-
-    Parameters
-    ----------
-    path : str or Path
-        Packed by gzip, bzip2 or xz or not.
-    what, expected : str
-        What the file should be, for messages: "flare table", "CSV or FITS".
-    texts : collection of str
-        Names of columns whose cells stay text, such as "0012".
-    commas : bool
-        Whether text is CSV in any case, instead of by the file's extension.
-    """
-    path = Path(path)
-    named = f"{what} {shortened(str(path))}"
-    content = unpacked(read_bytes(path, what), named)
-    if content.startswith(b"SIMPLE  ="):
-        return _fits_table(content, named, expected)
-    if b"<VOTABLE" in content[:4096]:
-        return votable(content, named, expected)
-    commas |= ".csv" in (suffix.lower() for suffix in path.suffixes[-2:])
-    return text_table(as_text(content, named), named, commas, expected, texts=texts)
-
-
-def _fits_table(content: bytes, named: str, expected: str) -> Table:
-    """Read the first table of a FITS file."""
-    from astropy.io import fits
-    from astropy.table import MaskedColumn, Table
-
-    with open_fits(io.BytesIO(content), named) as hdus, reading(named):
-        for hdu in hdus:
-            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU):
-                return Table(
-                    [MaskedColumn(np.ma.array(column_values(hdu.data, column), copy=True), str(column.name),
-                                  unit=column.unit) for column in hdu.columns],
-                    meta=dict(hdu.header),
-                )  # fmt: skip
-        raise InputError(f"{named} has no table", expected, key="file")
-
-
-def votable(content: bytes, named: str, expected: str) -> Table:
-    """Read the first table of a VOTable; raises InputError if it defines entities."""
-    from astropy.table import Table
-
-    if b"<!ENTITY" in content or b"<!DOCTYPE" in content:
-        raise InputError(f"{named} defines entities", "a VOTable without them", key="file")
-    with parsing(named, expected), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return Table.read(io.BytesIO(content), format="votable", table_id=0, use_names_over_ids=True)
 
 
 class Rows:

@@ -5,14 +5,11 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Collection, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
 
-from ..files.parsing import as_text, parsing
-from ..files.size_limits import read_bytes, unpacked
+from ..files.parsing import parsing
 from .ecsv import check_cells, parse_ecsv
 
 if TYPE_CHECKING:
@@ -20,30 +17,48 @@ if TYPE_CHECKING:
 
 #: Separators of cells in CSV; the one that is most frequent in the first line counts.
 SEPARATORS = (",", ";", "\t")
-#: Cells without a value, as archives and programs write them; an empty cell has none in any case.
-MISSING = tuple(
-    spelt for word in ("", "null", "none", "n/a", "na", "--", "-", "...", "masked", "indef", "<na>")
-    for spelt in dict.fromkeys((word, word.upper(), word.capitalize()))
-)  # fmt: skip
+#: Words of cells without a value, as archives and programs write them; an empty cell has none in any case.
+MISSING_WORDS = ("", "null", "none", "n/a", "na", "--", "-", "...", "masked", "indef", "<na>")
+MISSING = tuple(dict.fromkeys(how(word) for word in MISSING_WORDS for how in (str, str.upper, str.capitalize)))
 _ZERO = re.compile(r"0\d+")
 _LEADING_ZERO = re.compile(r"(?m)(?:^|[,;\t\s])\"?0\d+\"?\s*(?:$|[,;\t\s])")
 #: Largest number of characters of a table of known format, and of one for which astropy tries about twenty formats.
 MOST_TEXT, MOST_GUESSED = 64 * 2**20, 4 * 2**20
 
 
-def read_text_table(path: str | Path, what: str) -> Table:
-    """Read a table from a text file.
+def text_of(content: bytes) -> str:
+    """Decode text in UTF-8 or, with a byte-order mark, UTF-16."""
+    # Editors on Windows start a file with a byte-order mark.
+    code = "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    try:
+        text = content.decode(code)
+    except UnicodeDecodeError as error:
+        if b"\0" in content[:4096]:
+            raise InputError("is not text (it holds null bytes)", "text", key="file") from error
+        line = content[: error.start].count(b"\n") + 1
+        raise InputError(
+            f"is not text in UTF-8 (byte 0x{content[error.start]:02x} in line {line})",
+            "UTF-8: save it so",
+            key="file",
+            value=content[error.start],
+        ) from error
+    if "\0" in text:
+        raise InputError("is not text (it holds null bytes)", "text", key="file")
+    return text
 
-    Parameters
-    ----------
-    path : str or Path
-        ECSV if its first line says so, CSV by its extension, otherwise columns separated by blanks; may be compressed.
-    what : str
-        Expected kind of file, for messages.
-    """
-    path = Path(path)
-    named = f"{what} {shortened(str(path))}"
-    return text_table(as_text(unpacked(read_bytes(path, what), named), named), named, path.suffix.lower() == ".csv")
+
+def number_in(cell: str) -> float:
+    """Return the number in a cell, NaN for words such as "null"; raise ValueError for anything else."""
+    cell = cell.strip().strip("\"'")
+    if "_" in cell:
+        raise ValueError(cell)
+    try:
+        return float(cell)
+    except ValueError:
+        if cell.lower() in MISSING_WORDS:
+            return float("nan")
+        # Exponents of Fortran's double precision.
+        return float(re.sub(r"(?<=[\d.])[dD](?=[+-]?\d)", "e", cell))
 
 
 def text_table(

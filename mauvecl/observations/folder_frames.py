@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from mauvecl.host.tables.names import matched
-from mauvecl.host.tables.text_table import read_text_table
+from mauvecl.host.tables.opening import read_table
+from mauvecl.host.tables.table import MemoryTable, TableFile, Values
 from mauvecl.observations.mapping import FrameMapping
-from mauvecl.observations.values import FrameFile, TableFile, Values
 from mauvecl.schema.errors import InputError
 
 #: Largest number of files in a folder.
@@ -21,19 +21,19 @@ MAX_FILES = 2**20
 #: Column of a table with the names of files, by default.
 FILES = "file"
 
-Open = Callable[[Path], AbstractContextManager[FrameFile]]
+Open = Callable[[Path], AbstractContextManager[TableFile]]
 
 
-class FolderFile(FrameFile):
+class FolderFile(TableFile):
     """Spectra in the files of a folder; quantities of frames are keywords of their headers or columns of a table."""
 
     def __init__(self, folder: Path, mapping: FrameMapping, what: str, open_file: Open) -> None:
         super().__init__(what, {})
         self.open_file = open_file
-        self.table: TableFile | None = None
+        self.table: MemoryTable | None = None
         if mapping.table is not None:
             place = folder / mapping.table
-            self.table = TableFile(read_text_table(place, "table of files"), f"table {mapping.table!r}")
+            self.table = MemoryTable(read_table(place, "table of files", texts=()), f"table {mapping.table!r}")
             listed = self.table.find(mapping.files or FILES)
             self.paths = [folder / str(name) for name in listed.texts() or listed.read(0, listed.n_rows)]
         else:

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.files.parsing import parsing
-from mauvecl.host.files.size_limits import check_size, limit_bytes, open_regular, packed, read_bytes, unpacked
 from mauvecl.host.spectra.column_roles import words_of
 from mauvecl.host.spectra.formats import without_columns
-from mauvecl.host.spectra.text import text_of
-from mauvecl.host.tables.fits import open_fits
+from mauvecl.host.tables.fits_tables import FitsTables
 from mauvecl.host.tables.medium import medium_of, unit_and_medium, vacuum_wavelengths
 from mauvecl.host.tables.names import divided_unit, first_of, is_magnitude
-from mauvecl.host.tables.text_table import keywords_of, text_table
+from mauvecl.host.tables.opening import open_table
+from mauvecl.host.tables.table import MemoryTable, TableFile, Values, converted, unit_in, unit_in_name
 from mauvecl.host.tables.times import (
     MISSIONS,
     TimeSystem,
@@ -34,16 +32,13 @@ from mauvecl.host.tables.times import (
     time_in_name,
     time_unit,
 )
-from mauvecl.observations.fits_frames import FitsFile
 from mauvecl.observations.folder_frames import FolderFile
 from mauvecl.observations.frames import Frames
-from mauvecl.observations.large_tables import LARGE, open_large
 from mauvecl.observations.long_tables import spectra_of_rows
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.observations.quality import ALL_BITS, QualityBits, decimal_flags
 from mauvecl.observations.reduction import Light, PixelStatistics, weighted_sums, whole_or_reduced
 from mauvecl.observations.stored_frames import StoredFile, is_store, open_hdf5, open_store, stored_in_fits
-from mauvecl.observations.values import FrameFile, TableFile, Values, converted, unit_in, unit_in_name
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
@@ -67,8 +62,6 @@ PARTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
 DATES_MJD = (-5000.0, 150_000.0)
 #: What a cell of times may be.
 DATE = "a number or a date such as 2026-03-01T12:00:00"
-SIGNATURES = {b"SIMPLE  =": "FITS", b"\x89HDF\r\n": "HDF5"}
-ECSV = b"# %ECSV"
 
 
 @validated
@@ -134,7 +127,7 @@ def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any 
         )
         mapping = FrameMapping(time="time", flux="flux", wavelength="wavelength",
                                error="flux_err" if "flux_err" in columns else None)  # fmt: skip
-    file = TableFile(container, type(container).__name__)
+    file = MemoryTable(container, type(container).__name__)
     return _frames_in(file, mapping or _recognised(file), str(container.meta.get("LABEL", "frames")))
 
 
@@ -203,7 +196,7 @@ def _parsing(path: str | Path) -> AbstractContextManager[None]:
 @contextmanager
 def _frame_file(
     path: str | Path, mapping: FrameMapping | str | Path | None, check: bool = True
-) -> Iterator[tuple[FrameFile, FrameMapping, str]]:
+) -> Iterator[tuple[TableFile, FrameMapping, str]]:
     """Open a file, folder or store, and return its quantities and its name without extension."""
     place, words = without_columns(path)
     given = FrameMapping.read(mapping) if isinstance(mapping, str | Path) else mapping
@@ -215,7 +208,7 @@ def _frame_file(
 @contextmanager
 def _open_frames(
     path: Path, mapping: FrameMapping | None, name: str | None, check: bool
-) -> Iterator[tuple[FrameFile, FrameMapping]]:
+) -> Iterator[tuple[TableFile, FrameMapping]]:
     """Open a file with frames, and return where its quantities are."""
     what = f"file {path.name!r}"
     if path.is_dir():
@@ -234,7 +227,6 @@ def _open_frames(
         yield file, mapping or (file.mapping if isinstance(file, StoredFile) else _recognised(file))
 
 
-@contextmanager
 def _opened(
     path: Path,
     what: str,
@@ -243,53 +235,16 @@ def _opened(
     check: bool = True,
     *,
     large: bool = False,
-) -> Iterator[FrameFile]:
-    """Open a file by its first bytes; only `large` ones may exceed MAUVECL_LARGEST_FILE_MIB."""
-    if not large:
-        check_size(path, "file")
-    with open_regular(path, "file") as raw:
-        start = raw.read(16)
-        raw.seek(0)
-        file: IO[bytes] = raw
-        content: bytes | None = None
-        commas = ".csv" in path.suffixes[-2:]
-        if (commas or start.startswith(ECSV)) and not packed(start) and raw.seek(0, io.SEEK_END) > LARGE:
-            raw.seek(0)
-            with open_large(raw, what, commas, FORMATS) as table:
-                yield table
-            return
-        raw.seek(0)
-        if not any(start.startswith(mark) for mark in SIGNATURES):
-            content = unpacked(read_bytes(path, "file"), what)
-            start, file = content[:16], io.BytesIO(content)
-        kind = next((kind for mark, kind in SIGNATURES.items() if start.startswith(mark)), "text")
-        if kind == "FITS":
-            check &= file.seek(0, io.SEEK_END) <= limit_bytes("MAUVECL_LARGEST_FILE_MIB")
-            with open_fits(file, what, check=check) as hdus:
-                with parsing(what, FORMATS):
-                    stored = stored_in_fits(FitsFile(hdus, what), name)
-                    found = stored or FitsFile(hdus, what, name, _wanted(mapping))
-                yield _filled(found)
-        elif kind == "HDF5":
-            with open_hdf5(file, name, what) as scene:
-                yield scene
-        else:
-            try:
-                text = text_of(content or b"")
-            except InputError as error:
-                raise error.within(what) from error
-            if not text.strip():
-                raise InputError(f"{what} is empty", FORMATS, key="file")
-            small = TableFile(text_table(text, what, commas, FORMATS), what)
-            small.header |= keywords_of([line for line in text.splitlines() if line[:1] in "#%!;"])
-            yield _filled(small)
+) -> AbstractContextManager[TableFile]:
+    """Open a file with frames; only `large` ones may exceed MAUVECL_LARGEST_FILE_MIB."""
 
+    def of_fits(hdus: Any) -> TableFile:
+        return stored_in_fits(FitsTables(hdus, what), name) or FitsTables(hdus, what, name, _wanted(mapping))
 
-def _filled(file: FrameFile) -> FrameFile:
-    """Return a file; raise InputError if it has nothing with rows."""
-    if not file.names:
-        raise InputError(f"{file.what} has no table and no image", "a row for each frame", key="file")
-    return file
+    return open_table(
+        path, what, expected=FORMATS, check=check, large=large, of_fits=of_fits,
+        of_hdf5=lambda file: open_hdf5(file, name, what),
+    )  # fmt: skip
 
 
 def _wanted(mapping: FrameMapping | None) -> tuple[tuple[str, ...], ...]:
@@ -297,7 +252,7 @@ def _wanted(mapping: FrameMapping | None) -> tuple[tuple[str, ...], ...]:
     return (KNOWN["time"], KNOWN["flux"]) if mapping is None else tuple((name,) for name in mapping.times)
 
 
-def _recognised(file: FrameFile) -> FrameMapping:
+def _recognised(file: TableFile) -> FrameMapping:
     """Return the mapping of a file whose columns have known names."""
     names = [name for name in file.names if "/" not in name]
     columns = {key: first_of(known, names, file.what) for key, known in KNOWN.items()}
@@ -331,7 +286,7 @@ class Quantities:
     wavelength: Values | None
 
     @classmethod
-    def of(cls, file: FrameFile, mapping: FrameMapping) -> Quantities:
+    def of(cls, file: TableFile, mapping: FrameMapping) -> Quantities:
         """Find the quantities of a mapping."""
 
         def found(name: str | None) -> Values | None:
@@ -347,7 +302,7 @@ class Quantities:
         return cls(*spectra_of_rows(times, flux, one.error, one.quality, one.exposure, one.temperature, nm, file.what))
 
 
-def _wavelength(file: FrameFile, mapping: FrameMapping) -> Values | None:
+def _wavelength(file: TableFile, mapping: FrameMapping) -> Values | None:
     if mapping.wavelength_file is not None:
         path = Path(mapping.wavelength_file)
         with _opened(path, f"file {path.name!r}", None) as other:
@@ -365,7 +320,7 @@ def _wavelength(file: FrameFile, mapping: FrameMapping) -> Values | None:
 
 
 def _frames_in(
-    file: FrameFile, mapping: FrameMapping, stem: str, read: Callable[..., Light] = whole_or_reduced
+    file: TableFile, mapping: FrameMapping, stem: str, read: Callable[..., Light] = whole_or_reduced
 ) -> Frames:
     """Build frames from a file and the names of its quantities; `read` returns their light."""
     what = file.what
@@ -447,7 +402,7 @@ def _masked(quality: Values | None, bits: QualityBits) -> Values | None:
 
 
 def _times(
-    time: tuple[Values, ...], file: FrameFile, mapping: FrameMapping
+    time: tuple[Values, ...], file: TableFile, mapping: FrameMapping
 ) -> tuple[Float, Float | None, TimeSystem, tuple[str, ...]]:
     """Return times in seconds from the first, exposure times of frames with a start and an end, and their dates."""
     import astropy.units as u
@@ -487,7 +442,7 @@ def _times(
 
 
 def _time_unit(
-    time: tuple[Values, ...], values: Float, file: FrameFile, mapping: FrameMapping, stated: TimeSystem
+    time: tuple[Values, ...], values: Float, file: TableFile, mapping: FrameMapping, stated: TimeSystem
 ) -> tuple[TimeUnit, list[str]]:
     """Return the unit of times and what it says of their zero: of the mapping, the column, its name, the header."""
     if len({one.unit for one in time}) > 1 and not mapping.time_unit:
@@ -551,7 +506,7 @@ def _light(found: Quantities, mapping: FrameMapping) -> tuple[str, Values, Value
     return unit, found.flux, error, remarks
 
 
-def _vacuum_nm(wavelength: Values, given: str | None, file: FrameFile) -> Float:
+def _vacuum_nm(wavelength: Values, given: str | None, file: TableFile) -> Float:
     """Return the wavelengths of the pixels in vacuum, which must be the same in every frame."""
     plain, medium = unit_and_medium(given or "")
     stated, in_unit = unit_and_medium(wavelength.unit)

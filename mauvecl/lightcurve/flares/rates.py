@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.stars.flare_spectra import Blackbody, FlareSpectrum
-from mauvecl.host.tables.rows import Rows, read_table
+from mauvecl.host.tables.opening import read_table
+from mauvecl.host.tables.rows import Rows
 from mauvecl.lightcurve.flares.energies import flux_in_band
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError

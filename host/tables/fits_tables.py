@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.host.spectra.fits_images import axis_of
-from mauvecl.host.tables.fits import BLOCK, column_values, reading, text_at
-from mauvecl.host.tables.names import matched
-from mauvecl.observations.values import PIECE_BYTES, FrameFile, Values
 from mauvecl.schema.errors import InputError
+
+from .fits import BLOCK, column_values, reading, text_at
+from .fits_images import axis_of
+from .names import matched
+from .table import PIECE_BYTES, TableFile, Values
 
 if TYPE_CHECKING:
     from astropy.io import fits
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 SCALES = ("UTC", "TAI", "TT", "TDB", "TCG", "TCB", "UT1")
 
 
-class FitsFile(FrameFile):
+class FitsTables(TableFile):
     """An open FITS file.
 
     Parameters
@@ -61,12 +62,16 @@ class FitsFile(FrameFile):
                                 "TREFPOS": header.get(f"TRPOS{k}", header.get("TREFPOS", ""))}  # fmt: skip
 
     @property
+    def columns(self) -> list[str]:
+        """Names of the columns of the chosen table."""
+        return [] if self.chosen is None else [str(name) for name in self.hdus[self.chosen].columns.names]
+
+    @property
     def names(self) -> list[str]:
         """Names of the columns of the chosen table, of images, and of the columns of other tables."""
-        chosen = [] if self.chosen is None else [str(name) for name in self.hdus[self.chosen].columns.names]
         others = [f"{self._label(k)}/{name}" for k in self.tables if k != self.chosen
                   for name in self.hdus[k].columns.names]  # fmt: skip
-        return [*chosen, *(self._label(k) for k in self.images), *others]
+        return [*self.columns, *(self._label(k) for k in self.images), *others]
 
     def named(self, name: str) -> Values | None:
         """Return a column of the chosen table, an image, ``EXTENSION/COLUMN``, or a column of one other table."""

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.spectra.text import number_in
-from mauvecl.host.tables.names import divided_unit, matched
-from mauvecl.host.tables.times import time_unit
-from mauvecl.host.tables.units import unit_of
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
+
+from .names import divided_unit, matched
+from .text_table import number_in
+from .times import time_unit
+from .units import unit_of
 
 Float = NDArray[np.float64]
 
@@ -181,7 +182,7 @@ def unit_in_name(name: str) -> str:
         return ""
 
 
-class FrameFile(ABC):
+class TableFile(ABC):
     """A file with frames: its named values, and the keywords of its header."""
 
     def __init__(self, what: str, header: dict[str, Any]) -> None:
@@ -191,6 +192,22 @@ class FrameFile(ABC):
     @abstractmethod
     def names(self) -> list[str]:
         """Names of everything that has values."""
+
+    @property
+    def columns(self) -> list[str]:
+        """Names of the columns of its table."""
+        return self.names
+
+    def loaded(self) -> Any:
+        """Return the columns as a table of astropy, masked where they are undefined."""
+        from astropy.table import MaskedColumn, Table
+
+        columns = []
+        for name in self.columns:
+            values = self.find(name)
+            cells = np.ma.array(values.read(0, values.n_rows), copy=True)
+            columns.append(MaskedColumn(cells, name, unit=values.unit or None))
+        return Table(columns, meta=self.header)
 
     @abstractmethod
     def named(self, name: str) -> Values | None:
@@ -236,8 +253,8 @@ class FrameFile(ABC):
         raise InputError(f"{self.what} has no coordinates of images", "a FITS image", key="wavelength", value="wcs")
 
 
-class TableFile(FrameFile):
-    """A table in memory: CSV, ECSV, text."""
+class MemoryTable(TableFile):
+    """A table in memory: CSV, ECSV, VOTable, text."""
 
     def __init__(self, table: Any, what: str) -> None:
         from astropy.time import Time
