@@ -257,7 +257,7 @@ def _recognised(file: TableFile) -> FrameMapping:
     names = [name for name in file.names if "/" not in name]
     columns = {key: first_of(known, names, file.what) for key, known in KNOWN.items()}
     if columns["time"] is None:
-        dated = [name for name in names if time_in_name(name) is not None]
+        dated = [name for name in names if (said := time_in_name(name)) is not None and said.epoch_mjd is not None]
         columns["time"] = dated[0] if len(dated) == 1 else None
     flux = divided_unit(columns["flux"] or "")[0]
     # Errors of another flux would be wrong ones.
