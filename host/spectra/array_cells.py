@@ -11,6 +11,7 @@ import numpy as np
 
 from mauvecl.schema.errors import InputError
 
+from ..files.parsing import TYPED, part_to_name
 from .column_choice import Choice, listed, plain
 from .file_table import FileTable
 
@@ -144,11 +145,11 @@ def _row_asked(identifiers: Sequence[Sequence[str]], asked: Sequence[str], names
     if len(fitting) == 1:
         return fitting[0]
     labels = [identifiers[row][0] if identifiers[row] and identifiers[row][0] else f"row {row + 1}" for row in fitting]
-    if len(set(labels)) < len(labels):
+    if len(set(labels)) < len(labels) or not all(TYPED.fullmatch(label) for label in labels):
         labels = [f"row {row + 1}" for row in fitting]
     raise InputError(
         f"{len(fitting)} spectra are in it, one in each row ({listed(labels)})",
-        f"one: name it as in FILE[{(labels or ['row 1'])[0][:30]}]",
+        part_to_name(labels or ["row 1"], "one of them"),
         key="rows",
         value=labels,
     )

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
+from ..files.parsing import part_to_name
 from .column_roles import Role
 
 #: Largest number of names in a message.
@@ -77,7 +78,7 @@ def _wavelength(names: Sequence[str], roles: Sequence[Role]) -> tuple[int, ...]:
     if low or high:
         return _only("lower edge of the bins", names, low), _only("upper edge of the bins", names, high)
     raise InputError(
-        f"no column is recognised as the wavelength among {listed(names)}",
+        f"no column is recognised as the wavelength among {listed(names) or 'none'}",
         "one named wavelength: name two columns as in FILE[wavelength,flux]",
         key="columns",
         value=names,
@@ -95,7 +96,7 @@ def _flux(names: Sequence[str], roles: Sequence[Role], wavelength: tuple[int, ..
     held = [f"{names[i].strip()[:40]} ({roles[i].kind})" for i in rest]
     raise InputError(
         f"no column is recognised as a star's flux, only {listed(held) or 'the wavelength'}",
-        f"one named flux: name the column as in FILE[{names[(unknown or rest or [0])[0]].strip()[:40]}]",
+        part_to_name([names[i] for i in unknown or rest or [0]], "one named flux"),
         key="columns",
         value=held,
     )
@@ -111,7 +112,7 @@ def _only(what: str, names: Sequence[str], indices: Sequence[int]) -> int:
         return indices[0]
     if not indices:
         raise InputError(
-            f"no column is the {what} among {listed(names)}",
+            f"no column is the {what} among {listed(names) or 'none'}",
             "both edges or the wavelength itself",
             key="columns",
             value=names,
@@ -119,7 +120,7 @@ def _only(what: str, names: Sequence[str], indices: Sequence[int]) -> int:
     several = [names[i].strip() for i in indices]
     raise InputError(
         f"{len(several)} columns may be the {what}: {listed(several)}",
-        f"one: name it as in FILE[{several[-1][:40]}]",
+        part_to_name(reversed(several), "a file with one of them, or names without commas and brackets"),
         key="columns",
         value=several,
     )

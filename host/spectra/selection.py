@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
 
+from ..files.parsing import part_to_name
 from .array_cells import holds_arrays, no_such, selected_rows
 from .column_choice import choose, listed, plain
 from .column_roles import Role
@@ -68,7 +69,7 @@ def spectrum_in(tables: Sequence[FileTable], asked: Sequence[str]) -> RawSpectru
         held = [one.table.label for one in found]
         raise InputError(
             f"{len(held)} tables hold a spectrum: {listed(held)}",
-            f"one: name it as in FILE[{held[0].strip()}]",
+            part_to_name(held, "a file with one of them"),
             key="table",
             value=held,
         )
