@@ -11,9 +11,11 @@ from __future__ import annotations
 
 import argparse
 import gzip
+import importlib
 import itertools
 import json
 import os
+import pkgutil
 import random
 import re
 import resource
@@ -499,11 +501,12 @@ class Fault:
 
 def run(numbers: range, seed: int, only: str = "", keep: Path | None = None) -> Iterator[Fault | None]:
     """Run cases by number; yield the fault of each, or None."""
-    import mauvecl.answers.observations.analyse
-    import mauvecl.cli.app
-    import mauvecl.observations.reading
-    import mauvecl.store.bulk  # noqa: F401
+    import mauvecl
 
+    # Forked processes import nothing more, which saves half a second of each.
+    for module in pkgutil.walk_packages(mauvecl.__path__, "mauvecl."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
     with tempfile.TemporaryDirectory(prefix="mauvecl-fuzz-") as place:
         intact = Path(place) / "intact"
         intact.mkdir()

@@ -13,6 +13,8 @@ from .column_roles import Role
 
 #: Largest number of names in a message.
 MAX_LISTED = 12
+#: Names that can be typed between the brackets of ``FILE[name]``.
+TYPED = re.compile(r"[^\[\],\"'\s](?:[^\[\],\"'\n\r\t]{0,38}[^\[\],\"'\s])?")
 AXES = ("wavelength", "lower edge", "upper edge")
 
 
@@ -36,7 +38,7 @@ def listed(names: Sequence[str]) -> str:
 def as_typed(name: str, kind: str, place: int, names: Sequence[str] = ()) -> str:
     """Return ``FILE[name]`` for a message, or ``FILE[row 3]`` where the name cannot be typed or is not the only one."""
     word = name.strip()
-    typed = re.fullmatch(r"[^\[\],\n]{1,60}", word) is not None
+    typed = TYPED.fullmatch(word) is not None and word.isprintable()
     alone = sum(plain(one) == plain(word) for one in names) < 2
     return f"FILE[{word}]" if typed and alone else f"FILE[{kind} {place + 1}]"
 
@@ -94,7 +96,7 @@ def _wavelength(names: Sequence[str], roles: Sequence[Role]) -> tuple[int, ...]:
     if low or high:
         return _only("lower edge of the bins", names, low), _only("upper edge of the bins", names, high)
     raise InputError(
-        f"no column is recognised as the wavelength among {listed(names)}",
+        f"no column is recognised as the wavelength among {listed(names) or 'none'}",
         "one named wavelength: name two columns as in FILE[wavelength,flux]",
         key="columns",
         value=names,
@@ -129,7 +131,7 @@ def _only(what: str, names: Sequence[str], indices: Sequence[int]) -> int:
         return indices[0]
     if not indices:
         raise InputError(
-            f"no column is the {what} among {listed(names)}",
+            f"no column is the {what} among {listed(names) or 'none'}",
             "both edges or the wavelength itself",
             key="columns",
             value=names,

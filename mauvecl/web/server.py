@@ -79,8 +79,13 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
 
 
 def close_unused() -> None:
-    """Close the connections of unused pages."""
+    """Close the connections of unused pages, and release the memory of visitors who have left."""
     from mauvecl.web.visitor import UNUSED, Visitor
+    from mauvecl.web.work import reading, release_memory
+
+    if Visitor.has_left:
+        Visitor.has_left = False
+        reading(release_memory)
 
     now = time.monotonic()
     for one in list(Visitor.here):
@@ -135,6 +140,7 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
     from mauvecl.web.folders import remove_abandoned
     from mauvecl.web.plain_log import install
     from mauvecl.web.visitor import Visitor
+    from mauvecl.web.work import limit_arenas
 
     async def run() -> None:
         from tornado.ioloop import PeriodicCallback
@@ -164,4 +170,5 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
                 one.on_close()
 
     install()
+    limit_arenas()
     asyncio.run(run())

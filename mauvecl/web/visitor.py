@@ -30,6 +30,7 @@ from mauvecl.web.folders import visitor_folder
 from mauvecl.web.headline import other_payloads, solved
 from mauvecl.web.known_stars import known
 from mauvecl.web.sentences import field_of, remedies, sentence
+from mauvecl.web.shelf import RESULTS, UPLOADED
 from mauvecl.web.simulations import DRAWING, SIMULATIONS, verbs_of
 from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS, asking, reads_of
@@ -64,6 +65,8 @@ class Visitor(WebSocketHandler):
 
     #: Everybody who is here.
     here: set[Visitor] = set()  # noqa: RUF012
+    #: Whether somebody has left since memory was released.
+    has_left = False
 
     def initialize(self) -> None:
         """Set up a new connection."""
@@ -99,6 +102,9 @@ class Visitor(WebSocketHandler):
             if job is not None:
                 job.cancel()
         self._folder.cleanup()
+        for shelf in (RESULTS, UPLOADED):
+            shelf.leave(self)
+        Visitor.has_left = True
 
     def send(self, content: bytes | None = None, **message: Any) -> None:
         """Send a message, followed by bytes; a visitor who has left gets none."""
@@ -174,25 +180,36 @@ class Visitor(WebSocketHandler):
     def closed(self, state: State, tab: Tab) -> ClosedForms:
         """Return the closed forms of the part of a question that a tab reads; the last ones are cached."""
         key = self._key(state, tab.reads), tab.headline
-        if self._closed is None or self._closed[0] != key:
+        held = self._closed
+        if held is None or held[0] != key:
             question = state.question(tab.reads)
             given = self.given(state, tab)
-            self._closed = key, ClosedForms.of(question, Path(self._folder.name), headline=tab.headline, given=given)
-        return self._closed[1]
+            made = ClosedForms.of(question, Path(self._folder.name), headline=tab.headline, given=given)
+            held = self._closed = key, made
+        # Closed forms compute and keep more when they are used.
+        self._shelve("_closed", held)
+        return held[1]
 
     def given(self, state: State, tab: Tab) -> dict[str, Any]:
         """Return the content of the files that a tab reads; the last ones are cached."""
         key = tab.name, self._key(state, tab.reads & UPLOADS.keys())
-        if self._given is None or self._given[0] != key:
-            self._given = key, tab.given(state.question(tab.reads))
-        return self._given[1]
+        held = self._given
+        if held is None or held[0] != key:
+            held = self._given = key, tab.given(state.question(tab.reads))
+            self._shelve("_given", held)
+        return held[1]
+
+    def _shelve(self, name: str, value: object) -> None:
+        """Count an attribute among the results of all visitors; it may be reset to None."""
+        RESULTS.keep(self, name, value, partial(setattr, self, name, None))
 
     def answers(self, state: State) -> dict[str, Any]:
         """Return the simulated answers that hold for a question, by name."""
         found: dict[str, Any] = {}
-        for (simulation, key), answers in self._answers.items():
+        for (simulation, key), answers in list(self._answers.items()):
             if key == self._key(state, reads_of(simulation)):
                 found |= answers
+                RESULTS.used(self, (simulation, key))
         return found
 
     def _key(self, state: State, names: frozenset[str]) -> tuple[Any, ...]:
@@ -310,6 +327,7 @@ class Visitor(WebSocketHandler):
                 self.send(n=n, progress=job.share, message=job.words)
             self._answers[key] = done.result()
             self._answers.move_to_end(key)
+            RESULTS.keep(self, key, self._answers[key], partial(self._answers.pop, key, None))
             while len(self._answers) > MOST_ANSWERS:
                 self._answers.popitem(last=False)
             self.send(n=n, ended=f"Done: {job.words}.", kind=kind)
@@ -356,6 +374,7 @@ class Visitor(WebSocketHandler):
         def came(future: Future[Any]) -> None:
             try:
                 self._uploads[field] = future.result()
+                UPLOADED.keep(self, field, self._uploads[field], partial(self._uploads.pop, field, None))
             except InputError as error:
                 proposed = [one for one in remedies(error, upload.keys) if one[0] in upload.options]
                 self.send(n=n, field=field, lacks=sentence(error, upload.keys), remedies=proposed)
@@ -393,8 +412,10 @@ class Visitor(WebSocketHandler):
             else:
                 made = asked_study(name, state.question(reads).study(Path(self._folder.name)))
             self._files[which] = made
+            RESULTS.keep(self, which, made, partial(self._files.pop, which, None))
             while len(self._files) > MOST_KEPT:
                 self._files.popitem(last=False)
+            return made
         return self._files[which]
 
     def _ask_export(self, asked: dict[str, Any]) -> None:
