@@ -15,7 +15,7 @@ RIGHT_ASCENSIONS = ("ra", "ra_deg", "ra_icrs", "_raj2000", "raj2000", "ra_j2000"
                     "ra_h", "ra_rad", "right_ascension", "alpha_j2000")  # fmt: skip
 DECLINATIONS = ("dec", "dec_deg", "de_icrs", "_dej2000", "dej2000", "dec_j2000", "_de_icrs", "dec_icrs", "_de", "s_dec",
                 "de", "dec_rad", "declination", "delta_j2000")  # fmt: skip
-SPECTRAL_TYPES = ("spectral_type", "sptype", "sp_type", "spt", "spectype")
+SPECTRAL_TYPES = ("spectral_type", "sptype", "sp_type", "spt", "spectype", "st_spectype")
 _UNIT = re.compile(r"(?s)(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*")
 #: Columns of magnitudes: ``mag``, ``Vmag``, ``mag_err``, ``INST_MAG1``, ``delta magnitude``.
 _MAGNITUDE = re.compile(r"(?:^|[^a-z])[a-z]{0,5}(?:mag|mags|magnitude|magnitudes)(?:$|[^a-z])")

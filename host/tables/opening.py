@@ -75,7 +75,7 @@ def open_table(
         check_size(path, kind)
     with open_regular(path, kind) as raw:
         start = raw.read(4096)
-        commas = ".csv" in (suffix.lower() for suffix in path.suffixes[-2:])
+        commas = bool({".csv", ".tsv"} & {suffix.lower() for suffix in path.suffixes[-2:]})
         size = raw.seek(0, io.SEEK_END)
         raw.seek(0)
         if (commas or form_of(start) == "ECSV") and not packed(start) and size > LARGE:
@@ -105,8 +105,12 @@ def _in_memory(
     content: bytes, form: Form, what: str, commas: bool, expected: str, texts: Collection[str]
 ) -> MemoryTable:
     if form == "VOTable":
+        file = votable_in(content, what)
         with parsing(what, expected):
-            return MemoryTable(votable_in(content, what).get_first_table().to_table(use_names_over_ids=True), what)
+            found = MemoryTable(file.get_first_table().to_table(use_names_over_ids=True), what)
+        found.header |= _systems(file)
+        found.table.meta |= found.header
+        return found
     if form == "XML":
         raise InputError(f"{what} is a page or XML", expected, key="file")
     try:
@@ -117,6 +121,20 @@ def _in_memory(
         raise InputError(f"{what} is empty", expected, key="file")
     found = MemoryTable(text_table(text, what, commas, expected, texts=texts), what)
     found.header |= keywords_of([line for line in text.splitlines() if line[:1] in "#%!;"])
+    return found
+
+
+def _systems(file: VOTableFile) -> dict[str, Any]:
+    """Return what a VOTable says of its times and coordinates (TIMESYS and COOSYS), as keywords of FITS."""
+    found: dict[str, Any] = {}
+    for resource in file.resources:
+        for one in resource.time_systems:
+            # A number of days, or the words JD-origin and MJD-origin.
+            origin = {"JD-origin": 0.0, "MJD-origin": 2_400_000.5}.get(str(one.timeorigin), one.timeorigin)
+            found |= {} if origin is None else {"JDREF": float(origin)}
+            found |= {"TIMESYS": str(one.timescale or ""), "TREFPOS": str(one.refposition or "")}
+        for place in resource.coordinate_systems:
+            found["COOSYS"] = str(place.system or "")
     return found
 
 

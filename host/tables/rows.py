@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -93,6 +94,10 @@ class Rows:
         text = self.text(name, row)
         if not text:
             return None
+        system = " ".join(str(self.table.meta.get(key, "")) for key in ("RADESYS", "RADECSYS", "EQUINOX", "COOSYS"))
+        if re.search(r"FK4|1950", system):
+            expected = "right ascension and declination in ICRS or FK5 of J2000"
+            raise self.error(f"its coordinates are in {' '.join(system.split())}", expected, name, system)
         stated = getattr(self.table[name], "unit", None)
         unit = unit_in_name(name) if stated is None else angle_unit(str(stated))
         if unit is None:

@@ -84,9 +84,12 @@ def text_table(
     if text.startswith("# %ECSV"):
         return parse_ecsv(text, named)
     lines = text.splitlines()
-    separator = ""
+    separator, units = "", []
     if commas:
         lines, separator = _of_csv(lines, named, first)
+        if len(lines) > 2 and all(re.fullmatch(r"-+", cell) for cell in _cells(lines[2], separator)):
+            # VizieR writes units and dashes below the names.
+            units, lines = _cells(lines[1], separator), [lines[0], *lines[3:]]
     check_cells(lines, named)
     how: dict[str, Any] = {"delimiter": separator, "format": "ascii.csv"} if commas else {"format": "ascii"}
     zeros = _LEADING_ZERO.search("\n".join(lines[1:])) is not None
@@ -98,7 +101,10 @@ def text_table(
         how["converters"] = dict.fromkeys(kept, str)
     with parsing(named, expected), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return Table.read([*lines, ""], fill_values=[(word, "0") for word in MISSING], **how)
+        table = Table.read([*lines, ""], fill_values=[(word, "0") for word in MISSING], **how)
+        for name, unit in zip(table.colnames, units, strict=False):
+            table[name].unit = unit.strip('"') or None
+        return table
 
 
 def _of_csv(lines: list[str], named: str, first: int) -> tuple[list[str], str]:

@@ -52,6 +52,8 @@ _JULIAN = re.compile(
     rf"(?P<name>{'|'.join(sorted(set(_DAYS) - {'gps', 'unix'}, key=len, reverse=True))})"
     r"(?:[\s_(\[]+(?P<scale>utc|tdb|tt|tai|tcb)[)\]]?)?\s*(?:[-+]\s*(?P<less>\d+(?:\.\d*)?))?\s*[,;:]?\s*(?:[(\[]?d(?:ays?)?[)\]]?)?"
 )
+#: Words in the names of times that say nothing of their unit: ``time_bjd``, ``TMID_BJD``, ``mjd_obs``.
+_TIME_OF = ("time", "t", "date", "tmid", "mid", "middle", "obs", "mean", "center", "centre")
 _SINCE = re.compile(
     r"(?P<unit>[a-z]+)\s+(?:since|after|from)\s+(?P<date>\d{4}-\d\d-\d\d(?:[t ][\d:.]+)?)"
     r"\s*(?:z|\(?(?P<scale>utc|tdb|tt|tai)\)?)?"
@@ -105,8 +107,8 @@ def time_in_name(name: str) -> TimeUnit | None:
     base, unit = divided_unit(name)
     if (found := time_unit(name) if len(name.strip()) > 2 else None) or (found := time_unit(unit) if unit else None):
         return found
-    match = re.fullmatch(r"(?:time|t|date)[\s_.-]+(.+)|(.{2,})[\s_]+(?:time|date)", base.strip(), re.IGNORECASE)
-    return time_unit(match[1] or match[2]) if match else None
+    words = [word for word in re.split(r"[\s_.]+", base.strip()) if word.lower() not in _TIME_OF]
+    return time_unit(" ".join(words)) if words and len(words) < len(re.split(r"[\s_.]+", base.strip())) else None
 
 
 @dataclass(frozen=True)

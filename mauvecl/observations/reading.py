@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
@@ -261,7 +262,7 @@ def _recognised(file: TableFile) -> FrameMapping:
         columns["time"] = dated[0] if len(dated) == 1 else None
     flux = divided_unit(columns["flux"] or "")[0]
     # Errors of another flux would be wrong ones.
-    columns["error"] = first_of((f"{flux}_err", f"{flux}_error", f"e_{flux}", "error"), names, file.what)
+    columns["error"] = first_of((f"{flux}_err", f"{flux}_error", f"{flux}err", f"e_{flux}", "error"), names, file.what)
     if columns["time"] is None or columns["flux"] is None:
         raise InputError(
             f"{file.what} has the columns {shortened(', '.join(file.names), 300)}",
@@ -487,7 +488,7 @@ def _light(found: Quantities, mapping: FrameMapping) -> tuple[str, Values, Value
             "linear light: convert magnitudes and logarithms first, or name a linear unit as flux_unit in a mapping"
         )
         raise InputError.of("flux", found.flux.name, expected, where=found.flux.what)
-    if "mag" in unit.lower() and "maggie" not in unit.lower():
+    if re.match(r"\s*(?:dex|log|db)\b", unit, re.IGNORECASE) or ("mag" in unit.lower() and "magg" not in unit.lower()):
         raise InputError.of("flux_unit", unit, "a linear unit: light in magnitudes must be converted first",
                             where=found.flux.what)  # fmt: skip
     error = found.error

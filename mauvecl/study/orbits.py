@@ -295,10 +295,10 @@ def read_targets(path: Path) -> list[dict[str, Any]]:
 
 #: Names of columns of targets, in any case, by the keys of `PlanTarget`; keys themselves are names as well.
 TARGET_COLUMNS = {
-    "name": STARS, "ra": RIGHT_ASCENSIONS, "dec": DECLINATIONS, "spectral_type": SPECTRAL_TYPES,
-    "magnitude": ("V", "vmag", "mag_v", "v_mag", "johnson_v", "flux_v", "mag"),
+    "name": (*STARS, "hostname"), "ra": RIGHT_ASCENSIONS, "dec": DECLINATIONS, "spectral_type": SPECTRAL_TYPES,
+    "magnitude": ("V", "vmag", "mag_v", "v_mag", "johnson_v", "flux_v", "sy_vmag", "mag"),
     "distance_pc": ("distance", "dist", "d_pc", "dist_pc"), "parallax": ("parallax", "plx", "plx_value"),
-    "mass_msun": ("mass",), "age_myr": ("age",), "coordinates": ("coord", "coords", "position"),
+    "mass_msun": ("mass", "st_mass"), "age_myr": ("age",), "coordinates": ("coord", "coords", "position"),
 }  # fmt: skip
 
 
@@ -325,10 +325,11 @@ def targets_in(table: Table, named: str, folder: Path | None = None) -> list[dic
     path = next((held for key in PATH_KEYS if (held := columns[key]) and folder is None), None)
     if path is not None:
         raise InputError(f"{named} has the column {shortened(path)}", "no names of files", key=path)
-    distance = columns["distance_pc"]
-    if distance is not None and not rows.unit(distance) and not key_of(distance).endswith("_pc"):
-        # A distance in an unknown unit is none.
-        columns["distance_pc"] = None
+    for key in ("distance_pc", "mass_msun", "age_myr"):
+        held = columns[key]
+        if held is not None and key_of(held) in ("distance", "dist", "mass", "age") and not rows.unit(held):
+            # A distance in an unknown unit is none.
+            columns[key] = None
     if not 1 <= rows.n <= MAX_TARGETS:
         raise InputError(f"{named} holds {rows.n} targets", f"1 to {MAX_TARGETS}", key="name", value=rows.n)
     unused = tuple(name for name in rows.names if name not in columns.values())

@@ -234,6 +234,49 @@ def test_columns_of_stars_are_in_the_unit_that_they_state(columns: dict[str, Any
     assert (target.name, target.unused) == ("0012", ("colour",))
 
 
+def test_tables_of_vizier_and_the_exoplanet_archive_are_read(tmp_path: Path) -> None:
+    (tmp_path / "v.tsv").write_text(
+        '#RESOURCE=yCat\n#\n_RAJ2000;_DEJ2000;Name;Vmag;Plx\n"h:m:s";"d:m:s";;mag;mas\n---;---;---;---;---\n'
+        "00 42 00;-03 00 00;0012;8.0;50\n00 46 00;-03 00 00;0013;;\n"
+    )
+    first, second = (PlanTarget.model_validate(one) for one in read_targets(tmp_path / "v.tsv"))
+    assert first.target(simbad=False).ra_deg == pytest.approx(10.5)
+    assert (first.name, first.magnitude, first.distance_pc) == ("0012", 8.0, 20.0)
+    assert (second.name, second.magnitude, second.distance_pc) == ("0013", None, None)
+    (tmp_path / "e.csv").write_text(
+        "# This file was produced by the NASA Exoplanet Archive\n#\nhostname,ra,dec,sy_vmag,st_spectype,st_age\n"
+        "B,10.5,-3,8,K5V,4\n"
+    )
+    (one,) = read_targets(tmp_path / "e.csv")
+    assert (one["name"], one["magnitude"], one["spectral_type"], one["unused"]) == ("B", 8.0, "K5V", ("st_age",))
+
+
+def test_systems_of_votable_count(tmp_path: Path) -> None:
+    """TIMESYS (VOTable 1.4) states epoch, scale and place of times, as in Gaia's light curves; COOSYS the frame."""
+    table = Table({"time": DAYS * u.d, "flux": FLUX})
+    table.write(tmp_path / "a.vot", format="votable")
+    text = (tmp_path / "a.vot").read_text()
+    said = '<TIMESYS ID="t" timeorigin="2455197.5" timescale="TCB" refposition="BARYCENTER"/>'
+    (tmp_path / "a.vot").write_text(text.replace("<TABLE", f"{said}<TABLE", 1))
+    found = read_frames(tmp_path / "a.vot")
+    assert (first_mjd(found), found.scale, found.position) == (pytest.approx(55_197.0), "tcb", "BARYCENTER")
+    stars = Table({"name": ["B"], "ra": [10.5] * u.deg, "dec": [-3.0] * u.deg})
+    stars.write(tmp_path / "b.vot", format="votable")
+    text = (tmp_path / "b.vot").read_text()
+    (tmp_path / "b.vot").write_text(text.replace("<TABLE", '<COOSYS ID="c" system="eq_FK4" equinox="B1950"/><TABLE', 1))
+    with refused("ra", "eq_FK4"):
+        read_targets(tmp_path / "b.vot")
+
+
+@pytest.mark.parametrize(
+    "name", ["BJD", "MJD", "HJD", "BJD_TDB", "time_bjd", "TMID_BJD", "mjd_obs", "BJD - 2457000", "JD (UTC)"]
+)
+def test_names_of_dates_are_times(name: str, tmp_path: Path) -> None:
+    zero = 2_457_000.0 if "-" in name else 2_400_000.5 if "mjd" in name.lower() else 0.0
+    Table({name: 2_458_000.0 - zero + DAYS, "flux": FLUX}).write(tmp_path / "a.csv", format="ascii.csv")
+    assert first_mjd(read_frames(tmp_path / "a.csv")) == pytest.approx(57_999.5, abs=1e-8)
+
+
 def test_units_of_other_kinds_raise(tmp_path: Path) -> None:
     Table({"name": ["a"], "ra": [10.5] * u.s, "dec": [3.0] * u.deg}).write(tmp_path / "a.ecsv")
     with refused("ra", "'s'"):
