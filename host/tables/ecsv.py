@@ -12,7 +12,6 @@ from mauvecl.schema.text import shortened
 
 from ..files.parsing import as_text, parsing
 from ..files.size_limits import LONGEST_LINE, limit_bytes, read_bytes, unpacked
-from .times import with_mission_formats
 
 if TYPE_CHECKING:
     import numpy as np
@@ -45,8 +44,10 @@ def parse_ecsv(text: str, what: str, expected: str = "an ECSV table") -> Table:
     expected : str
         Expected content, for messages.
     """
-    # The import is slow and only needed here.
+    # These imports are slow and only needed here.
     from astropy.table import Table
+
+    from .times import with_mission_formats
 
     lines = text.splitlines()
     check_header(lines, what)

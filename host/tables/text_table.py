@@ -120,13 +120,14 @@ def _of_csv(lines: list[str], named: str, first: int) -> tuple[list[str], str]:
         alike = above and above[-1].count(separator) == n > 0
         names = above[-1].lstrip("# ") if alike else separator.join(f"col{k + 1}" for k in range(n + 1))
         data = [names, *data]
+    rows = [row.rstrip(" ") for row in data[1:]]
+    if rows and all(row.endswith(separator) for row in rows):
+        # The last separator ends the lines, unless it is that of an empty column which has a name.
+        ends = data[0].rstrip(" ").endswith(separator)
+        if ends or rows[0].count(separator) > data[0].count(separator):
+            data = [data[0].rstrip(" ").removesuffix(separator), *(row.removesuffix(separator) for row in rows)]
     _check_lengths(data, separator, named, first)
-    return [line.rstrip().removesuffix(separator) for line in data] if _ends(data[1:], separator) else data, separator
-
-
-def _ends(rows: list[str], separator: str) -> bool:
-    """Return whether each row ends with a separator, so that its last cell is none."""
-    return bool(rows) and all(row.rstrip(" ").endswith(separator) for row in rows)
+    return data, separator
 
 
 def _cells(line: str, separator: str) -> list[str]:
@@ -147,11 +148,8 @@ def is_number(cell: str) -> bool:
 
 def _check_lengths(lines: list[str], separator: str, named: str, first: int) -> None:
     """Raise InputError for the first row with another number of cells than the first line, as if cut short."""
-    # Rows may all end with a separator, with or without one at the end of the names.
-    more = int(_ends(lines[1:], separator) and not _ends(lines[:1], separator))
     for number, line in enumerate(lines, first):
-        wanted = lines[0].count(separator) + 1 + (more if line is not lines[0] else 0)
-        n = line.count(separator) + 1
+        n, wanted = (one.count(separator) + 1 for one in (line, lines[0]))
         if n != wanted and '"' not in line and '"' not in lines[0]:
             raise InputError(
                 f"{named} has {n} cells in row {number}", f"{wanted} as in the first line", key="file", value=n

@@ -308,6 +308,11 @@ def test_separators_at_the_end_of_lines_are_no_cells(separator: str, end: str, h
     rows = "".join(f"{k * CADENCE_S}{separator}{value}{end}\n" for k, value in enumerate(FLUX))
     (tmp_path / "a.csv").write_text(f"time (s){separator}flux{head}\n{rows}")
     np.testing.assert_array_equal(read_frames(tmp_path / "a.csv").flux, FLUX)
+    # An empty column that has a name is one.
+    (tmp_path / "b.csv").write_text(f"time (s){separator}flux{separator}note\n{rows}")
+    np.testing.assert_array_equal(read_frames(tmp_path / "b.csv").flux, FLUX)
+    with refused("column", "flux, note"):
+        read_frames(tmp_path / "b.csv", FrameMapping(time="time (s)", flux="another"))
 
 
 def test_names_that_differ_in_case_are_told_apart(tmp_path: Path) -> None:

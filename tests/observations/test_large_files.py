@@ -197,6 +197,8 @@ TABLES = {
     "long row": ["time,flux,error", *CELLS[:-5], "55,1000,5,6", *CELLS[-4:]],
     "decimal commas": ["time;flux;error", *(f"{k},5;1000,0;5" for k in range(60))],
     "no rows": ["time,flux,error"],
+    "separators at the end": ["time,flux,error", *(f"{line}," for line in CELLS)],
+    "an empty last column": ["time,flux,error,note", *(f"{line}," for line in CELLS)],
 }
 REFUSED = {"text among numbers": "in row 56", "short row": "2 cells in row 56", "long row": "4 cells in row 56",
            "decimal commas": "'0,5' in row 1", "no rows": "has no rows"}  # fmt: skip
