@@ -12,8 +12,6 @@ from mauvecl.schema.text import shortened
 
 from ..files.parsing import parsing
 from ..files.size_limits import read_bytes, unpacked
-from ..tables.opening import form_of
-from ..tables.text_table import text_of
 
 if TYPE_CHECKING:
     import astropy.units as u
@@ -87,6 +85,8 @@ def _stem(name: str) -> str:
 def _tables(
     content: bytes, name: str, origin: str, asked: Sequence[str], units: tuple[bool, bool], check: bool
 ) -> list[FileTable]:
+    from ..tables.opening import form_of
+    from ..tables.text_table import text_of
     from .fits_files import fits_tables
     from .table_files import ecsv_tables, votable_tables
     from .text import text_tables
