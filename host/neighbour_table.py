@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened, shown
+from mauvecl.schema.text import printable, shortened, shown
 
 from .neighbours import Neighbour
 from .stars.band_names import known_band
@@ -38,6 +38,7 @@ COLOURS = ("bp_rp", "bp-rp", "bprp")
 #: All names of columns that are read, with that of a magnitude's band.
 KNOWN = (*STARS, *SEPARATIONS, *RIGHT_ASCENSIONS, *DECLINATIONS, *MAGNITUDES, "band", *TYPES, *FILES, *TEMPERATURES,
          *COLOURS)  # fmt: skip
+_KEYS = {key_of(name) for name in KNOWN} | {key_of("target_separation")}
 #: Units of separations without a stated unit: ADQL's DISTANCE is in degrees.
 UNSTATED = {"dist": "deg"}
 #: Largest number of rows; a fibre holds far fewer stars.
@@ -78,6 +79,10 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
                 path.parent / spectrum if spectrum else None, table.number(temperature, k, "K", above=0.0),
                 table.number(colour, k, "mag"),
             ))  # fmt: skip
+    unused = [one for one in table.names if key_of(one) not in _KEYS]
+    if unused:
+        words = f"column of {named} is" if len(unused) == 1 else f"columns of {named} are"
+        notes += (f"{len(unused)} {words} not used: {printable(', '.join(unused), 200)}.",)
     return tuple(sorted(stars, key=lambda star: star.separation_arcsec)), notes
 
 

@@ -20,7 +20,7 @@ from .fits_tables import FitsTables
 from .large_tables import LARGE, open_large
 from .names import STARS
 from .table import MemoryTable, TableFile
-from .text_table import keywords_of, text_of, text_table
+from .text_table import is_csv, keywords_of, text_of, text_table
 
 if TYPE_CHECKING:
     from astropy.io.votable.tree import VOTableFile
@@ -119,7 +119,7 @@ def _in_memory(
         raise error.within(what) from error
     if not text.strip():
         raise InputError(f"{what} is empty", expected, key="file")
-    found = MemoryTable(text_table(text, what, commas, expected, texts=texts), what)
+    found = MemoryTable(text_table(text, what, commas or is_csv(text), expected, texts=texts), what)
     found.header |= keywords_of([line for line in text.splitlines() if line[:1] in "#%!;"])
     return found
 

@@ -11,6 +11,7 @@ from mauvecl.schema.errors import InputError
 
 from ..files.parsing import parsing
 from .ecsv import check_cells, parse_ecsv
+from .times import is_dated
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -105,6 +106,15 @@ def text_table(
         for name, unit in zip(table.colnames, units, strict=False):
             table[name].unit = unit.strip('"') or None
         return table
+
+
+def is_csv(text: str) -> bool:
+    """Return whether the rows of a text are divided by commas or semicolons, whatever the file is called."""
+    rows = [line for line in text[:20_000].splitlines() if line.strip() and line[0] not in "#%!;"][1:50]
+    separator = next((one for one in SEPARATORS[:2] if rows and all(one in row for row in rows)), "")
+    # Decimal commas stand between columns that blanks divide.
+    return bool(separator) and not any(re.search(r"\d\s+[-+.\d]", cell) for cell in _cells(rows[0], separator)
+                                       if not is_dated(cell))  # fmt: skip
 
 
 def _of_csv(lines: list[str], named: str, first: int) -> tuple[list[str], str]:

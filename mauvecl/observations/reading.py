@@ -259,7 +259,10 @@ def _recognised(file: TableFile) -> FrameMapping:
     columns = {key: first_of(known, names, file.what) for key, known in KNOWN.items()}
     if columns["time"] is None:
         dated = [name for name in names if (said := time_in_name(name)) is not None and said.epoch_mjd is not None]
-        columns["time"] = dated[0] if len(dated) == 1 else None
+        if len(dated) > 1:
+            fault = f"{file.what}: {len(dated)} columns may be the time: {', '.join(map(shortened, dated))}"
+            raise InputError(fault, "a mapping that names one", key="time", value=dated)
+        columns["time"] = dated[0] if dated else None
     flux = divided_unit(columns["flux"] or "")[0]
     # Errors of another flux would be wrong ones.
     columns["error"] = first_of((f"{flux}_err", f"{flux}_error", f"{flux}err", f"e_{flux}", "error"), names, file.what)
