@@ -105,7 +105,7 @@ DAMAGED = ("_ValidHDU", "_NonstandardHDU", "_CorruptedHDU")
 def check_extensions(hdus: Any) -> None:
     """Raise InputError for an extension whose header is damaged, such as a second primary header."""
     for number, hdu in enumerate(hdus):
-        if type(hdu).__name__ in DAMAGED:
+        if type(hdu).__name__ in DAMAGED or (number > 0 and "SIMPLE" in hdu.header):
             raise InputError(f"has a damaged header in extension {number}", WHOLE, key="file", value=number)
 
 
