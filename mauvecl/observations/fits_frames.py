@@ -208,7 +208,8 @@ def open_fits(file: IO[bytes], what: str) -> Iterator[fits.HDUList]:
         hdus = fits.open(file, mode="readonly", memmap=False, lazy_load_hdus=False)
     with hdus:
         try:
-            check_extensions(hdus)
+            with parsing("it", EXPECTED):
+                check_extensions(hdus)
         except InputError as error:
             raise error.within(what) from error
         yield hdus
