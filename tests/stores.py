@@ -32,10 +32,9 @@ def study(realisations: int = 300, **sections: Any) -> Study:
 
 
 def tree(path: Path) -> dict[str, bytes]:
-    """Read every file of a store; lists of digests are sorted, since their order is that of writing."""
+    """Read every file of a store."""
     found = {str(p.relative_to(path)): p.read_bytes() for p in path.rglob("*") if p.is_file()}
-    lists = {name: b"".join(sorted(set(text.splitlines()))) for name, text in found.items() if "digests" in name}
-    return {name: text for name, text in found.items() if not Path(name).name.startswith(".")} | lists
+    return {name: text for name, text in found.items() if not Path(name).name.startswith(".")}
 
 
 def flip(path: Path, place: int = 100) -> None:

@@ -114,14 +114,32 @@ def open_fits(file: IO[bytes], what: str = "", *, check: bool = True) -> fits.HD
         file.seek(0)
         with reading("it"):
             hdus = fits.open(file, mode="readonly", memmap=False, lazy_load_hdus=False, disable_image_compression=True)
-        for number, hdu in enumerate(hdus):
-            if type(hdu).__name__ in DAMAGED:
-                raise InputError(f"has a damaged header in extension {number}", WHOLE, key="file", value=number)
+        with reading("it"):
+            check_extensions(hdus)
         if check:
             check_sums(hdus, content)
     except InputError as error:
         raise (error.within(what) if what else error) from error
     return hdus
+
+
+def check_extensions(hdus: Any) -> None:
+    """Raise InputError for an extension whose header is damaged, such as a second primary header.
+
+    astropy reads rows by the formats of their columns, also where they do not take NAXIS1 bytes.
+    """
+    from astropy.io import fits
+
+    for number, hdu in enumerate(hdus):
+        if type(hdu).__name__ in DAMAGED or (number > 0 and "SIMPLE" in hdu.header):
+            raise InputError(f"has a damaged header in extension {number}", WHOLE, key="file", value=number)
+        if isinstance(hdu, fits.BinTableHDU) and (size := hdu.columns.dtype.itemsize) != hdu.header["NAXIS1"]:
+            raise InputError(
+                f"has rows of {hdu.header['NAXIS1']} bytes in extension {number}, whose columns take {size}",
+                WHOLE,
+                key="file",
+                value=number,
+            )
 
 
 class FileContent:

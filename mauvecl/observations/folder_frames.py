@@ -39,7 +39,7 @@ class FolderFile(TableFile):
         else:
             self.paths = sorted(
                 path for path in folder.glob(mapping.files or "*")
-                if path.is_file() and not path.name.startswith(".") and path.suffix != ".toml"
+                if not path.is_dir() and not path.name.startswith(".") and path.suffix != ".toml"
             )  # fmt: skip
         if not 1 <= len(self.paths) <= MAX_FILES:
             raise InputError(f"{what}: {mapping.files or '*'!r} names {len(self.paths)} files", f"1 to {MAX_FILES}",

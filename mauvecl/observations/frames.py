@@ -22,6 +22,8 @@ Float = NDArray[np.float64]
 MIN_FRAMES = 20
 #: Largest number of frames, for which a search needs some 2 GiB.
 MAX_FRAMES = 2**22
+#: Largest time from the first to the last frame in median steps, of which searches make a grid: 42 years of 20 s.
+MAX_SPAN = 2**26
 #: Share of frames in which a pixel must be finite; others are left out of every frame.
 LIVE_SHARE = 0.5
 #: Shortest time between frames as a share of the cadence; frames that are closer overlap.
@@ -162,6 +164,10 @@ class Frames:
             if not cadence > 0:
                 least = "a different time for each frame"
             raise _bad(name, "time", f"{step[row]:g} s from one frame to the next", least)
+        span = float(time[order[-1]] - time[order[0]])
+        if not span <= MAX_SPAN * cadence:
+            most = f"at most {MAX_SPAN} of the median step of {cadence:g} s"
+            raise _bad(name, "time", f"{span:g} s from the first frame to the last", most)
         if exposure is None:
             exposure = np.full(n, cadence)
         if not (np.isfinite(exposure) & (exposure > 0)).all():

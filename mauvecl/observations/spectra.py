@@ -267,7 +267,9 @@ def survey_spectra(
     # The noise follows that of the whole light in time.
     variance = (level.error[used] / scale) ** 2
     net = (flux - level.level)[used] / scale
-    photon = float(model.gain @ np.maximum(light, 0.0) / np.maximum(light, 0.0).sum())
+    lit = np.maximum(light, 0.0)
+    # Frames without light, such as dark frames, have no photon noise to weight by.
+    photon = float(np.average(model.gain, weights=lit if lit.any() else None))
     survey = SeriesSurvey(
         stare, bank_of(stare, directions, shape), templates, sums[used], variance, net, variance, scale, typical,
         photon, frames.time_s[used],

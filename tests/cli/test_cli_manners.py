@@ -197,3 +197,28 @@ def test_mistakes_load_no_heavy_package(tmp_path: Path) -> None:
     assert list(zip(asked, reported, strict=True)) == [
         (words, [0 if words == ["--version"] else 2, []]) for words in asked
     ]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "started", [["-m", "mauvecl"], ["-c", "import sys; sys.argv[0] = 'mauvecl'; import mauvecl.cli.app"]]
+)
+@pytest.mark.parametrize("module", ["mauvecl.answers.verbs", "mauvecl.schema", "mauvecl.cli.boundary", "typer"])
+def test_interrupt_during_imports_prints_one_line(started: list[str], module: str, tmp_path: Path) -> None:
+    """Interrupt a command while a module is imported."""
+    (tmp_path / "sitecustomize.py").write_text(
+        "import builtins, os, signal\n"
+        "real = builtins.__import__\n"
+        "def imported(name, *given, **how):\n"
+        f"    if name == {module!r}:\n"
+        "        builtins.__import__ = real\n"
+        "        os.kill(os.getpid(), signal.SIGINT)\n"
+        "    return real(name, *given, **how)\n"
+        "builtins.__import__ = imported\n"
+    )
+    path = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])])
+    done = subprocess.run(
+        [sys.executable, *started, "schema"], env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True
+    )
+    assert done.stderr == "mauvecl: interrupted\n"
+    assert done.returncode in (-2, 130)

@@ -87,6 +87,8 @@ TABLES: dict[str, tuple[Columns, Columns, Expected]] = {
     "a row twice": (chosen(DOUBLE), {}, "time"),
     "two rows at a time": (light_curve(t=at(7, TIME[6], TIME)), {}, "time"),
     "all at one time": (light_curve(t=np.full(N, 5.0)), {}, "time"),
+    "a time in another century": (light_curve(t=at(59, 1e11, TIME)), {}, "time"),
+    "a time beyond whole numbers": (light_curve(t=at(59, 1.8e19 * 86_400, TIME)), {}, "time"),
     "no time column": (light_curve(t=None), {}, "column"),
     "no flux column": (light_curve(f=None), {}, "column"),
     "no error column": (light_curve(e=None), {}, "column"),

@@ -1,0 +1,186 @@
+"""Files without an end or of absurd size, and what is no file: refused in one sentence, in little time and memory."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from astropy.table import Table
+
+pytestmark = pytest.mark.long
+
+ROOT = Path(__file__).parents[2]
+GIB = 2**30
+
+
+@pytest.fixture(scope="module")
+def fuzz() -> ModuleType:
+    """Return `tools/fuzz_files.py`, which runs commands within limits."""
+    spec = importlib.util.spec_from_file_location("fuzz_files", ROOT / "tools" / "fuzz_files.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_mutated_files_are_answered_or_refused(fuzz: ModuleType) -> None:
+    """Mutate each format twice; `python tools/fuzz_files.py` does so two thousand times."""
+    assert [fault for fault in fuzz.run(range(74), 4300) if fault is not None] == []
+
+
+@pytest.fixture(scope="module")
+def intact(fuzz: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write intact files of every format."""
+    folder = tmp_path_factory.mktemp("intact")
+    fuzz.make(folder)
+    return folder
+
+
+@pytest.fixture
+def place(intact: Path, tmp_path: Path) -> Path:
+    """Return a folder with links to the intact files, of which a test replaces some."""
+    for path in intact.rglob("*"):
+        there = tmp_path / path.relative_to(intact)
+        if path.is_dir():
+            there.mkdir(exist_ok=True)
+        else:
+            os.link(path, there)
+    return tmp_path
+
+
+def sparse(path: Path, start: bytes = b"", size: int = 8 * GIB) -> None:
+    """Replace a file by one of many GiB that takes no room."""
+    path.unlink(missing_ok=True)
+    with path.open("wb") as file:
+        file.write(start)
+        file.truncate(size)
+
+
+def fifo(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+
+
+def endless(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    path.symlink_to("/dev/zero")
+
+
+def one_line(path: Path) -> None:
+    """Replace a table by one whose last row never ends."""
+    sparse(path, path.read_bytes().rstrip().rpartition(b"\n")[0] + b"\n0.1,1")
+
+
+def many_comments(path: Path) -> None:
+    """Replace a table by its first line and a hundred MiB of comments."""
+    first = path.read_bytes().splitlines(keepends=True)[0]
+    path.unlink()
+    path.write_bytes((first if first.startswith(b"#") else b"") + b"# nothing\n" * (10 * 2**20))
+
+
+REPLACED: tuple[Callable[[Path], None], ...] = (sparse, fifo, endless)
+ANALYSE = ("analyse", "--no-pictures", "--quiet", "--output", "out")
+#: What reads a file: the file, and the command.
+READERS = {
+    "frames": ("f.csv", (*ANALYSE, "f.csv", "--mapping", "m.toml")),
+    "frames in FITS": ("f.fits", (*ANALYSE, "f.fits", "--mapping", "w.toml")),
+    "mapping": ("m.toml", (*ANALYSE, "f.csv", "--mapping", "m.toml")),
+    "a file of a folder": ("spectra/07.fits", (*ANALYSE, "spectra", "--mapping", "folder.toml")),
+    "the first file of a folder": ("spectra/00.fits", (*ANALYSE, "spectra", "--mapping", "folder.toml")),
+    "wavelengths that a mapping names": ("nm.csv", (*ANALYSE, "i.fits", "--mapping", "named.toml")),
+    "table that a mapping names": ("times.csv", (*ANALYSE, "spectra", "--mapping", "listed.toml")),
+    "spectrum": ("s.ecsv", ("library", "add", "s.ecsv")),
+    "study": ("study.toml", ("exposure", "study.toml", "--snr", "20", "--at", "500", "--output", "out")),
+    "instrument": ("own.toml", ("exposure", "--snr", "9", "--at", "500", "--star", "G2V", "--magnitude", "8",
+                                "--instrument", "own.toml")),
+    "targets": ("targets.csv", ("visible", "--targets", "targets.csv", "--output", "out")),
+    "description of a store": ("frames.zarr/star-1/quiescent/zarr.json", (*ANALYSE, "frames.zarr[star-1/quiescent]")),
+    "exported description": ("frames.zarr/star-1/quiescent/zarr.json", ("export", "frames.zarr", "new.h5")),
+    "exported chunk": ("frames.zarr/star-1/quiescent/c/0/0", ("export", "frames.zarr", "new.h5")),
+    "chunk of a store": ("frames.zarr/star-1/quiescent/c/0/0", (*ANALYSE, "frames.zarr[star-1/quiescent]")),
+}  # fmt: skip
+#: Files that `verify` finds at fault.
+VERIFIED = {
+    "description of a store": ("frames.zarr/star-1/quiescent/zarr.json", "frames.zarr"),
+    "chunk of a store": ("frames.zarr/star-1/quiescent/c/0/0", "frames.zarr"),
+    "digests of a store": ("frames.zarr/star-1/quiescent/digests.txt", "frames.zarr"),
+    "table of an answer": ("answer/exposure.ecsv", "answer"),
+    "study of an answer": ("answer/study.toml", "answer"),
+}
+
+
+def prepare(place: Path) -> None:
+    """Write what only these tests need: wavelengths in a file, and a table of the files of a folder."""
+    mapping = (place / "wcs.toml").read_text().replace('wavelength = "wcs"', 'wavelength_file = "nm.csv"')
+    (place / "named.toml").write_text(f'{mapping}wavelength_unit = "Angstrom"\n')
+    Table({"nm": np.linspace(2505.0, 6505.0, 6)}).write(place / "nm.csv", format="ascii.csv")
+    names = [path.name for path in sorted((place / "spectra").glob("*.fits"))]
+    Table({"file": names, "T": np.arange(len(names)) * 20.0}).write(place / "times.csv")
+    (place / "listed.toml").write_text(
+        'table = "../times.csv"\ntime = "T"\ntime_unit = "s"\nflux = "FLUX"\nflux_unit = "adu/s"\nerror = "ERR"\n'
+        'exposure_s = 18.0\nwavelength = "W"\nwavelength_unit = "Angstrom"\n'
+    )
+
+
+def outcome(fuzz: ModuleType, words: tuple[str, ...], place: Path, codes: tuple[int, ...]) -> tuple[str, str]:
+    """Run a command within its limits; return what is wrong with its outcome, and its messages."""
+    code, out, log = fuzz.ended(list(words), place, fuzz.limited, {"MAUVECL_DATA_DIR": str(place / "d")})
+    return fuzz.fault_of(code, out, log, codes), out + log
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_intact_files_are_read(reader: str, place: Path, fuzz: ModuleType) -> None:
+    """Check that the refusals below are not those of something else."""
+    prepare(place)
+    fault, log = outcome(fuzz, READERS[reader][1], place, (0,))
+    assert fault == "", log
+
+
+@pytest.mark.parametrize("replace", REPLACED)
+@pytest.mark.parametrize("reader", READERS)
+def test_no_reader_reads_without_end(
+    reader: str, replace: Callable[[Path], None], place: Path, fuzz: ModuleType
+) -> None:
+    prepare(place)
+    file, words = READERS[reader]
+    replace(place / file)
+    fault, log = outcome(fuzz, words, place, (2,))
+    assert fault == "", log
+
+
+@pytest.mark.parametrize("replace", REPLACED)
+@pytest.mark.parametrize("what", VERIFIED)
+def test_verification_reads_no_file_without_end(
+    what: str, replace: Callable[[Path], None], place: Path, fuzz: ModuleType
+) -> None:
+    file, folder = VERIFIED[what]
+    replace(place / file)
+    fault, log = outcome(fuzz, ("verify", folder), place, (1, 2))
+    assert fault == "", log
+
+
+@pytest.mark.parametrize("replace", [one_line, many_comments])
+@pytest.mark.parametrize("name", ["f.csv", "f.ecsv"])
+def test_lines_have_a_bound(name: str, replace: Callable[[Path], None], place: Path, fuzz: ModuleType) -> None:
+    """Read tables that are large enough for pieces, whose line or header has no end."""
+    replace(place / name)
+    fault, log = outcome(fuzz, (*ANALYSE, name, "--mapping", "m.toml"), place, (2,))
+    assert fault == "", log
+    assert "characters" in log
+
+
+def test_descriptions_nested_deeply_are_refused(place: Path, fuzz: ModuleType) -> None:
+    path = place / "frames.zarr/star-1/quiescent/zarr.json"
+    path.unlink()
+    path.write_text('{"a":' * 100_000 + "1" + "}" * 100_000)
+    for words, codes in ((("verify", "frames.zarr"), (1,)), (("export", "frames.zarr", "n.h5"), (2,))):
+        fault, log = outcome(fuzz, words, place, codes)
+        assert fault == "", log
