@@ -12,7 +12,7 @@ from mauvecl.schema.text import printable, shortened, shown
 
 from .neighbours import Neighbour
 from .stars.band_names import known_band
-from .tables.names import DECLINATIONS, RIGHT_ASCENSIONS, SPECTRAL_TYPES, STARS, key_of
+from .tables.names import DECLINATIONS, RIGHT_ASCENSIONS, SPECTRAL_TYPES, STARS, divided_unit, key_of
 from .tables.opening import read_table
 from .tables.rows import Rows
 
@@ -79,7 +79,7 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
                 path.parent / spectrum if spectrum else None, table.number(temperature, k, "K", above=0.0),
                 table.number(colour, k, "mag"),
             ))  # fmt: skip
-    unused = [one for one in table.names if key_of(one) not in _KEYS]
+    unused = [one for one in table.names if not {key_of(one), key_of(divided_unit(one)[0])} & _KEYS]
     if unused:
         words = f"column of {named} is" if len(unused) == 1 else f"columns of {named} are"
         notes += (f"{len(unused)} {words} not used: {printable(', '.join(unused), 200)}.",)

@@ -95,18 +95,17 @@ def angle(text: str, unit: str = "", *, right_ascension: bool, pair: int = 3) ->
 
     Raises ValueError if the text is no angle, InputError if it is out of range.
     """
-    import astropy.units as u
     from astropy.coordinates import Angle
 
     plain = " ".join(text.translate(_TYPESET).strip().split())
     sexagesimal = "hourangle" if right_ascension else "deg"
     if re.fullmatch(_NUMBER, plain):
-        value = float(u.Quantity(float(plain), unit or "deg").to_value("deg"))
+        value = _degrees(Angle(float(plain), unit or "deg"))
     elif match := re.fullmatch(rf"({_NUMBER})\s*([a-zA-Z°'\"]+)", plain):
         stated = angle_unit(match[2])
         if stated is None:
             raise ValueError(text)
-        value = float(u.Quantity(float(match[1]), stated).to_value("deg"))
+        value = _degrees(Angle(float(match[1]), stated))
     elif re.fullmatch(r"[+-]?\d+(?::\d+){0,1}:\d+(?:\.\d*)?", plain) or (
         re.fullmatch(r"[+-]?\d+ \d+ \d+(?:\.\d*)?", plain) and pair == 3
     ):

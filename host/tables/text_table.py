@@ -11,7 +11,7 @@ from mauvecl.schema.errors import InputError
 
 from ..files.parsing import parsing
 from .ecsv import check_cells, parse_ecsv
-from .times import is_dated
+from .times import is_dated, time_unit
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 #: Separators of cells in CSV; the one that is most frequent in the first line counts.
 SEPARATORS = (",", ";", "\t")
 #: Words of cells without a value, as archives and programs write them; an empty cell has none in any case.
-MISSING_WORDS = ("", "null", "none", "n/a", "na", "--", "-", "...", "masked", "indef", "<na>")
+MISSING_WORDS = ("", "null", "none", "n/a", "na", "--", "---", "-", "...", "masked", "indef", "<na>")
 MISSING = tuple(dict.fromkeys(how(word) for word in MISSING_WORDS for how in (str, str.upper, str.capitalize)))
 _ZERO = re.compile(r"0\d+")
 _LEADING_ZERO = re.compile(r"(?m)(?:^|[,;\t\s])\"?0\d+\"?\s*(?:$|[,;\t\s])")
@@ -91,6 +91,8 @@ def text_table(
         if len(lines) > 2 and all(re.fullmatch(r"-+", cell) for cell in _cells(lines[2], separator)):
             # VizieR writes units and dashes below the names.
             units, lines = _cells(lines[1], separator), [lines[0], *lines[3:]]
+        elif len(lines) > 2 and _are_units(_cells(lines[1], separator), _cells(lines[2], separator)):
+            units, lines = _cells(lines[1], separator), [lines[0], *lines[2:]]
     check_cells(lines, named)
     how: dict[str, Any] = {"delimiter": separator, "format": "ascii.csv"} if commas else {"format": "ascii"}
     zeros = _LEADING_ZERO.search("\n".join(lines[1:])) is not None
@@ -138,6 +140,22 @@ def _of_csv(lines: list[str], named: str, first: int) -> tuple[list[str], str]:
             data = [data[0].rstrip(" ").removesuffix(separator), *(row.removesuffix(separator) for row in rows)]
     _check_lengths(data, separator, named, first)
     return data, separator
+
+
+def _are_units(cells: list[str], below: list[str]) -> bool:
+    """Return whether the cells below the names of columns are units of the numbers below them."""
+    import astropy.units as u
+
+    for cell, number in zip(cells, below, strict=False):
+        if cell and (is_number(cell) or not is_number(number)):
+            return False
+        try:
+            known = not cell or time_unit(cell) is not None or u.Unit(cell) is not None
+        except (ValueError, TypeError):
+            known = False
+        if not known:
+            return False
+    return any(cells)
 
 
 def _cells(line: str, separator: str) -> list[str]:

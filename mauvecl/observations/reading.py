@@ -255,7 +255,8 @@ def _wanted(mapping: FrameMapping | None) -> tuple[tuple[str, ...], ...]:
 
 def _recognised(file: TableFile) -> FrameMapping:
     """Return the mapping of a file whose columns have known names."""
-    names = [name for name in file.names if "/" not in name]
+    # Of FITS files also images, but no columns of other extensions.
+    names = [*file.columns, *(name for name in file.names if "/" not in name and name not in file.columns)]
     columns = {key: first_of(known, names, file.what) for key, known in KNOWN.items()}
     if columns["time"] is None:
         dated = [name for name in names if (said := time_in_name(name)) is not None and said.epoch_mjd is not None]
@@ -266,6 +267,9 @@ def _recognised(file: TableFile) -> FrameMapping:
     flux = divided_unit(columns["flux"] or "")[0]
     # Errors of another flux would be wrong ones.
     columns["error"] = first_of((f"{flux}_err", f"{flux}_error", f"{flux}err", f"e_{flux}", "error"), names, file.what)
+    if columns["flux"] is None and (magnitudes := [name for name in names if is_magnitude(name)]):
+        fault = f"{file.what} has magnitudes ({', '.join(map(shortened, magnitudes))}) and no column of linear light"
+        raise InputError(fault, "light in a linear unit, in a column named flux", key="flux", value=magnitudes)
     if columns["time"] is None or columns["flux"] is None:
         raise InputError(
             f"{file.what} has the columns {shortened(', '.join(file.names), 300)}",

@@ -286,7 +286,7 @@ def test_units_of_other_kinds_raise(tmp_path: Path) -> None:
         read_targets(tmp_path / "b.ecsv")
 
 
-@pytest.mark.parametrize("cell", ["", "null", "NULL", "nan", "NaN", "None", "N/A", "--", "-"])
+@pytest.mark.parametrize("cell", ["", "null", "NULL", "nan", "NaN", "None", "N/A", "--", "---", "-"])
 def test_cells_without_a_value_are_missing(cell: str, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(f"name,ra,dec,V,sptype\nAU Mic,{cell},{cell},{cell},{cell}\nB,10.5,-3,8,K5V\n")
     first, second = read_targets(tmp_path / "a.csv")
@@ -313,6 +313,21 @@ def test_separators_at_the_end_of_lines_are_no_cells(separator: str, end: str, h
     np.testing.assert_array_equal(read_frames(tmp_path / "b.csv").flux, FLUX)
     with refused("column", "flux, note"):
         read_frames(tmp_path / "b.csv", FrameMapping(time="time (s)", flux="another"))
+
+
+def test_rows_of_units_below_the_names_count(tmp_path: Path) -> None:
+    rows = "".join(f"{day},{value},2\n" for day, value in zip(DAYS, FLUX, strict=True))
+    (tmp_path / "a.csv").write_text(f"time,flux [ct/s],flux_err\ndays,,\n{rows}")
+    found = read_frames(tmp_path / "a.csv")
+    assert (found.n_frames, found.unit) == (N, "ct/s")
+    assert found.cadence_s == pytest.approx(CADENCE_S, abs=1e-3)
+    assert found.error is not None
+    (tmp_path / "t.csv").write_text("name,ra,dec,distance\n,hourangle,deg,kpc\nB,0.7,-3,0.02\n")
+    (one,) = read_targets(tmp_path / "t.csv")
+    assert (one["coordinates"], one["distance_pc"]) == ("10.5 -3.0", 20.0)
+    # Names that are units as well stay rows.
+    (tmp_path / "n.csv").write_text("name,V\nm,8\ns,9\n")
+    assert [one["name"] for one in read_targets(tmp_path / "n.csv")] == ["m", "s"]
 
 
 def test_names_that_differ_in_case_are_told_apart(tmp_path: Path) -> None:
