@@ -89,7 +89,13 @@ class _Reader:
 
     def _remarks(self, header: Any) -> str:
         headers = [self.primary] if self.primary is header else [self.primary, header]
-        return "\n".join(text_at(one, key) for one in headers for key in _REMARKS)[:100_000]
+        texts = [text_at(one, key) for one in headers for key in _REMARKS]
+        # Comments beside the names and units of columns and axes, as in "TTYPE1 = 'WAVE' / in air".
+        cards = [key for key in header if re.fullmatch(r"T(?:TYPE|UNIT)\d+|C(?:TYPE|UNIT|RVAL)1", key)]
+        texts += [str(header.comments[key]) for key in cards] + [
+            text_at(header, key) for key in header if "TCOMM" in key
+        ]
+        return "\n".join(texts)[:100_000]
 
     def _notes(self, header: Any) -> tuple[str, ...]:
         notes = []

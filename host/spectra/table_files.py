@@ -20,6 +20,7 @@ def ecsv_tables(text: str, name: str, origin: str) -> list[FileTable]:
     table = parse_ecsv(text, "it")
     meta = table.meta if isinstance(table.meta, dict) else {}
     own = meta.get("name")
+    descriptions = [str(table[one].info.description or "") for one in table.colnames]
     return [
         FileTable(
             [
@@ -31,7 +32,9 @@ def ecsv_tables(text: str, name: str, origin: str) -> list[FileTable]:
             ],
             own.strip()[:80] if isinstance(own, str) and own.strip() else name,
             origin,
-            remarks="\n".join(_texts(meta.get("comments"))),
+            remarks="\n".join(
+                (*_texts(meta.get("comments")), *(table[one].info.description or "" for one in table.colnames))
+            ),
             medium=partial(medium_of, meta),
             messages=_texts(meta.get("told")),
         )

@@ -18,8 +18,10 @@ Medium = Literal["air", "vacuum"]
 NAMED = ("AIRORVAC", "WAVEMED", "WAVETYPE", "MEDIUM", "WAVEREF", "WLTYPE", "LAMTYPE", "AIR_VAC", "AIRVAC", "VACORAIR",
          "VAC_AIR", "WAVELENGTH_MEDIUM", "WAVELENGTH_TYPE")  # fmt: skip
 LOGICAL: dict[str, Medium] = {
-    **dict.fromkeys(("VACUUM", "VACWAVE", "VACLAM", "ISVAC", "INVAC", "IN_VACUUM", "VAC"), "vacuum"),
-    **dict.fromkeys(("AIR", "AIRWAVE", "AIRLAM", "ISAIR", "IN_AIR"), "air"),
+    **dict.fromkeys(
+        ("VACUUM", "VACWAVE", "VACLAM", "ISVAC", "INVAC", "IN_VACUUM", "VAC", "WAVE_VAC", "WAVEVAC", "VACWL"), "vacuum"
+    ),
+    **dict.fromkeys(("AIR", "AIRWAVE", "AIRLAM", "ISAIR", "IN_AIR", "WAVE_AIR", "WAVEAIR", "AIRWL"), "air"),
 }
 _OTHER: dict[Medium, Medium] = {"air": "vacuum", "vacuum": "air"}
 _TRUE, _FALSE = ("true", "t", "yes", "y", "1", "1.0"), ("false", "f", "no", "n", "0", "0.0")

@@ -417,6 +417,23 @@ def test_keywords_say_air_or_vacuum(medium: str, tmp_path: Path) -> None:
             assert nm == pytest.approx(AIR_500 if medium == "air" else 500.0, abs=1e-4), (path.suffix, name, value)
 
 
+@pytest.mark.parametrize("where", ["comment of the name", "TCOMM", "description", "COMMENT"])
+def test_words_beside_a_column_say_air(where: str, tmp_path: Path) -> None:
+    path = tmp_path / ("a.ecsv" if where == "description" else "a.fits")
+    table = Table({"wavelength": NM * u.nm, "flux": STAR * u.Unit("erg / (s cm2 AA)")})
+    if where == "description":
+        table["wavelength"].info.description = "wavelength in air"
+        table.write(path)
+    else:
+        hdu = fits.table_to_hdu(table)
+        if where == "comment of the name":
+            hdu.header.comments["TTYPE1"] = "wavelength in air"
+        else:
+            hdu.header["TCOMM1" if where == "TCOMM" else "COMMENT"] = "wavelength in air"
+        hdu.writeto(path)
+    assert read_spectrum(path).wavelength_nm[160] == pytest.approx(AIR_500, abs=1e-4)
+
+
 @pytest.mark.parametrize("unit", ["Angstrom air", "nm (air)", "nm_air", "Angstrom (in air)"])
 def test_units_say_air(unit: str, tmp_path: Path) -> None:
     hdu = fits.table_to_hdu(Table({"W": NM * (1 if unit.startswith("nm") else 10), "FLUX": STAR}))
