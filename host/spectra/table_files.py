@@ -20,7 +20,6 @@ def ecsv_tables(text: str, name: str, origin: str) -> list[FileTable]:
     table = parse_ecsv(text, "it")
     meta = table.meta if isinstance(table.meta, dict) else {}
     own = meta.get("name")
-    descriptions = [str(table[one].info.description or "") for one in table.colnames]
     return [
         FileTable(
             [
