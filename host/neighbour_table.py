@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -89,15 +90,24 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
 class _Neighbours(Rows):
     """Rows of a table of neighbours."""
 
+    @cached_property
+    def magnitudes(self) -> list[tuple[str, str]]:
+        """Columns of magnitudes, and their bands."""
+        held = [(self.first((name,)), name, band) for name, band in MAGNITUDES.items()]
+        # Gmag is Gaia's in VizieR, gmag that of other surveys.
+        return [(one, band) for one, name, band in held if one is not None and not (name == "gmag" and one != "Gmag")]
+
+    @cached_property
+    def band(self) -> str | None:
+        """Column of bands."""
+        return self.first(("band",))
+
     def magnitude(self, row: int) -> tuple[float | None, str]:
         """Return magnitude and band of a star; None if it has none."""
-        for name, band in MAGNITUDES.items():
-            # Gmag is Gaia's in VizieR, gmag that of other surveys.
-            held = self.first((name,))
-            if held is not None and not (name == "gmag" and held != "Gmag"):
-                value = self.number(held, row, "mag")
-                if value is not None:
-                    return value, band or known_band(self.text(self.first(("band",)), row) or "V")
+        for name, band in self.magnitudes:
+            value = self.number(name, row, "mag")
+            if value is not None:
+                return value, band or known_band(self.text(self.band, row) or "V")
         return None, "V"
 
     def separations(self, own: int | None, target: str | None) -> tuple[Float, tuple[str, ...]]:

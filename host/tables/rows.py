@@ -35,6 +35,10 @@ class Rows:
 
     def __init__(self, table: Table, named: str, key: str | None = None) -> None:
         self.table, self.named, self.key, self.n = table, named, key, len(table)
+        self._texts: dict[str, list[str]] = {}
+        self._values: dict[str, list[float] | None] = {}
+        self._units: dict[str, str] = {}
+        self._factors: dict[tuple[str, str], float] = {}
 
     @cached_property
     def names(self) -> list[str]:
@@ -47,15 +51,27 @@ class Rows:
 
     def text(self, name: str | None, row: int) -> str:
         """Return the text of a cell; empty for a missing one."""
-        if name is None:
-            return ""
-        value = self.table[name][row]
-        if np.ma.is_masked(value):
-            return ""
-        text = (
-            value.decode("utf-8", "replace") if isinstance(value, bytes) else str(getattr(value, "value", value))
-        ).strip()
-        return "" if text in MISSING or text.lower() == "nan" else text
+        return "" if name is None else self.texts(name)[row]
+
+    def texts(self, name: str) -> list[str]:
+        """Return the texts of a column."""
+        if name not in self._texts:
+            values = np.ma.asarray(getattr(self.table[name], "value", self.table[name]))
+            cells = [
+                "" if cell is None or cell is np.ma.masked else
+                (cell.decode("utf-8", "replace") if isinstance(cell, bytes) else str(cell)).strip()
+                for cell in (values.tolist() if values.dtype.kind in "SUO" else values)
+            ]  # fmt: skip
+            self._texts[name] = ["" if text in MISSING or text.lower() == "nan" else text for text in cells]
+        return self._texts[name]
+
+    def _numbers(self, name: str) -> list[float] | None:
+        """Return the numbers of a column as the table holds them, or None if it holds texts."""
+        if name not in self._values:
+            values = np.ma.asarray(getattr(self.table[name], "value", self.table[name]))
+            numeric = values.dtype.kind in "iuf" and values.ndim == 1
+            self._values[name] = np.ma.filled(values.astype(np.float64), np.nan).tolist() if numeric else None
+        return self._values[name]
 
     def unit(self, name: str) -> str:
         """Return the unit of a column as the table states it, or in its name, as in ``distance (pc)``; or nothing."""
@@ -75,11 +91,10 @@ class Rows:
         text = self.text(name, row)
         if name is None or not text:
             return None
-        cell = self.table[name][row]
+        numbers = self._numbers(name)
         try:
             # Numbers of single precision are those that the file holds, not their shortest text.
-            value = float(getattr(cell, "value", cell) if self.table[name].dtype.kind in "iuf" else text)
-            value *= self._factor(name, unit)
+            value = (float(text) if numbers is None else numbers[row]) * self._factor(name, unit)
         except InputError:
             raise
         except ValueError:
@@ -94,19 +109,26 @@ class Rows:
         text = self.text(name, row)
         if not text:
             return None
-        system = " ".join(str(self.table.meta.get(key, "")) for key in ("RADESYS", "RADECSYS", "EQUINOX", "COOSYS"))
-        if re.search(r"FK4|1950", system):
-            expected = "right ascension and declination in ICRS or FK5 of J2000"
-            raise self.error(f"its coordinates are in {' '.join(system.split())}", expected, name, system)
-        stated = getattr(self.table[name], "unit", None)
-        unit = unit_in_name(name) if stated is None else angle_unit(str(stated))
-        if unit is None:
-            raise self.error(f"{name} has the unit {shortened(str(stated))}", "an angle", name, str(stated))
+        unit = self._angles(name)
         try:
             return angle(text, unit, right_ascension=right_ascension)
         except ValueError as error:
             expected = getattr(error, "expected", None) or "degrees, or sexagesimal text such as 10h30m00s or 10:30:00"
             raise self.error(f"row {row + 1} has {name} = {shortened(text)}", expected, name, text) from error
+
+    def _angles(self, name: str) -> str:
+        """Return the unit of a column of angles; raise InputError for another, or for coordinates in FK4."""
+        if name not in self._units:
+            system = " ".join(str(self.table.meta.get(key, "")) for key in ("RADESYS", "RADECSYS", "EQUINOX", "COOSYS"))
+            if re.search(r"FK4|1950", system):
+                expected = "right ascension and declination in ICRS or FK5 of J2000"
+                raise self.error(f"its coordinates are in {' '.join(system.split())}", expected, name, system)
+            stated = getattr(self.table[name], "unit", None)
+            unit = unit_in_name(name) if stated is None else angle_unit(str(stated))
+            if unit is None:
+                raise self.error(f"{name} has the unit {shortened(str(stated))}", "an angle", name, str(stated))
+            self._units[name] = unit
+        return self._units[name]
 
     def error(self, fault: str, expected: str, name: str, value: Any = None) -> InputError:
         """Return the error of a column or cell."""
@@ -114,6 +136,11 @@ class Rows:
 
     def _factor(self, name: str, unit: str) -> float:
         """Return the factor from the unit of a column to another."""
+        if (name, unit) not in self._factors:
+            self._factors[name, unit] = self._ratio(name, unit)
+        return self._factors[name, unit]
+
+    def _ratio(self, name: str, unit: str) -> float:
         import astropy.units as u
 
         stated = self.unit(name)

@@ -51,12 +51,14 @@ FORMATS = "FITS, HDF5, ECSV, CSV, a Zarr store or a folder of spectra"
 #: Names of columns that need no mapping, in order of preference, in any case: those of mauvecl, of the pipelines of
 #: Kepler, K2 and TESS, of lightkurve and AltaiPony, and of K2SFF, QLP, eleanor and TASOC.
 KNOWN = {
-    "time": ("time", "t", "date", "datetime", "timestamp"),
+    "time": ("time",),
     "flux": ("flux", "pdcsap_flux", "sap_flux", "kspsap_flux", "det_flux", "corr_flux", "corrected_flux", "fcor",
              "flux_corr", "detrended_flux", "rate"),
     "quality": ("quality", "sap_quality"),
     "temperature": ("temperature",),
 }  # fmt: skip
+#: Names of times where no column is called time and none is named after its dates, such as BJD.
+OTHER_TIMES = ("t", "date", "datetime", "timestamp")
 #: Part of a frame that times refer to.
 PARTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
 #: Dates of observed light, MJD, from 1845 to 2269.
@@ -263,7 +265,7 @@ def _recognised(file: TableFile) -> FrameMapping:
         if len(dated) > 1:
             fault = f"{file.what}: {len(dated)} columns may be the time: {', '.join(map(shortened, dated))}"
             raise InputError(fault, "a mapping that names one", key="time", value=dated)
-        columns["time"] = dated[0] if dated else None
+        columns["time"] = dated[0] if dated else first_of(OTHER_TIMES, names, file.what)
     flux = divided_unit(columns["flux"] or "")[0]
     # Errors of another flux would be wrong ones.
     columns["error"] = first_of((f"{flux}_err", f"{flux}_error", f"{flux}err", f"e_{flux}", "error"), names, file.what)
@@ -456,7 +458,7 @@ def _time_unit(
     if len({one.unit for one in time}) > 1 and not mapping.time_unit:
         names = " and ".join(repr(one.name) for one in time)
         raise InputError(f"{file.what}: {names} have different units", "one unit", key="time")
-    text = mapping.time_unit or time[0].unit
+    text = mapping.time_unit or time[0].unit or unit_in_name(time[0].name)
     named = time_in_name(time[0].name)
     said = named if not text else time_unit(text)
     if said is None:
