@@ -19,6 +19,8 @@ from .fits_images import axis_of, is_spectrum_image, paired_images, rows_of
 IMPLIED_UNITS = ("Angstrom", "erg / (s cm2 Angstrom)")
 #: Bytes of a block (FITS standard 4.0, section 3.1), and largest numbers of cards of a header and of extensions.
 BLOCK, MAX_CARDS, MAX_EXTENSIONS = 2880, 100_000, 1000
+#: Largest number of bytes after the last extension.
+MAX_AFTER = 2**20
 #: Keywords whose text may mention air, vacuum, the star's surface or its dust.
 _REMARKS = ("AIRORVAC", "VACUUM", "WAVEMED", "WAVETYPE", "VACWAVE", "COMMENT", "HISTORY", "DESCRIP")
 WHOLE = "a whole FITS file"
@@ -59,6 +61,10 @@ def check_sizes(content: Content) -> None:
     place = 0
     for number in range(MAX_EXTENSIONS + 1):
         if content[place : place + 8] not in (b"SIMPLE  ", b"XTENSION"):
+            if len(content) - place > MAX_AFTER:
+                # astropy would search all of it for the end of a header.
+                fault = f"has {len(content) - place} bytes after its extension {number - 1}"
+                raise InputError(fault, f"at most {MAX_AFTER}", key="file", value=len(content) - place)
             return
         if number == MAX_EXTENSIONS:
             break
