@@ -8,6 +8,8 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
+import numpy as np
+
 from mauvecl.schema.errors import InputError
 
 from ..files.parsing import parsing
@@ -118,7 +120,21 @@ def check_extensions(hdus: Any) -> None:
     for number, hdu in enumerate(hdus):
         if type(hdu).__name__ in DAMAGED or (number > 0 and "SIMPLE" in hdu.header):
             raise InputError(f"has a damaged header in extension {number}", WHOLE, key="file", value=number)
-        if isinstance(hdu, fits.BinTableHDU) and (size := hdu.columns.dtype.itemsize) != hdu.header["NAXIS1"]:
+        if not isinstance(hdu, fits.BinTableHDU):
+            continue
+        names = hdu.columns.names
+        if odd := next((name for name in names if name is not None and names.count(name) > 1), None):
+            fault = f"has several columns named {odd!r} in extension {number}"
+            raise InputError(fault, "another name for each", key="columns", value=odd)
+        if None in names:
+            raise InputError(
+                f"has a column whose TTYPE{names.index(None) + 1} is empty in extension {number}",
+                "a name for each column",
+                key="columns",
+                value=number,
+            )
+        size = sum(np.dtype(column.format.recformat).itemsize for column in hdu.columns)
+        if size != hdu.header["NAXIS1"]:
             raise InputError(
                 f"has rows of {hdu.header['NAXIS1']} bytes in extension {number}, whose columns take {size}",
                 WHOLE,
