@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 #: Bytes of a block (FITS standard 4.0, section 3.1), and largest numbers of cards of a header and of extensions.
 BLOCK, MAX_CARDS, MAX_EXTENSIONS = 2880, 100_000, 1000
+#: Largest number of bytes after the last extension.
+MAX_AFTER = 2**20
 WHOLE = "a whole FITS file"
 #: astropy's classes of extensions whose headers it cannot interpret.
 DAMAGED = ("_ValidHDU", "_NonstandardHDU", "_CorruptedHDU")
@@ -46,6 +48,10 @@ def check_sizes(content: Content) -> None:
     place = 0
     for number in range(MAX_EXTENSIONS + 1):
         if content[place : place + 8] not in (b"SIMPLE  ", b"XTENSION"):
+            if len(content) - place > MAX_AFTER:
+                # astropy would search all of it for the end of a header.
+                fault = f"has {len(content) - place} bytes after its extension {number - 1}"
+                raise InputError(fault, f"at most {MAX_AFTER}", key="file", value=len(content) - place)
             return
         if number == MAX_EXTENSIONS:
             break
@@ -133,7 +139,21 @@ def check_extensions(hdus: Any) -> None:
     for number, hdu in enumerate(hdus):
         if type(hdu).__name__ in DAMAGED or (number > 0 and "SIMPLE" in hdu.header):
             raise InputError(f"has a damaged header in extension {number}", WHOLE, key="file", value=number)
-        if isinstance(hdu, fits.BinTableHDU) and (size := hdu.columns.dtype.itemsize) != hdu.header["NAXIS1"]:
+        if not isinstance(hdu, fits.BinTableHDU):
+            continue
+        names = hdu.columns.names
+        if odd := next((name for name in names if name is not None and names.count(name) > 1), None):
+            fault = f"has several columns named {odd!r} in extension {number}"
+            raise InputError(fault, "another name for each", key="columns", value=odd)
+        if None in names:
+            raise InputError(
+                f"has a column whose TTYPE{names.index(None) + 1} is empty in extension {number}",
+                "a name for each column",
+                key="columns",
+                value=number,
+            )
+        size = sum(np.dtype(column.format.recformat).itemsize for column in hdu.columns)
+        if size != hdu.header["NAXIS1"]:
             raise InputError(
                 f"has rows of {hdu.header['NAXIS1']} bytes in extension {number}, whose columns take {size}",
                 WHOLE,

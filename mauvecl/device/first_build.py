@@ -45,7 +45,7 @@ THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
 #: A failure may have a temporary cause and is discarded after a day.
 OUTCOME_LIFETIME_S = 86400.0
 #: Beginning of the outcomes' names in the cache, and the command that forgets them.
-OUTCOME_KEY, FORGET = "first-build-", "mauvecl devices --forget"
+OUTCOME_KEY, FORGET = "first-build-", "`mauvecl devices --forget`"
 #: Number of attempts at each level, since a failure may not occur again.
 ATTEMPTS = 2
 #: Exit codes of the child: the driver failed, or something else.
@@ -320,5 +320,5 @@ def _failure_message(device: Any, outcome: Outcome) -> str:
     return (
         f"{driver}, cannot build kernels for the processor {device.name.strip()} ({tried}), expected another device "
         f"(`mauvecl devices` lists them) or driver: {driver_sources()}; {LIMIT} sets the limit, and mauvecl tries "
-        f"again after a day or after `{FORGET}`"
+        f"again after a day or after {FORGET}"
     )

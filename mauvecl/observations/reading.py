@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.files.parsing import parsing
+from mauvecl.host.files.size_limits import limit_bytes
 from mauvecl.host.spectra.column_roles import words_of
 from mauvecl.host.spectra.formats import without_columns
 from mauvecl.host.tables.fits_tables import FitsTables
@@ -34,7 +35,7 @@ from mauvecl.host.tables.times import (
     time_unit,
 )
 from mauvecl.observations.folder_frames import FolderFile
-from mauvecl.observations.frames import Frames
+from mauvecl.observations.frames import MAX_FRAMES, Frames
 from mauvecl.observations.long_tables import spectra_of_rows
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.observations.quality import ALL_BITS, QualityBits, decimal_flags
@@ -309,6 +310,13 @@ class Quantities:
         nm = one.wavelength
         if nm is None or not nm.shape == flux.shape == times[0].shape or isinstance(file, FolderFile):
             return one
+        if 32 * flux.n_rows > (most := limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")):
+            raise InputError(
+                f"{file.what} has {flux.n_rows} rows of pixels",
+                f"at most {most // 32}; MAUVECL_LARGEST_CONTENT_MIB sets the limit",
+                key="MAUVECL_LARGEST_CONTENT_MIB",
+                value=flux.n_rows,
+            )
         return cls(*spectra_of_rows(times, flux, one.error, one.quality, one.exposure, one.temperature, nm, file.what))
 
 
@@ -338,6 +346,9 @@ def _frames_in(
     n = found.time[0].n_rows
     if n == 0:
         raise InputError(f"{what} has no rows", "a row for each frame", key="frames", value=0)
+    if n > MAX_FRAMES:
+        # Before anything of them is read.
+        raise InputError(f"{what} has {n} rows", f"at most {MAX_FRAMES} frames", key="frames", value=n)
     for values in (*found.time, found.flux, found.error, found.quality, found.exposure, found.temperature):
         if values is not None and values.n_rows != n:
             raise InputError(f"{what}: {values.name!r} has {values.n_rows} rows", f"{n} as the times have",

@@ -15,6 +15,7 @@ from mauvecl.host.files.parsing import parsing
 from mauvecl.host.files.size_limits import check_folder
 from mauvecl.host.tables.fits_tables import FitsTables
 from mauvecl.host.tables.table import TableFile, Values
+from mauvecl.observations.frames import MAX_FRAMES
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.schema.errors import InputError
 
@@ -25,6 +26,8 @@ MAPPING = {"time": "time", "flux": "flux", "error": "error", "quality": "quality
            "wavelength": "wavelength", "flux_unit": "adu"}  # fmt: skip
 #: Attributes that every scene has.
 REQUIRED = ("exposure_s", "frames", "instrument", "dark_unit", "saturation_dn")
+#: Largest number of pixels of a spectrum.
+MAX_PIXELS = 2**20
 EXPECTED = "a file that `mauvecl realise` wrote, whole"
 
 
@@ -57,6 +60,8 @@ class StoredFile(TableFile):
         self.per_row = 1 if numbers is None else numbers.size
         exposure, frame = float(of["exposure_s"]), float(of["exposure_s"]) / int(of["frames"])
         n = int(scene.rows.shape[0]) * self.per_row
+        if n > MAX_FRAMES:
+            raise InputError(f"{what} holds {n} frames of {scene.path}", f"at most {MAX_FRAMES}", key="frames", value=n)
         within = np.array([exposure / 2]) if numbers is None else (numbers + 0.5) * frame
         at = np.arange(n)
         each = np.ones(n)
@@ -167,8 +172,12 @@ def _in_groups(root: Any, name: str | None, what: str) -> StoredFile:
         path = _chosen(sorted(found, key=lambda one: "flare" in one), name, what)
         star, _, _ = path.partition("/")
         group, array = root[star], root[path]
-        of = {key: np.asarray(group[key][:], np.float64) for key in (
-            "wavelength_nm", "bias_dn", "dark_dn", "read_noise_dn", "gain_dn_per_electron")}  # fmt: skip
+        names = ("wavelength_nm", "bias_dn", "dark_dn", "read_noise_dn", "gain_dn_per_electron")
+        largest = max(int(group[key].size) for key in names)
+        if largest > MAX_PIXELS:
+            # A header may claim any number.
+            raise InputError(f"{what} holds {largest} pixels", f"at most {MAX_PIXELS}", key="file", value=largest)
+        of = {key: np.asarray(group[key][:], np.float64) for key in names}
         frames = np.asarray(group["frame"][:], np.int64) if "frame" in group else None
         return StoredFile(StoredScene(path, array, of, dict(group.attrs), frames), what)
 

@@ -9,8 +9,10 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
+import h5py
 import numpy as np
 import pytest
+from astropy.io import fits
 from astropy.table import Table
 
 pytestmark = pytest.mark.long
@@ -184,3 +186,38 @@ def test_descriptions_nested_deeply_are_refused(place: Path, fuzz: ModuleType) -
     for words, codes in ((("verify", "frames.zarr"), (1,)), (("export", "frames.zarr", "n.h5"), (2,))):
         fault, log = outcome(fuzz, words, place, codes)
         assert fault == "", log
+
+
+@pytest.mark.parametrize("after", [0, GIB])
+def test_frames_of_many_gibibytes_are_refused_before_they_are_read(after: int, place: Path, fuzz: ModuleType) -> None:
+    """Let the header of a table claim the rows of a sparse file, which may go on after them."""
+    content = (place / "f.fits").read_bytes()
+    width, rows = int(fits.getheader(place / "f.fits", 1)["NAXIS1"]), 40
+    claimed = 8 * GIB // width
+    card = f"NAXIS2  = {rows:20d}".encode()
+    assert card in content
+    header = content[: -(-rows * width // 2880) * -2880]
+    size = len(header) - -claimed * width // 2880 * 2880 + after
+    sparse(place / "f.fits", header.replace(card, f"NAXIS2  = {claimed:20d}".encode()), size)
+    fault, log = outcome(fuzz, READERS["frames in FITS"][1], place, (2,))
+    assert fault == "", log
+    assert (f"{after} bytes after" if after else f"has {claimed} rows") in log
+
+
+@pytest.mark.parametrize("key", ["wavelength_nm", "quiescent"])
+def test_sizes_that_an_hdf5_file_claims_are_refused(key: str, place: Path, fuzz: ModuleType) -> None:
+    """Extend an array, which then holds a fill value without taking room."""
+    name = place / "frames.h5"
+    content = name.read_bytes()
+    name.unlink()
+    name.write_bytes(content)
+    with h5py.File(name, "r+") as file:
+        group, old = file["star-1"], file["star-1"][key]
+        shape = (10**11, *old.shape[1:])
+        attributes = dict(old.attrs)
+        del group[key]
+        made = group.create_dataset(key, shape, old.dtype, chunks=(1000, *old.shape[1:]), fillvalue=1)
+        made.attrs.update({k: v for k, v in attributes.items() if k in ("units", "amplitude")})
+    fault, log = outcome(fuzz, (*ANALYSE, "frames.h5[star-1/quiescent]"), place, (2,))
+    assert fault == "", log
+    assert str(10**11) in log

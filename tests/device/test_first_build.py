@@ -133,7 +133,7 @@ def test_command_forgets_stored_failure(tmp_path: Path) -> None:
     assert "sentence" in run(tmp_path, misbehaving("os.abort()", "(None,)"))
     assert run(tmp_path, COUNT).keys() == {"sentence"}
     subprocess.run(
-        [sys.executable, "-m", *first_build.FORGET.split(), "--no-rate"],
+        [sys.executable, "-m", *first_build.FORGET.strip("`").split(), "--no-rate"],
         env=os.environ | {"MAUVECL_CACHE_DIR": str(tmp_path)},
         check=True,
         capture_output=True,

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from refusals import refused
 
 from mauvecl.host.files.parsing import parsing
 from mauvecl.host.spectra.column_choice import as_typed
@@ -152,3 +153,17 @@ def test_image_that_claims_other_sizes_is_refused(tmp_path: Path) -> None:
         path.write_bytes(content.replace(old, new))
         with pytest.raises(InputError):
             read_spectrum(path)
+
+
+@pytest.mark.parametrize(("name", "said"), [(b"          ", "TTYPE3 is empty"), (b"'T       '", "columns named 'T'")])
+@pytest.mark.parametrize("kind", ["spectrum", "frames"])
+def test_columns_without_a_name_of_their_own_are_refused(name: bytes, said: str, kind: str, tmp_path: Path) -> None:
+    """Leave out a name, or give one twice, with which astropy cannot read the table."""
+    path = tmp_path / "a.fits"
+    frames(path)
+    content = path.read_bytes()
+    old = b"TTYPE3  = 'Q       '"
+    assert old in content
+    path.write_bytes(content.replace(old, b"TTYPE3  = " + name))
+    with refused("columns", said):
+        read_spectrum(path) if kind == "spectrum" else read_frames(path, HOW)
