@@ -95,7 +95,7 @@ def text_table(
             units, lines = _cells(lines[1], separator), [lines[0], *lines[2:]]
     check_cells(lines, named)
     how: dict[str, Any] = {"delimiter": separator, "format": "ascii.csv"} if commas else {"format": "ascii"}
-    zeros = _LEADING_ZERO.search("\n".join(lines[1:])) is not None
+    zeros = _LEADING_ZERO.search(text) is not None
     if texts or zeros:
         names = [cell.strip().strip("\"'") for cell in (lines[0].split(separator) if separator else lines[0].split())]
         columns = zip(*(_cells(line, separator) for line in lines[1:]), strict=False) if zeros else ()
@@ -132,7 +132,7 @@ def _of_csv(lines: list[str], named: str, first: int) -> tuple[list[str], str]:
         alike = above and above[-1].count(separator) == n > 0
         names = above[-1].lstrip("# ") if alike else separator.join(f"col{k + 1}" for k in range(n + 1))
         data = [names, *data]
-    rows = [row.rstrip(" ") for row in data[1:]]
+    rows = [row.rstrip(" ") for row in data[1:]] if len(data) > 1 and data[1].rstrip(" ").endswith(separator) else []
     if rows and all(row.endswith(separator) for row in rows):
         # The last separator ends the lines, unless it is that of an empty column which has a name.
         ends = data[0].rstrip(" ").endswith(separator)
