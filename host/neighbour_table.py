@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened, shown
+from mauvecl.schema.text import printable, shortened, shown
 
-from .files.tables import read_table
 from .neighbours import Neighbour
 from .stars.band_names import known_band
+from .tables.names import DECLINATIONS, RIGHT_ASCENSIONS, SPECTRAL_TYPES, STARS, divided_unit, key_of
+from .tables.opening import read_table
+from .tables.rows import Rows
 
 Float = NDArray[np.float64]
 
-#: Names of columns in lower case: those of the Gaia archive, astroquery, VizieR and CDS X-Match, and plain ones.
-NAMES = ("name", "designation", "source_id", "source", "main_id", "id", "dr3name")
+#: Names of columns: those of the Gaia archive, astroquery, VizieR and CDS X-Match, and plain ones.
 SEPARATIONS = (
     "separation",
     "separation_arcsec",
@@ -29,19 +30,18 @@ SEPARATIONS = (
     "dist",
     "_r",
 )
-RIGHT_ASCENSIONS = ("ra", "ra_deg", "ra_icrs", "_raj2000", "raj2000")
-DECLINATIONS = ("dec", "dec_deg", "de_icrs", "_dej2000", "dej2000")
 #: Columns of magnitudes, with their bands; the first that a row has counts. Gmag is Gaia's in VizieR.
 MAGNITUDES = {"magnitude": "", "mag": "", "v": "V", "vmag": "V", "phot_g_mean_mag": "Gaia G", "gmag": "Gaia G"}
-TYPES = ("spectral_type", "sptype", "sp_type", "type")
+TYPES = (*SPECTRAL_TYPES, "type")
 FILES = ("file", "spectrum", "spectrum_file")
 TEMPERATURES = ("teff_gspphot", "teff", "teff_val", "temperature", "temperature_k")
 COLOURS = ("bp_rp", "bp-rp", "bprp")
 #: All names of columns that are read, with that of a magnitude's band.
-KNOWN = (*NAMES, *SEPARATIONS, *RIGHT_ASCENSIONS, *DECLINATIONS, *MAGNITUDES, "band", *TYPES, *FILES, *TEMPERATURES,
+KNOWN = (*STARS, *SEPARATIONS, *RIGHT_ASCENSIONS, *DECLINATIONS, *MAGNITUDES, "band", *TYPES, *FILES, *TEMPERATURES,
          *COLOURS)  # fmt: skip
+_KEYS = {key_of(name) for name in KNOWN} | {key_of("target_separation")}
 #: Units of separations without a stated unit: ADQL's DISTANCE is in degrees.
-UNSTATED = {"dist": "deg", "target_separation (deg)": "deg"}
+UNSTATED = {"dist": "deg"}
 #: Largest number of rows; a fibre holds far fewer stars.
 MOST_ROWS = 100_000
 
@@ -63,75 +63,51 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
     """
     path = Path(path)
     named = f"table of neighbours {shortened(path.name)}"
-    table = _Columns(read_table(path, "table of neighbours", "CSV, ECSV, FITS or VOTable"), named)
+    table = _Neighbours(read_table(path, "table of neighbours"), named, "neighbours")
     if not 1 <= table.n <= MOST_ROWS:
         raise InputError(f"{named} holds {table.n} stars", f"1 to {MOST_ROWS}", key="neighbours", value=table.n)
-    names = table.names()
+    name = table.first(STARS)
+    names = [table.text(name, row) or f"row {row + 1}" for row in range(table.n)]
     own = None if target is None else next((k for k, name in enumerate(names) if name == target.strip()), None)
     separations, notes = table.separations(own, target)
-    stars = [
-        Neighbour(name, float(separations[k]), *table.magnitude(k), table.text(TYPES, k), _file(table, k, path.parent),
-                  table.number(TEMPERATURES, k, above=0.0), table.number(COLOURS, k))
-        for k, name in enumerate(names)
-        if k != own
-    ]  # fmt: skip
+    kind, file, temperature, colour = map(table.first, (TYPES, FILES, TEMPERATURES, COLOURS))
+    stars = []
+    for k, name in enumerate(names):
+        if k != own:
+            spectrum = table.text(file, k)
+            stars.append(Neighbour(
+                name, float(separations[k]), *table.magnitude(k), table.text(kind, k),
+                path.parent / spectrum if spectrum else None, table.number(temperature, k, "K", above=0.0),
+                table.number(colour, k, "mag"),
+            ))  # fmt: skip
+    unused = [one for one in table.names if not {key_of(one), key_of(divided_unit(one)[0])} & _KEYS]
+    if unused:
+        words = f"column of {named} is" if len(unused) == 1 else f"columns of {named} are"
+        notes += (f"{len(unused)} {words} not used: {printable(', '.join(unused), 200)}.",)
     return tuple(sorted(stars, key=lambda star: star.separation_arcsec)), notes
 
 
-def _file(table: _Columns, row: int, folder: Path) -> Path | None:
-    name = table.text(FILES, row)
-    return folder / name if name else None
+class _Neighbours(Rows):
+    """Rows of a table of neighbours."""
 
+    @cached_property
+    def magnitudes(self) -> list[tuple[str, str]]:
+        """Columns of magnitudes, and their bands."""
+        held = [(self.first((name,)), name, band) for name, band in MAGNITUDES.items()]
+        # Gmag is Gaia's in VizieR, gmag that of other surveys.
+        return [(one, band) for one, name, band in held if one is not None and not (name == "gmag" and one != "Gmag")]
 
-class _Columns:
-    """Columns of a table by their names in lower case."""
-
-    def __init__(self, table: Any, named: str) -> None:
-        self.table, self.named, self.n = table, named, len(table)
-        self.title = {str(name).strip().lower(): name for name in table.colnames}
-
-    def first(self, names: tuple[str, ...]) -> str | None:
-        """Return the first of some names that the table has."""
-        return next((name for name in names if name in self.title), None)
-
-    def text(self, names: tuple[str, ...], row: int) -> str:
-        """Return the text of a cell, empty if there is none."""
-        name = self.first(names)
-        if name is None:
-            return ""
-        value = self.table[self.title[name]][row]
-        text = "" if np.ma.is_masked(value) else str(value).strip()
-        return "" if text.lower() in ("nan", "--", "none") else text
-
-    def number(self, names: tuple[str, ...], row: int, above: float = -np.inf) -> float | None:
-        """Return the number of a cell, None if there is none; raises InputError for anything else."""
-        text = self.text(names, row).removesuffix(" mag").removesuffix(" K")
-        if not text:
-            return None
-        try:
-            value = float(text)
-        except ValueError:
-            value = np.nan
-        if not (np.isfinite(value) and above < value < 1e6):
-            raise InputError(
-                f"{self.named}: row {row + 1} has {self.first(names)} = {shortened(text)}",
-                "a number" if np.isinf(above) else f"a number above {above:g}",
-                key="neighbours",
-                value=text,
-            )
-        return value
-
-    def names(self) -> list[str]:
-        """Return the names of the stars; rows without one are numbered."""
-        return [self.text(NAMES, row) or f"row {row + 1}" for row in range(self.n)]
+    @cached_property
+    def band(self) -> str | None:
+        """Column of bands."""
+        return self.first(("band",))
 
     def magnitude(self, row: int) -> tuple[float | None, str]:
         """Return magnitude and band of a star; None if it has none."""
-        for name, band in MAGNITUDES.items():
-            if name in self.title and not (name == "gmag" and self.title[name] != "Gmag"):
-                value = self.number((name,), row)
-                if value is not None:
-                    return value, band or known_band(self.text(("band",), row) or "V")
+        for name, band in self.magnitudes:
+            value = self.number(name, row, "mag")
+            if value is not None:
+                return value, band or known_band(self.text(self.band, row) or "V")
         return None, "V"
 
     def separations(self, own: int | None, target: str | None) -> tuple[Float, tuple[str, ...]]:
@@ -142,7 +118,7 @@ class _Columns:
         name = self.first(SEPARATIONS)
         if name is None:
             raise InputError(
-                f"{self.named} has the columns {shown(', '.join(self.title), 300)}"
+                f"{self.named} has the columns {shown(', '.join(self.names), 300)}"
                 + ("" if ra is None else " and no position of the star itself"),
                 "separation (arcsec)" + (", or ra and dec" if ra is None else "")
                 + ("" if ra is None else ", or star.neighbours_of: the star's own row by name, or its coordinates"),
@@ -159,52 +135,36 @@ class _Columns:
         return self._stated(name)
 
     def _stated(self, name: str) -> tuple[Float, tuple[str, ...]]:
-        import astropy.units as u
-
-        column = self.table[self.title[name]]
-        stated = None if getattr(column, "unit", None) is None else str(column.unit)
-        if stated is None and name == "_r":
-            raise InputError(
-                f"{self.named}: the column _r states no unit",
-                "a table with units (ECSV, FITS, VOTable), or the column separation, arcsec",
-                key="neighbours",
-                value=name,
-            )
-        unit = stated or UNSTATED.get(name, "arcsec")
-        try:
-            factor = float(u.Unit(unit).to(u.arcsec))
-        except (u.UnitConversionError, ValueError) as error:
-            raise InputError(
-                f"{self.named}: {name} has the unit {shortened(unit)}", "an angle", key="neighbours", value=unit
-            ) from error
-        values = self._numbers(name) * factor
+        stated, known = getattr(self.table[name], "unit", None) is not None, key_of(name)
+        if not stated and known == "_r":
+            raise self.error(
+                f"the column {name} states no unit",
+                "a table with units (ECSV, FITS, VOTable), or the column separation, arcsec", name,
+            )  # fmt: skip
+        factor = 1.0 if stated else {"deg": 3600.0}.get(UNSTATED.get(known, ""), 1.0)
+        values = np.array([self._given(name, row, self.number(name, row, "arcsec")) for row in range(self.n)]) * factor
         negative = ~(values >= 0)
         if negative.any():
             row = int(np.argmax(negative))
-            raise InputError(
-                f"{self.named}: row {row + 1} has {name} = {values[row] / factor:g}",
-                "an angle of 0 and above",
-                key="neighbours",
-                value=float(values[row] / factor),
-            )
+            text = self.text(name, row)
+            raise self.error(f"row {row + 1} has {name} = {text}", "an angle of 0 and above", name, float(text))
         note = f"Separations are the column {name} of {self.named}, read as degrees since it states no unit."
-        return values, (note,) if stated is None and name == "dist" else ()
+        return values, (note,) if not stated and known == "dist" else ()
 
     def _from_positions(self, ra: str, dec: str, own: int | None, target: str) -> Float:
         from astropy.coordinates import angular_separation
 
-        east, north = np.radians(self._numbers(ra)), np.radians(self._numbers(dec))
+        east, north = (
+            np.radians([self._given(name, row, self.degrees(name, row, right_ascension=name == ra))
+                        for row in range(self.n)]) for name in (ra, dec)
+        )  # fmt: skip
         place = _coordinates(target, self.named) if own is None else (float(east[own]), float(north[own]))
         return np.asarray(np.degrees(angular_separation(*place, east, north)) * 3600.0)
 
-    def _numbers(self, name: str) -> Float:
-        values = [self.number((name,), row) for row in range(self.n)]
-        missing = next((row for row, value in enumerate(values) if value is None), None)
-        if missing is not None:
-            raise InputError(
-                f"{self.named}: row {missing + 1} has no {name}", "one", key="neighbours", value=missing + 1
-            )
-        return np.array(values, np.float64)
+    def _given(self, name: str, row: int, value: float | None) -> float:
+        if value is None:
+            raise self.error(f"row {row + 1} has no {name}", "one", name, row + 1)
+        return value
 
 
 def _coordinates(text: str, named: str) -> tuple[float, float]:

@@ -7,7 +7,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -59,25 +59,6 @@ def parsing(what: str, expected: str) -> Iterator[None]:
         place = PLACE.search(str(error))
         fault = f"{what} cannot be read{f' ({place[0]})' if place else ''}"
         raise InputError(fault, expected, key="file", value=str(error)[:200] or type(error).__name__) from error
-
-
-#: Names that can be typed between the brackets of ``FILE[name]``.
-TYPED = re.compile(r"[^\[\],\"'\s](?:[^\[\],\"'\n\r\t]{0,38}[^\[\],\"'\s])?")
-
-
-def part_to_name(names: Iterable[str], otherwise: str) -> str:
-    """Return how to name a part of a file on the command line, as the end of a sentence.
-
-    Parameters
-    ----------
-    names : iterable of str
-        Names of parts, of which the first that can be typed and is not repeated is the example.
-    otherwise : str
-        What is accepted if none can be typed.
-    """
-    held = [name.strip() for name in names]
-    typed = next((one for one in held if TYPED.fullmatch(one) and one.isprintable() and held.count(one) == 1), None)
-    return otherwise if typed is None else f"one: name it as in FILE[{typed}]"
 
 
 def read_text(path: Path, what: str) -> str:

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.schema.errors import InputError
 
-from ..files.ecsv import read_numbers
-from ..files.units import unit_of
+from ..tables.ecsv import read_numbers
+from ..tables.units import unit_of
 
 
 @dataclass(frozen=True)

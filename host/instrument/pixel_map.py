@@ -16,7 +16,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Unit
 
 from ..content_equality import ContentEquality
-from ..files.ecsv import read_numbers
+from ..tables.ecsv import read_numbers
 
 Float = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
 
-from ..files.ecsv import parse_ecsv
+from ..tables.ecsv import parse_ecsv
 
 Energy = Literal[10, 30]
 

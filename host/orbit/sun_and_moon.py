@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..sky.helioecliptic import offline
+from ..tables.times import offline
 from .earth import Vectors, unit
 from .time_grid import TimeGrid, as_time
 

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
-from ..files.ecsv import parse_ecsv
-from ..sky.helioecliptic import offline, parse_position
+from ..sky.helioecliptic import parse_position
 from ..stars import well_known
 from ..stars.star_names import near_names
 from ..stars.well_known import by_key, name_key
+from ..tables.ecsv import parse_ecsv
+from ..tables.times import offline
 from .earth import direction
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ class Target:
         if star is not None:
             return cls(name or star.name, star.ra_deg, star.dec_deg, f"embedded list ({star.source})",
                        star.distance_pc, star.magnitude, star.spectral_type)  # fmt: skip
-        if not re.match(r"\s*[+-]?\d", text):
+        if re.match(r"\s*[^\W\d]", text) and not re.match(r"\s*ra\W*\d", text, re.IGNORECASE):
             if simbad:
                 return _from_simbad(text, name)
             like = ", ".join(near_names(text, stars_only=True))

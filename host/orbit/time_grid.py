@@ -14,7 +14,8 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Unit
 from mauvecl.schema.physical import DAY_S, Duration
 
-from ..sky.helioecliptic import offline, parse_time
+from ..sky.helioecliptic import parse_time
+from ..tables.times import offline
 
 if TYPE_CHECKING:
     from astropy.time import Time

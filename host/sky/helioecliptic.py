@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,6 +12,9 @@ from mauvecl.schema.errors import InputError
 
 from ..stars.star_names import near_names
 from ..stars.well_known import by_key, name_key
+from ..tables.coordinates import EXPECTED
+from ..tables.coordinates import position as coordinates
+from ..tables.times import offline
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
@@ -22,9 +22,6 @@ if TYPE_CHECKING:
 
 #: Calendar years in which errors of UTC and ephemeris are far smaller than a cell of the zodiacal table.
 YEARS = (1990, 2100)
-
-#: Two plain numbers such as "290.0 -11.2", in degrees.
-_DEGREES = re.compile(r"\s*([+-]?\d+(?:\.\d*)?)\s*[,\s]\s*[+-]?\d+(?:\.\d*)?\s*")
 
 
 @dataclass(frozen=True)
@@ -72,22 +69,6 @@ def helioecliptic(target: SkyCoord | str, time: Time | str) -> HelioEcliptic:
     return HelioEcliptic(longitude, abs(latitude), float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))))
 
 
-@contextmanager
-def offline() -> Iterator[None]:
-    """Keep astropy from using the network and from warning of distant years."""
-    from astropy.utils import iers
-
-    with iers.conf.set_temp("auto_download", False):
-        # This import reads leap seconds, which may download them, so it comes after the line above.
-        from astropy.coordinates import solar_system_ephemeris
-
-        # The ephemeris has a context manager of its own.
-        with solar_system_ephemeris.set("builtin"), warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*dubious year.*")
-            warnings.filterwarnings("ignore", message=".*leap-second file is expired.*")
-            yield
-
-
 def parse_time(time: Time | str) -> Time:
     """Return a single finite time between 1990 and 2100; text is ISO 8601, UTC. Call inside `offline`."""
     from astropy.time import Time
@@ -118,19 +99,19 @@ def parse_position(target: SkyCoord | str) -> SkyCoord:
     from astropy.coordinates import SkyCoord
     from astropy.coordinates.baseframe import BaseCoordinateFrame
 
-    expected = "right ascension and declination such as '290.0 -11.2' (degrees) or '19h22m00s -11d12m00s'"
+    expected = EXPECTED
     if isinstance(target, str):
         star = by_key().get(name_key(target))
         if star is not None:
             return SkyCoord(star.ra_deg, star.dec_deg, unit=u.deg)
-        if re.match(r"\s*[^\W\d]", target):
-            expected = f"a name such as {', '.join(near_names(target, stars_only=True))}, or {expected}"
-        unit = u.deg if _in_degrees(target) else (u.hourangle, u.deg)
         try:
-            position = SkyCoord(target.replace(",", " "), unit=unit)
-        except (ValueError, TypeError, IndexError):
-            raise InputError.of("target", target, expected) from None
-    elif isinstance(target, SkyCoord | BaseCoordinateFrame):
+            return SkyCoord(*coordinates(target), unit=u.deg)
+        except InputError as error:
+            if not re.match(r"\s*[^\W\d]", target):
+                raise
+            expected = f"a name such as {', '.join(near_names(target, stars_only=True))}, or {expected}"
+            raise InputError.of("target", target, expected) from error
+    if isinstance(target, SkyCoord | BaseCoordinateFrame):
         position = SkyCoord(target)
     else:
         raise InputError.of("target", target, expected)
@@ -140,16 +121,3 @@ def parse_position(target: SkyCoord | str) -> SkyCoord:
     if not np.isfinite([angles.lon.deg, angles.lat.deg]).all():
         raise InputError.of("target", target, expected)
     return position
-
-
-def _in_degrees(target: str) -> bool:
-    """Return whether a string holds two numbers in degrees.
-
-    Raises InputError for a right ascension outside 0-360, which astropy would wrap.
-    """
-    degrees = _DEGREES.fullmatch(target)
-    if degrees and not 0 <= float(degrees[1]) <= 360:
-        raise InputError(
-            f"target = {target!r} has a right ascension of {degrees[1]}", "0 to 360 degrees", key="target", value=target
-        )
-    return degrees is not None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,8 +10,7 @@ import numpy as np
 
 from mauvecl.schema.errors import InputError
 
-from ..files.parsing import TYPED, part_to_name
-from .column_choice import Choice, listed, plain
+from .column_choice import Choice, as_typed, listed, numbered, plain
 from .file_table import FileTable
 
 #: Columns whose presence shows that rows are parts of one spectrum: detector segments and echelle orders.
@@ -132,11 +130,10 @@ def _row_asked(identifiers: Sequence[Sequence[str]], asked: Sequence[str], names
     """Return the selected row: the only one, the one with the requested identifier, or ``row 3``."""
     fitting = list(range(len(identifiers)))
     for word in asked:
-        if match := re.fullmatch(r"row\s+(\d{1,9})", word.strip(), re.IGNORECASE):
-            number = int(match[1])
-            if not 1 <= number <= len(identifiers):
-                raise InputError.of("row", number, f"1 to {len(identifiers)}")
-            fits = [number - 1]
+        if (place := numbered("row", word)) is not None:
+            if place >= len(identifiers):
+                raise InputError.of("row", place + 1, f"1 to {len(identifiers)}")
+            fits = [place]
         else:
             fits = [row for row in fitting if word.strip() in identifiers[row]]
         if not fits:
@@ -145,11 +142,11 @@ def _row_asked(identifiers: Sequence[Sequence[str]], asked: Sequence[str], names
     if len(fitting) == 1:
         return fitting[0]
     labels = [identifiers[row][0] if identifiers[row] and identifiers[row][0] else f"row {row + 1}" for row in fitting]
-    if len(set(labels)) < len(labels) or not all(TYPED.fullmatch(label) for label in labels):
+    if len(set(labels)) < len(labels):
         labels = [f"row {row + 1}" for row in fitting]
     raise InputError(
         f"{len(fitting)} spectra are in it, one in each row ({listed(labels)})",
-        part_to_name(labels or ["row 1"], "one of them"),
+        f"one: name it as in {as_typed((labels or ['row 1'])[0], 'row', (fitting or [0])[0], labels)}",
         key="rows",
         value=labels,
     )

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
-from ..files.parsing import part_to_name
 from .column_roles import Role
 
 #: Largest number of names in a message.
 MAX_LISTED = 12
+#: Names that can be typed between the brackets of ``FILE[name]``.
+TYPED = re.compile(r"[^\[\],\"'\s](?:[^\[\],\"'\n\r\t]{0,38}[^\[\],\"'\s])?")
 AXES = ("wavelength", "lower edge", "upper edge")
 
 
@@ -21,10 +23,24 @@ def plain(name: str) -> str:
     return " ".join(name.strip().strip("\"'").lower().split())
 
 
+def numbered(kind: str, word: str) -> int | None:
+    """Return the index in a word such as ``row 3``, or None."""
+    match = re.fullmatch(rf"{kind}\s+(\d{{1,9}})", word.strip(), re.IGNORECASE)
+    return int(match[1]) - 1 if match and int(match[1]) > 0 else None
+
+
 def listed(names: Sequence[str]) -> str:
     """Join names for a message; a long list ends with the number of omitted names."""
     shown = [name.strip()[:40] for name in names]
     return ", ".join(shown[:MAX_LISTED]) + (f" and {len(shown) - MAX_LISTED} more" if len(shown) > MAX_LISTED else "")
+
+
+def as_typed(name: str, kind: str, place: int, names: Sequence[str] = ()) -> str:
+    """Return ``FILE[name]`` for a message, or ``FILE[row 3]`` where the name cannot be typed or is not the only one."""
+    word = name.strip()
+    typed = TYPED.fullmatch(word) is not None and word.isprintable()
+    alone = sum(plain(one) == plain(word) for one in names) < 2
+    return f"FILE[{word}]" if typed and alone else f"FILE[{kind} {place + 1}]"
 
 
 @dataclass(frozen=True)
@@ -60,6 +76,8 @@ def choose(names: Sequence[str], roles: Sequence[Role], asked: Sequence[str] = (
 
 def _named(name: str, names: Sequence[str]) -> int:
     indices = [i for i, one in enumerate(names) if one.strip() == name]
+    if not indices and (place := numbered("column", name)) is not None and place < len(names):
+        return place
     indices = indices or [i for i, one in enumerate(names) if plain(one) == plain(name)]
     if len(indices) != 1:
         raise InputError(
@@ -93,10 +111,11 @@ def _flux(names: Sequence[str], roles: Sequence[Role], wavelength: tuple[int, ..
     unknown = [i for i in rest if roles[i].kind == "unknown"]
     if len(rest) == len(unknown) == 1:
         return unknown[0]
+    shown = (unknown or rest or [0])[0]
     held = [f"{names[i].strip()[:40]} ({roles[i].kind})" for i in rest]
     raise InputError(
         f"no column is recognised as a star's flux, only {listed(held) or 'the wavelength'}",
-        part_to_name([names[i] for i in unknown or rest or [0]], "one named flux"),
+        f"one named flux: name the column as in {as_typed(names[shown], 'column', shown, names)}",
         key="columns",
         value=held,
     )
@@ -120,7 +139,7 @@ def _only(what: str, names: Sequence[str], indices: Sequence[int]) -> int:
     several = [names[i].strip() for i in indices]
     raise InputError(
         f"{len(several)} columns may be the {what}: {listed(several)}",
-        part_to_name(reversed(several), "a file with one of them, or names without commas and brackets"),
+        f"one: name it as in {as_typed(several[-1], 'column', indices[-1], names)}",
         key="columns",
         value=several,
     )

@@ -15,7 +15,7 @@ from typing import Literal
 
 from mauvecl.schema.errors import InputError
 
-from ..files.units import SCALE, FluxKind, balanced, flux_kind, is_spectral, is_stated, unit_of
+from ..tables.units import SCALE, FluxKind, balanced, flux_kind, is_spectral, is_stated, unit_of
 
 Kind = Literal[
     "wavelength", "lower edge", "upper edge", "flux", "model", "error", "quality", "continuum", "counts", "background",
@@ -62,8 +62,8 @@ _PHRASES = tuple(
     for pattern, word in (
         (rf"{_LAMBDA}[\s_*.]*f(?:lux)?[\s_]*{_LAMBDA}|w[\s_*.]*f[\s_]*w", "lamflam"),
         (rf"{_NU}[\s_*.]*f(?:lux)?[\s_]*{_NU}|v[\s_*.]*f[\s_]*v", "nufnu"),
-        (rf"f(?:lux)?[\s_]*(?:{_LAMBDA}|wl|wave)", "flam"),
-        (rf"f(?:lux)?[\s_]*{_NU}", "fnu"),
+        (rf"(?:[sib]|f(?:lux)?(?:[\s_]*density)?)[\s_]*(?:{_LAMBDA}|wl|wave)", "flam"),
+        (rf"(?:[sib]|f(?:lux)?(?:[\s_]*density)?)[\s_]*{_NU}", "fnu"),
         (rf"l[\s_]*(?:{_LAMBDA}|{_NU})", "luminosity"),
         (r"log_?10|lg", "log"),
         (r"s[_/]n", "snr"),
@@ -73,6 +73,8 @@ _PHRASES = tuple(
 _DECIDING: tuple[Kind, ...] = (
     "error", "quality", "continuum", "background", "counts", "throughput", "luminosity",
 )  # fmt: skip
+#: Words in the name of a flux that say that it is one per frequency.
+_PER_FREQUENCY = {"fnu", "fν", "photnu", "nu", "ν", "freq", "frequency", "hz", "hertz", "jy"}
 _BRACKETS = re.compile(r"[\[(]((?:[^\[\]()]|\([^()]*\))*)[\])]\s*$")
 _LOGARITHM_OF = re.compile(r"(log_?10|log|lg|ln)\s*[(\[](.*?)[)\]]\s*([(\[].*)?", re.IGNORECASE)
 # Words of the IVOA's unified content descriptors (UCD1+ 1.5), by their first word.
@@ -92,6 +94,8 @@ class Role:
     logarithm: str = ""
     #: Whether the flux is multiplied by its wavelength or frequency according to the name.
     total: bool = False
+    #: Whether a flux is one per frequency according to its name.
+    per_frequency: bool = False
     #: Stated unit, or the unit in the name, as in ``flux_W_m2_nm`` or ``wave [nm]``.
     unit: str | None = None
 
@@ -127,7 +131,10 @@ def role_of(name: str, unit: str | None = None, ucd: str = "") -> Role:
     if logarithm:
         score -= 1
     total = any(_WORDS.get(word) == "total" for word in words)
-    return Role(kind, score, logarithm, total, stated)
+    per_frequency = kind in ("flux", "model") and not total and bool(_PER_FREQUENCY & set(words))
+    # VOTable says so by the second word of a UCD, as in phot.flux.density;em.freq.
+    per_frequency |= kind == "flux" and ucd.lower().startswith("phot.flux.density;em.freq")
+    return Role(kind, score, logarithm, total, per_frequency, stated)
 
 
 def _kind_of(words: Sequence[str]) -> tuple[Kind, int]:

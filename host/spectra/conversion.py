@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
 
-from ..files.units import flux_kind, is_spectral, is_stated, linear, unit_of
-from .air import vacuum_wavelengths
+from ..tables.medium import Medium, unit_and_medium, vacuum_wavelengths
+from ..tables.units import flux_kind, is_spectral, is_stated, linear, unit_of
 from .column_roles import Role
 from .selection import RawSpectrum
 from .wavelength_range import check_assumed_unit
@@ -43,6 +43,8 @@ class ReadSpectrum:
     messages: tuple[str, ...] = ()
     #: Reason why the flux is not that at the telescope, so that a magnitude is needed; otherwise empty.
     unscaled: str = ""
+    #: Unit of the wavelengths in the file.
+    axis_unit: str = "nm"
 
 
 def converted(raw: RawSpectrum, wavelength_unit: Any = None, flux_unit: Any = None) -> ReadSpectrum:
@@ -54,13 +56,13 @@ def converted(raw: RawSpectrum, wavelength_unit: Any = None, flux_unit: Any = No
         Units that override those of the file. A unit of wavelength may end in "air" or "vacuum".
     """
     messages = list(raw.messages)
-    medium: str | None = None
-    if isinstance(wavelength_unit, str) and (
-        match := re.fullmatch(r"\s*(.*?)\s*\b(air|vacuum)\s*", wavelength_unit, re.I)
-    ):
-        wavelength_unit, medium = match[1] or None, match[2].lower()
+    medium: Medium | None = None
+    if isinstance(wavelength_unit, str):
+        wavelength_unit, medium = unit_and_medium(wavelength_unit)
+    stated, in_unit = unit_and_medium(raw.wavelength_role.unit or "")
+    role = replace(raw.wavelength_role, unit=stated) if in_unit else raw.wavelength_role
     implied = raw.table.implied_units or (None, None)
-    axis = _scale("wavelength", raw.wavelength_name, raw.wavelength_role, wavelength_unit, implied[0])
+    axis = _scale("wavelength", raw.wavelength_name, role, wavelength_unit, implied[0])
     flux = _scale("flux", raw.flux_name, raw.flux_role, flux_unit, implied[1])
     messages += [*axis.messages, *flux.messages]
     if axis.is_assumed:
@@ -72,7 +74,7 @@ def converted(raw: RawSpectrum, wavelength_unit: Any = None, flux_unit: Any = No
     nm, flam = _joined(segments, messages)
     if flux.is_assumed:
         _check_assumed_flux(flam, raw)
-    nm, said = vacuum_wavelengths(nm, raw.wavelength_name, raw.table.remarks, medium)
+    nm, said = vacuum_wavelengths(nm, raw.wavelength_name, raw.table.remarks, medium or in_unit, raw.table.medium)
     messages += said
     nm, flam = _merged(nm, flam, messages)
     unscaled = raw.table.unscaled or (
@@ -83,7 +85,7 @@ def converted(raw: RawSpectrum, wavelength_unit: Any = None, flux_unit: Any = No
     notes = raw.table.notes
     if re.search(r"dereddened", raw.table.remarks, re.I) and not any("dereddened" in note for note in notes):
         notes += ("dereddened, as its header says: counts need it reddened again",)
-    return ReadSpectrum(nm, flam, raw.table.name, raw.table.origin, notes, tuple(messages), unscaled)
+    return ReadSpectrum(nm, flam, raw.table.name, raw.table.origin, notes, tuple(messages), unscaled, axis.name)
 
 
 @dataclass(frozen=True)
@@ -113,8 +115,10 @@ def _scale(what: str, column: str, role: Role, asked: Any, implied: str | None) 
             )
         # Logarithms of wavelength are of Angstrom everywhere (SDSS, LAMOST, DESI).
         is_logarithm = is_bare_logarithm or role.logarithm
-        unit = unit_of("Angstrom" if what == "wavelength" and is_logarithm else implied)
-        messages.append(f"ASSUMED: {what} in {unit}, because its file states no unit; --{what}-unit names another")
+        per_frequency = what == "flux" and role.per_frequency
+        unit = unit_of("Angstrom" if what == "wavelength" and is_logarithm else "fnu" if per_frequency else implied)
+        why = f", and {column} is one per frequency" if per_frequency else ""
+        messages.append(f"ASSUMED: {what} in {unit}, because its file states no unit{why}; --{what}-unit names another")
     if what == "flux":
         _check_flux_unit(unit, role)
     elif not is_spectral(unit):

@@ -53,14 +53,14 @@ def check_points(name: str, wavelength: Float, flux: Float) -> None:
     check_values(name, wavelength, flux)
 
 
-def check_measured(name: str, wavelength: Float) -> None:
-    """Raise InputError if a spectrum itself covers less than a third of 200-700 nm."""
+def check_measured(name: str, wavelength: Float, unit: str = "nm") -> None:
+    """Raise InputError if a spectrum itself covers less than a third of 200-700 nm; `unit` is that of its file."""
     part = measured_part(wavelength)
     if part >= MIN_MEASURED - 1e-9:
         return
     low, high = float(wavelength[0]), float(wavelength[-1])
-    unit = likely_unit(low, high, "nm")
-    meant = f"; as numbers these look like {unit}: `wavelength_unit={unit!r}`" if unit else ""
+    likely = likely_unit(low, high, "nm") if unit == "nm" else None
+    meant = f"; as numbers these look like {likely}: `wavelength_unit={likely!r}`" if likely else ""
     raise InputError(
         f"spectrum {name} covers {low:g}-{high:g} nm, {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm",
         f"at least a third, which `extend` can continue{meant}",

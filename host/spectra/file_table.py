@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.schema.errors import InputError
 
+from ..tables.medium import Medium
 from .column_roles import Role, role_of
 
 Float = NDArray[np.float64]
@@ -28,8 +29,6 @@ class Column:
     values: Callable[[], Any]
     #: Unit as stated in the file.
     unit: str | None = None
-    #: Value that marks missing ones.
-    missing: float | None = None
     #: IVOA unified content descriptor.
     ucd: str = ""
     #: Role, if known from more than the name.
@@ -58,6 +57,8 @@ class FileTable:
     implied_units: tuple[str, str] | None = None
     #: Text of the header that may mention air, the star's surface or its dust.
     remarks: str = ""
+    #: Function that returns the medium of the wavelengths that keywords state.
+    medium: Callable[[], Medium | None] = lambda: None
     notes: tuple[str, ...] = ()
     messages: tuple[str, ...] = ()
     #: Group; tables of the same group are parts of one spectrum.
@@ -70,7 +71,7 @@ class FileTable:
     row_title: str = ""
 
 
-def numbers(values: ArrayLike, what: str, missing: float | None = None) -> Float:
+def numbers(values: ArrayLike, what: str) -> Float:
     """Convert values to floats, with NaN for masked values and missing measurements."""
     kind = np.asanyarray(values).dtype.kind
     if kind in "bc":
@@ -83,8 +84,5 @@ def numbers(values: ArrayLike, what: str, missing: float | None = None) -> Float
             plain_values = np.array(values, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{what} does not contain plain numbers", "one number in each cell", key=what) from error
-    if missing is not None:
-        # Single precision rounds the values but not the mark in the header.
-        plain_values[np.isclose(plain_values, float(missing), rtol=1e-6, atol=0.0)] = np.nan
     plain_values[~(np.abs(plain_values) < INDEFINITE)] = np.nan
     return plain_values

@@ -33,7 +33,11 @@ def without_columns(path: str | Path) -> tuple[Path, tuple[str, ...]]:
 
 
 def read_spectrum(
-    path: Path, *, wavelength_unit: str | u.UnitBase | None = None, flux_unit: str | u.UnitBase | None = None
+    path: Path,
+    *,
+    wavelength_unit: str | u.UnitBase | None = None,
+    flux_unit: str | u.UnitBase | None = None,
+    ignore_checksum: bool = False,
 ) -> ReadSpectrum:
     """Read a spectrum from text, ECSV, VOTable or FITS, which may be compressed by gzip, bzip2 or xz.
 
@@ -46,6 +50,8 @@ def read_spectrum(
         state their units.
     wavelength_unit, flux_unit : str or Unit, optional
         Units that override those of the file; a unit of wavelength may end in " air" or " vacuum".
+    ignore_checksum : bool
+        Whether a FITS file is read that its CHECKSUM or DATASUM contradicts.
     """
     import numpy as np
 
@@ -60,9 +66,10 @@ def read_spectrum(
     content = read_bytes(place, "spectrum file")
     shown = place.name if len(place.name) <= 80 else shortened(place.name)
     try:
+        units = (wavelength_unit is None, flux_unit is None)
         with parsing("it", "a spectrum"):
-            origin = f"file {shown}"
-            tables = _tables(unpacked(content, "it"), _stem(place.name), origin, asked, wavelength_unit, flux_unit)
+            content, origin = unpacked(content, "it"), f"file {shown}"
+            tables = _tables(content, _stem(place.name), origin, asked, units, not ignore_checksum)
         # Overflows become infinities, which the check of points rejects.
         with parsing("it", "a spectrum"), np.errstate(all="ignore"):
             return converted(spectrum_in(tables, asked), wavelength_unit, flux_unit)
@@ -76,25 +83,26 @@ def _stem(name: str) -> str:
 
 
 def _tables(
-    content: bytes, name: str, origin: str, asked: Sequence[str], wavelength_unit: object, flux_unit: object
+    content: bytes, name: str, origin: str, asked: Sequence[str], units: tuple[bool, bool], check: bool
 ) -> list[FileTable]:
+    from ..tables.opening import form_of
+    from ..tables.text_table import text_of
     from .fits_files import fits_tables
     from .table_files import ecsv_tables, votable_tables
-    from .text import text_of, text_tables
+    from .text import text_tables
 
-    if content[:9] == b"SIMPLE  =":
-        return fits_tables(content, name, origin, asked)
-    start = content[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")
-    if re.match(rb"<(\?xml|votable|vot:)", start, re.IGNORECASE) and b"VOTABLE" in content[:4096].upper():
+    form = form_of(content[:4096])
+    if form == "FITS":
+        return fits_tables(content, name, origin, asked, check)
+    if form == "VOTable":
         return votable_tables(content, name, origin)
-    if start[:1] == b"<":
+    if form == "XML":
+        start = content[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")[:20]
         raise InputError(
-            f"is a page or XML that begins with {shortened(start[:20].decode('ascii', 'replace'))}",
-            "a spectrum",
-            key="file",
-            value=start[:20],
-        )
+            f"is a page or XML that begins with {shortened(start.decode('ascii', 'replace'))}",
+            "a spectrum", key="file", value=start,
+        )  # fmt: skip
     text = text_of(content)
-    if re.match(r"#\s*%ECSV", text):
+    if form == "ECSV":
         return ecsv_tables(text, name, origin)
-    return text_tables(text, name, f"text {origin}", asked, wavelength_unit is None, flux_unit is None)
+    return text_tables(text, name, f"text {origin}", asked, *units)

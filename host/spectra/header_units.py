@@ -6,7 +6,7 @@ import re
 
 from mauvecl.schema.errors import InputError
 
-from ..files.units import balanced, is_spectral, unit_of
+from ..tables.units import balanced, is_spectral, unit_of
 
 #: Length of the longest header that is searched.
 MAX_HEADER = 20_000

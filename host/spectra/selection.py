@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
 
-from ..files.parsing import part_to_name
 from .array_cells import holds_arrays, no_such, selected_rows
-from .column_choice import choose, listed, plain
+from .column_choice import as_typed, choose, listed, numbered, plain
 from .column_roles import Role
 from .file_table import FileTable, numbers
 
@@ -44,7 +43,11 @@ def spectrum_in(tables: Sequence[FileTable], asked: Sequence[str]) -> RawSpectru
     labels = [table.label.strip().lower() for table in tables]
     words = {word.lower() for word in asked}
     named = [i for i, label in enumerate(labels) if label and label in words]
-    rest = [word for word in asked if word.lower() not in {labels[i] for i in named}]
+    by_number = {word: place for word in asked if (place := numbered("table", word)) is not None}
+    if any(place >= len(tables) for place in by_number.values()):
+        raise InputError.of("table", max(by_number.values()) + 1, f"1 to {len(tables)}")
+    named += by_number.values()
+    rest = [word for word in asked if word.lower() not in {labels[i] for i in named} and word not in by_number]
     found: list[RawSpectrum] = []
     errors: list[InputError] = []
     for table in [tables[i] for i in named] or tables:
@@ -69,7 +72,7 @@ def spectrum_in(tables: Sequence[FileTable], asked: Sequence[str]) -> RawSpectru
         held = [one.table.label for one in found]
         raise InputError(
             f"{len(held)} tables hold a spectrum: {listed(held)}",
-            part_to_name(held, "a file with one of them"),
+            f"one: name it as in {as_typed(held[0], 'table', labels.index(held[0].strip().lower()), labels)}",
             key="table",
             value=held,
         )
@@ -79,7 +82,7 @@ def spectrum_in(tables: Sequence[FileTable], asked: Sequence[str]) -> RawSpectru
 def _spectrum_of(table: FileTable, asked: Sequence[str]) -> RawSpectrum:
     names = [column.name for column in table.columns]
     roles = [column.known_role for column in table.columns]
-    known = {plain(name) for name in names}
+    known = {plain(name) for name in names} | {plain(f"column {place + 1}") for place in range(len(names))}
     # Words that do not name a column may name a row.
     rest = [word for word in asked if plain(word) not in known]
     try:
@@ -106,9 +109,7 @@ def _spectrum_of(table: FileTable, asked: Sequence[str]) -> RawSpectrum:
         rows = [cells]
     segments = []
     for row in rows:
-        *axes, flux = (
-            numbers(cell, column.name.strip(), column.missing) for cell, column in zip(row, chosen, strict=True)
-        )
+        *axes, flux = (numbers(cell, column.name.strip()) for cell, column in zip(row, chosen, strict=True))
         segments.append((sum(axes[1:], axes[0]) / len(axes), flux))
         for array, column in zip((axes[0], flux), (chosen[0], chosen[-1]), strict=True):
             if array.ndim != 1:

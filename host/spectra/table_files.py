@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import operator
-import warnings
 from functools import partial
 from typing import Any
 
-from mauvecl.schema.errors import InputError
-
-from ..files.ecsv import parse_ecsv
-from ..files.parsing import parsing
+from ..tables.ecsv import parse_ecsv
+from ..tables.medium import medium_of
+from ..tables.opening import votable_in
 from .file_table import Column, FileTable
 
 #: Largest number and length of messages in the table of a kept star.
@@ -34,7 +31,10 @@ def ecsv_tables(text: str, name: str, origin: str) -> list[FileTable]:
             ],
             own.strip()[:80] if isinstance(own, str) and own.strip() else name,
             origin,
-            remarks="\n".join(_texts(meta.get("comments"))),
+            remarks="\n".join(
+                (*_texts(meta.get("comments")), *(table[one].info.description or "" for one in table.colnames))
+            ),
+            medium=partial(medium_of, meta),
             messages=_texts(meta.get("told")),
         )
     ]
@@ -53,13 +53,9 @@ def _texts(given: Any) -> tuple[str, ...]:
 
 def votable_tables(content: bytes, name: str, origin: str) -> list[FileTable]:
     """Read the tables of a VOTable file."""
-    from astropy.io import votable
-
-    if b"<!ENTITY" in content or b"<!DOCTYPE" in content:
-        raise InputError("defines entities", "a VOTable without entities", key="file")
-    with parsing("it", "a complete VOTable"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        tables = list(votable.parse(io.BytesIO(content), verify="ignore").iter_tables())
+    file = votable_in(content, "it")
+    tables = list(file.iter_tables())
+    shared = {param.name or param.ID: param.value for one in file.resources for param in one.params}
     return [
         FileTable(
             [
@@ -75,6 +71,7 @@ def votable_tables(content: bytes, name: str, origin: str) -> list[FileTable]:
             origin,
             label=str(table.name or table.ID or i + 1),
             remarks="\n".join(f"{field.ucd or ''} {field.description or ''}" for field in table.fields)[:5000],
+            medium=partial(medium_of, shared, {param.name or param.ID: param.value for param in table.params}),
         )
         for i, table in enumerate(tables)
     ]

@@ -13,6 +13,8 @@ import numpy as np
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
+from ..tables.medium import medium_of
+from ..tables.text_table import MISSING_WORDS, keywords_of, number_in
 from .column_choice import AXES
 from .column_roles import Role
 from .file_table import Column, FileTable
@@ -26,29 +28,7 @@ GAIA_NM, GAIA_FLUX = 336.0 + 2.0 * np.arange(343), "W m-2 nm-1"
 _REMARK = re.compile(r"^\s*(#|%|!|;|//|\\|\|)")
 _NUMBER = re.compile(r"[+-]?(?:\d[\d_]*[.,]?\d*|[.,]\d+)(?:[eEdD][+-]?\d+)?(?![\w.])")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eEdD][+-]?\d+)?")
-_MISSING = {"", "--", "-", "null", "none", "indef", "n/a", "na", "...", "masked"}
 _NOT_FINITE = {"nan", "inf", "-inf"}
-
-
-def text_of(content: bytes) -> str:
-    """Decode UTF-8 or, with a byte-order mark, UTF-16."""
-    # Editors on Windows start a file with a byte-order mark.
-    code = "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
-    try:
-        text = content.decode(code)
-    except UnicodeDecodeError as error:
-        if b"\0" in content[:4096]:
-            raise InputError("is not text (it holds null bytes)", "two columns of numbers", key="file") from error
-        line = content[: error.start].count(b"\n") + 1
-        raise InputError(
-            f"is not text in UTF-8 (byte 0x{content[error.start]:02x} in line {line})",
-            "UTF-8: save it so",
-            key="file",
-            value=content[error.start],
-        ) from error
-    if "\0" in text:
-        raise InputError("is not text (it holds null bytes)", "two columns of numbers", key="file")
-    return text
 
 
 def text_tables(
@@ -78,7 +58,11 @@ def text_tables(
     else:
         columns = _unnamed(rows, n, asked, messages)
     columns = _with_units_of(remarks, columns, wavelength, flux, is_named=bool(names))
-    return [FileTable(columns, name, origin, implied_units=IMPLIED_UNITS, remarks=remarks, messages=tuple(messages))]
+    keywords = keywords_of([f"# {line}" for line, _ in header])
+    return [
+        FileTable(columns, name, origin, implied_units=IMPLIED_UNITS, remarks=remarks, messages=tuple(messages),
+                  medium=partial(medium_of, keywords))
+    ]  # fmt: skip
 
 
 Row = tuple[int, str, list[str]]
@@ -145,7 +129,7 @@ def _first_of_data(lines: Sequence[tuple[int, str]]) -> float:
         cells = re.split(r"[\s;|]+", line.strip())
         cells = line.split(",") if len(cells) == 1 else cells
         # A line of a preamble, such as "2 columns" or "912 s", has no second number.
-        if sum(bool(_NUMBER.match(cell)) or cell.lower() in _MISSING | _NOT_FINITE for cell in cells) > 1:
+        if sum(bool(_NUMBER.match(cell)) or cell.lower() in {*MISSING_WORDS} | _NOT_FINITE for cell in cells) > 1:
             return number
     return starting[0][0] if starting else float("inf")
 
@@ -218,20 +202,6 @@ def _value(row: Row, place: int) -> float:
         raise InputError(
             f"line {number}: {shortened(line, 60)} is not numeric", "wavelength and flux", key="columns", value=line
         ) from error
-
-
-def number_in(cell: str) -> float:
-    """Return the number in a cell, NaN for words such as "null"; raise ValueError for anything else."""
-    cell = cell.strip().strip("\"'")
-    if "_" in cell:
-        raise ValueError(cell)
-    try:
-        return float(cell)
-    except ValueError:
-        if cell.lower() in _MISSING:
-            return float("nan")
-        # Exponents of Fortran's double precision.
-        return float(re.sub(r"(?<=[\d.])[dD](?=[+-]?\d)", "e", cell))
 
 
 def _table_of_arrays(

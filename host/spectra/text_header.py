@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 from mauvecl.schema.errors import InputError
 
-from ..files.units import flux_kind, is_spectral, is_stated, unit_of
+from ..tables.units import flux_kind, is_spectral, is_stated, unit_of
 from .column_choice import AXES, listed
 from .column_roles import divided, role_of, words_of
 

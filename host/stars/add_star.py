@@ -15,7 +15,7 @@ from ..files.size_limits import read_bytes
 from ..spectra.coverage import check_covers
 from ..spectra.formats import without_columns
 from . import catalogue
-from .own_stars import OwnStar, find, folder, spectrum_digest
+from .own_stars import OwnStar, find, folder, kept, spectrum_digest
 from .source import Source
 
 
@@ -85,11 +85,15 @@ def add(
     }
     if source.measured_nm is not None:
         table.meta["measured_nm"] = list(source.measured_nm)
-    place = there.path if there is not None else folder() / f"{re.sub(r'[^A-Za-z0-9.+-]', '_', name)}.ecsv"
-    if there is None and place.exists():
+    place = folder() / f"{re.sub(r'[^A-Za-z0-9.+-]', '_', name)}.ecsv" if there is None else there.path
+    alike = re.sub(r"[\s_]+", "_", name.casefold())
+    if there is None and any(re.sub(r"[\s_]+", "_", star.name.casefold()) == alike for star in kept()):
         raise InputError(
             f"star name {name!r} is too much like another kept star's", "another name", key="name", value=name
         )
+    if there is None and place.exists():
+        # Letters that file names cannot have, such as Greek ones, are equal in them: the digest of the name differs.
+        place = place.with_stem(f"{place.stem}-{hashlib.sha256(name.casefold().encode()).hexdigest()[:8]}")
     text = io.StringIO()
     table.write(text, format="ascii.ecsv")
     try:

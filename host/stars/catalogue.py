@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from mauvecl.schema.tables import Column
 
-from ..files.ecsv import Numbers, parse_numbers
+from ..tables.ecsv import Numbers, parse_numbers
 from . import own_stars
 from .well_known import name_key
 

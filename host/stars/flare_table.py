@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened, shown
 
 from ..files.parsing import LARGEST, SMALLEST
-from ..files.tables import read_table
+from ..tables.opening import read_table
+from ..tables.rows import Rows
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
@@ -54,54 +54,27 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
 
     if not isinstance(table, Table):
         table = Table.from_pandas(table)
-    lower = {str(column).strip().lower(): column for column in table.colnames}
-
-    def column(names: tuple[str, ...], unit: str) -> np.ndarray | None:
-        title = next((lower[one] for one in names if one in lower), None)
-        return None if title is None else _numbers(table[title], f"{name}: the column {title!r}", unit)
-
-    amplitudes = column(AMPLITUDES, "")
-    if amplitudes is None:
-        raise InputError(
-            f"{name} has the columns {shown(', '.join(lower), 300)}",
-            f"one named {', '.join(AMPLITUDES)}",
-            key="amplitude",
-            value=lower,
+    rows = Rows(table, name, "amplitude")
+    amplitude, start, stop = map(rows.first, (AMPLITUDES, STARTS, STOPS))
+    if amplitude is None:
+        raise rows.error(
+            f"has the columns {shown(', '.join(rows.names), 300)}", f"one named {', '.join(AMPLITUDES)}", "amplitude"
         )
-    if not 0 < amplitudes.size <= MAX_FLARES:
-        raise InputError(
-            f"{name} holds {amplitudes.size} flares", f"1 to {MAX_FLARES}", key="amplitude", value=amplitudes.size
-        )
-    bad = ~((amplitudes >= SMALLEST) & (amplitudes <= LARGEST))
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise InputError.of("amplitude", amplitudes[row], "a relative rise above 0", where=f"{name}, flare {row}")
-    flares = QTable({"amplitude": amplitudes})
-    for title, names in (("start", STARTS), ("stop", STOPS)):
-        times = column(names, "d")
-        if times is not None:
-            flares[title] = times
-            flares[title].unit = "d"
+    columns = {"amplitude": (amplitude, "1"), "start": (start, "d"), "stop": (stop, "d")}
+    cells = [[rows.number(held, row, unit) for held, unit in columns.values()] for row in range(rows.n)]
+    # AltaiPony's tables have an empty row for a star without flares.
+    kept = [row for row, values in enumerate(cells) if any(value is not None for value in values)]
+    if not 0 < len(kept) <= MAX_FLARES:
+        raise rows.error(f"holds {len(kept)} flares", f"1 to {MAX_FLARES}", "amplitude", len(kept))
+    for row in kept:
+        value = cells[row][0]
+        if value is None or not SMALLEST <= value <= LARGEST:
+            shown_value = "no amplitude" if value is None else f"an amplitude of {value:g}"
+            raise rows.error(f"row {row + 1} has {shown_value}", "a relative rise above 0", "amplitude", value)
+    flares = QTable({"amplitude": [cells[row][0] for row in kept]})
+    for place, (title, (held, unit)) in enumerate(columns.items()):
+        if place and held is not None:
+            flares[title] = np.array([cells[row][place] for row in kept], float)
+            flares[title].unit = unit
     flares["amplitude"].info.description = "relative rise above the quiescent flux, in the band of the light curve"
     return flares
-
-
-def _numbers(column: Any, named: str, unit: str) -> np.ndarray:
-    """Return a column's numbers in a unit, which is also assumed if the column has none; masked values become NaN."""
-    import astropy.units as u
-
-    kind = np.asarray(column).dtype.kind if hasattr(column, "dtype") else "O"
-    if kind not in "iuf" or np.ndim(column) != 1:
-        raise InputError(f"{named} holds no plain numbers", "one number in each row", key=column.name)
-    values: np.ndarray = np.ma.filled(np.ma.asarray(getattr(column, "value", column), float), np.nan)
-    if getattr(column, "unit", None) is None:
-        return np.asarray(values, float)
-    try:
-        return np.asarray((values * u.Unit(column.unit)).to_value(unit), float)
-    except (u.UnitConversionError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{named} has the unit {str(column.unit)!r}",
-            unit or "none, since amplitudes are relative",
-            key=column.name,
-            value=column.unit,
-        ) from error

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from mauvecl.schema.errors import InputError
 
-from ..files.ecsv import read_ecsv
+from ..tables.ecsv import read_ecsv
 
 if TYPE_CHECKING:
     import numpy as np
@@ -96,10 +96,15 @@ def spectrum_digest(wavelength: np.ndarray, flux: np.ndarray) -> str:
 def remove(name: str) -> None:
     """Delete a kept star; raises InputError for an unknown name."""
     wanted = name.strip().casefold()
-    for path in sorted(folder().glob("*.ecsv")):
-        if path.stem.casefold() == re.sub(r"[^a-z0-9.+-]", "_", wanted) or _named(path) == wanted:
-            path.unlink()
-            return
+    paths = sorted(folder().glob("*.ecsv"))
+    # A damaged file has no name but that of the file.
+    stem = re.sub(r"[^a-z0-9.+-]", "_", wanted)
+    found = [path for path in paths if _named(path) == wanted] or [
+        path for path in paths if path.stem.casefold() == stem and _named(path) is None
+    ]
+    if found:
+        found[0].unlink()
+        return
     names = ", ".join(star.name for star in kept()) or "no star is kept"
     raise InputError.of("name", name, f"one of: {names}")
 

@@ -168,6 +168,7 @@ class Source(Drawable, ContentEquality):
         wavelength_unit: str | u.UnitBase | None = None,
         flux_unit: str | u.UnitBase | None = None,
         extend: str | Source | None = None,
+        ignore_checksum: bool = False,
     ) -> Self:
         """Read a spectrum from a file of text, ECSV, VOTable or FITS.
 
@@ -182,16 +183,21 @@ class Source(Drawable, ContentEquality):
             Units that override those of the file; a unit of wavelength may end in " air" or " vacuum".
         extend : str or Source, optional
             Library spectrum that continues the file's beyond its end, scaled to match at the join.
+        ignore_checksum : bool
+            Whether a FITS file is read that its CHECKSUM or DATASUM contradicts.
 
         Raises
         ------
         InputError
             If the file is missing, unreadable or holds no usable spectrum, or less than a third of 200-700 nm.
         """
-        read = read_spectrum(Path(path), wavelength_unit=wavelength_unit, flux_unit=flux_unit)
-        star = cls._made(
-            read.wavelength_nm, read.flux_flam, read.name, read.origin, read.notes, read.messages, extend, is_file=True
+        read = read_spectrum(
+            Path(path), wavelength_unit=wavelength_unit, flux_unit=flux_unit, ignore_checksum=ignore_checksum
         )
+        star = cls._made(
+            read.wavelength_nm, read.flux_flam, read.name, read.origin, read.notes, read.messages, extend,
+            file_unit=read.axis_unit,
+        )  # fmt: skip
         unscaled = read.unscaled or star._too_bright()
         return replace(star, unscaled=unscaled) if unscaled else star
 
@@ -205,13 +211,13 @@ class Source(Drawable, ContentEquality):
         notes: tuple[str, ...] = (),
         messages: tuple[str, ...] = (),
         extend: str | Source | None = None,
-        is_file: bool = False,
+        file_unit: str = "",
     ) -> Self:
         """Check a user's spectrum, drop undefined ends, continue others, and make it a source."""
         check_points(name, wavelength, flux)
-        check_measured(name, wavelength)
+        check_measured(name, wavelength, file_unit or "nm")
         wavelength, flux, cut = without_undefined_ends(name, wavelength, flux)
-        if is_file or extend is not None:
+        if file_unit or extend is not None:
             messages += (coverage(wavelength),)
         messages += remarks(wavelength, flux)
         if extend is not None:

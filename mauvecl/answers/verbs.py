@@ -29,6 +29,7 @@ OBSERVATION = (
     "star.wavelength_unit",
     "star.flux_unit",
     "star.extend",
+    "star.ignore_checksum",
     "star.bin_nm",
     "star.neighbours",
     "star.neighbours_of",

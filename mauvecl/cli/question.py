@@ -76,8 +76,8 @@ def holds_study(file: Path) -> bool:
     """Return whether a file is not a plain table, such as CSV, or ECSV that no answer wrote."""
     suffix = file.suffix.lower()
     if suffix != ".ecsv" or not file.is_file():
-        return suffix != ".csv"
-    from mauvecl.host.files.ecsv import read_ecsv
+        return suffix not in (".csv", ".vot", ".votable", ".xml", ".fits", ".fit")
+    from mauvecl.host.tables.ecsv import read_ecsv
 
     return "study" in read_ecsv(file, "table", "a table of targets, or of an answer").meta
 

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from mauvecl.host.orbit.orbit import Orbit
 from mauvecl.host.orbit.targets import Target
-from mauvecl.host.sky.helioecliptic import offline
+from mauvecl.host.tables.times import SCALES, offline
 from mauvecl.observations.frames import Frames
-from mauvecl.observations.time_system import SCALES
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
 

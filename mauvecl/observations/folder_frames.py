@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import lru_cache
@@ -11,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from mauvecl.host.files.text_table import read_text_table
+from mauvecl.host.tables.names import matched
+from mauvecl.host.tables.opening import read_table
+from mauvecl.host.tables.table import MemoryTable, TableFile, Values
 from mauvecl.observations.mapping import FrameMapping
-from mauvecl.observations.values import FrameFile, TableFile, Values
 from mauvecl.schema.errors import InputError
 
 #: Largest number of files in a folder.
@@ -21,19 +21,19 @@ MAX_FILES = 2**20
 #: Column of a table with the names of files, by default.
 FILES = "file"
 
-Open = Callable[[Path], AbstractContextManager[FrameFile]]
+Open = Callable[[Path], AbstractContextManager[TableFile]]
 
 
-class FolderFile(FrameFile):
+class FolderFile(TableFile):
     """Spectra in the files of a folder; quantities of frames are keywords of their headers or columns of a table."""
 
     def __init__(self, folder: Path, mapping: FrameMapping, what: str, open_file: Open) -> None:
         super().__init__(what, {})
         self.open_file = open_file
-        self.table: TableFile | None = None
+        self.table: MemoryTable | None = None
         if mapping.table is not None:
             place = folder / mapping.table
-            self.table = TableFile(read_text_table(place, "table of files"), f"table {mapping.table!r}")
+            self.table = MemoryTable(read_table(place, "table of files", texts=()), f"table {mapping.table!r}")
             listed = self.table.find(mapping.files or FILES)
             self.paths = [folder / str(name) for name in listed.texts() or listed.read(0, listed.n_rows)]
         else:
@@ -59,7 +59,7 @@ class FolderFile(FrameFile):
         """Return a column of the table, a keyword of each header, or a column of each file."""
         if self.table is not None and (found := self.table.named(name)) is not None:
             return found
-        keyword = next((key for key in self.header if key.lower() == name.lower()), None)
+        keyword = matched(name, self.header)
         if keyword is not None:
             return Values.of(name, np.array(self._keywords(keyword)), None, self.what)
         with self.open_file(self.paths[0]) as first:
@@ -112,13 +112,3 @@ class FolderFile(FrameFile):
             raise InputError(f"{self.what}: {self.paths[found.index(None)].name} has no {keyword}",
                              "the keyword in every file", key=keyword)  # fmt: skip
         return found
-
-
-def keywords_of(lines: Sequence[str]) -> dict[str, str]:
-    """Return the keywords in the comments of a text file, as in ``# DATE-OBS = 2026-03-01T12:00:00``."""
-    found = {}
-    for line in lines:
-        match = re.match(r"\s*[#%!;]+\s*([A-Za-z][\w .-]{0,40}?)\s*[=:]\s*(.*?)\s*(?:\s/\s.*)?$", line)
-        if match:
-            found[match[1]] = match[2].strip("\"'")
-    return found

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mauvecl.observations.quality import ALL_BITS, QualityBits
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Unit
@@ -32,7 +33,7 @@ MIN_STEP = 0.5
 class Reason(IntFlag):
     """Why a frame is not searched, as bits of a quality flag."""
 
-    QUALITY = 1  #: the file's own quality flag is not zero
+    QUALITY = 1  #: the file's own quality flag has a bit that excludes the frame
     NOT_FINITE = 2  #: flux or error is not a finite number, or the error is not positive
     BELOW = 4  #: far below the quiescent level, where no flare can be
     SPIKE = 8  #: a single frame far above both of its neighbours, such as a cosmic ray
@@ -61,6 +62,10 @@ class Frames:
         Standard deviation of each value.
     quality : ndarray, shape (n_frame,)
         Zero for frames without a known fault.
+    quality_mask : int
+        Bits of `quality` that exclude a frame; by default all.
+    mission : str
+        Mission whose names the bits have, "Kepler" (and K2) or "TESS"; empty for other files.
     wavelength_nm : ndarray, shape (n_pixel,), or None
     temperature_c : ndarray, shape (n_frame,), or None
         Temperature of the detector.
@@ -87,6 +92,8 @@ class Frames:
     flux: Float
     error: Float | None = None
     quality: NDArray[np.int64] | None = None
+    quality_mask: int = ALL_BITS
+    mission: str = ""
     wavelength_nm: Annotated[Float, Unit("nm")] | None = None
     temperature_c: Annotated[Float, Unit("deg_C")] | None = None
     unit: str = ""
@@ -237,8 +244,19 @@ class Frames:
         if self.error is not None:
             errors = self.error.reshape(self.n_frames, -1)
             finite &= (np.isfinite(errors) & (errors > 0)).all(axis=1)
-        flagged = np.zeros(self.n_frames, np.bool_) if self.quality is None else self.quality != 0
+        flagged = np.zeros(self.n_frames, np.bool_)
+        if self.quality is not None:
+            flagged = QualityBits(self.quality_mask).excluded(self.quality)
         return np.asarray(np.where(flagged, Reason.QUALITY, 0) | np.where(finite, 0, Reason.NOT_FINITE), np.int64)
+
+    @property
+    def flags(self) -> list[str]:
+        """Bits of the quality flag that exclude each frame, as in "Desat (32)"; empty for others."""
+        if self.quality is None:
+            return [""] * self.n_frames
+        bits = QualityBits(self.quality_mask, self.mission)
+        words = {int(value): bits.words(int(value)) for value in np.unique(self.quality)}
+        return [words[value] for value in self.quality.tolist()]
 
     def shifted(self, by_s: Annotated[Float, Unit("s")]) -> Self:
         """Return the frames with other times."""

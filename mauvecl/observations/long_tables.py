@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mauvecl.observations.values import Values
+from mauvecl.host.tables.table import Values
 from mauvecl.schema.errors import InputError
 
 

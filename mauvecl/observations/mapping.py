@@ -8,23 +8,11 @@ from typing import Literal, Self
 from pydantic import model_validator
 
 from mauvecl.host.files.parsing import read_text, toml
-from mauvecl.observations.time_system import SCALES, scale_of
+from mauvecl.host.tables.times import EPOCHS_MJD, SCALES, offline, scale_of
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import Exposure
 from mauvecl.schema.records import Record
 from mauvecl.schema.text import shortened
-
-#: Epochs by name, as modified Julian dates: of TESS and Kepler (their archive manuals), GPS and Unix seconds.
-EPOCHS_MJD = {
-    "mjd": 0.0,
-    "rjd": -0.5,
-    "jd": -2_400_000.5,
-    "bjd": -2_400_000.5,
-    "btjd": 56_999.5,
-    "bkjd": 54_832.5,
-    "gps": 44_244.0,
-    "unix": 40_587.0,
-}
 
 
 class FrameMapping(Record):
@@ -55,8 +43,12 @@ class FrameMapping(Record):
     flux_unit : str, optional
         Unit of the light, if the file does not state it.
     error, quality, exposure, temperature : str, optional
-        Frames with a quality other than zero are not searched; neither are pixels with one, where there is one for
-        each pixel.
+        Frames with a bit of `quality_bits` in their quality are not searched; neither are pixels with one, where there
+        is one for each pixel.
+    quality_bits : str or int, optional
+        Bits of the quality that exclude a frame: their sum, "all", "none", or names and numbers such as "Desat, 128".
+        By default lightkurve's default for Kepler and K2, the same without ImpulsiveOutlier for TESS, and all bits for
+        other files.
     exposure_s : float, optional
         Exposure time of every frame.
     exposure_unit, temperature_unit, wavelength_unit : str, optional
@@ -84,6 +76,7 @@ class FrameMapping(Record):
     flux_unit: str | None = None
     error: str | None = None
     quality: str | None = None
+    quality_bits: str | int | None = None
     exposure: str | None = None
     exposure_s: Exposure | None = None
     exposure_unit: str | None = None
@@ -133,7 +126,7 @@ class FrameMapping(Record):
             return None
         if self.epoch.lower() in EPOCHS_MJD:
             return EPOCHS_MJD[self.epoch.lower()]
-        from mauvecl.host.sky.helioecliptic import offline, parse_time
+        from mauvecl.host.sky.helioecliptic import parse_time
 
         with offline():
             try:

@@ -2,33 +2,45 @@
 
 from __future__ import annotations
 
-import io
+import re
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.files.parsing import parsing
-from mauvecl.host.files.size_limits import check_size, limit_bytes, open_regular, packed, read_bytes, unpacked
-from mauvecl.host.files.text_table import text_table
-from mauvecl.host.spectra.air import vacuum_from_air
-from mauvecl.host.spectra.fits_files import check_sums
+from mauvecl.host.files.size_limits import limit_bytes
+from mauvecl.host.spectra.column_roles import words_of
 from mauvecl.host.spectra.formats import without_columns
-from mauvecl.host.spectra.text import text_of
-from mauvecl.observations.fits_frames import FitsFile, open_fits
-from mauvecl.observations.folder_frames import FolderFile, keywords_of
+from mauvecl.host.tables.fits_tables import FitsTables
+from mauvecl.host.tables.medium import medium_of, unit_and_medium, vacuum_wavelengths
+from mauvecl.host.tables.names import divided_unit, first_of, is_magnitude
+from mauvecl.host.tables.opening import open_table
+from mauvecl.host.tables.table import MemoryTable, TableFile, Values, converted, unit_in, unit_in_name
+from mauvecl.host.tables.times import (
+    MISSIONS,
+    TimeSystem,
+    TimeUnit,
+    is_dated,
+    mjd_of,
+    position_of,
+    scale_of,
+    seconds_from_first,
+    time_in_name,
+    time_unit,
+)
+from mauvecl.observations.folder_frames import FolderFile
 from mauvecl.observations.frames import MAX_FRAMES, Frames
-from mauvecl.observations.large_tables import LARGE, open_large
 from mauvecl.observations.long_tables import spectra_of_rows
 from mauvecl.observations.mapping import FrameMapping
+from mauvecl.observations.quality import ALL_BITS, QualityBits, decimal_flags
 from mauvecl.observations.reduction import Light, PixelStatistics, weighted_sums, whole_or_reduced
 from mauvecl.observations.stored_frames import StoredFile, is_store, open_hdf5, open_store, stored_in_fits
-from mauvecl.observations.time_system import TimeSystem, mjd_of, position_of, scale_of, seconds_from_first
-from mauvecl.observations.values import FrameFile, TableFile, Values, converted, unit_in
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
@@ -37,22 +49,33 @@ from mauvecl.schema.text import shortened
 Float = NDArray[np.float64]
 
 FORMATS = "FITS, HDF5, ECSV, CSV, a Zarr store or a folder of spectra"
-#: Names of columns that need no mapping, in order of preference: those of mauvecl, of TESS and Kepler light curves, and
-#: of lightkurve's and AltaiPony's tables.
+#: Names of columns that need no mapping, in order of preference, in any case: those of mauvecl, of the pipelines of
+#: Kepler, K2 and TESS, of lightkurve and AltaiPony, and of K2SFF, QLP, eleanor and TASOC.
 KNOWN = {
     "time": ("time",),
-    "flux": ("flux", "pdcsap_flux", "sap_flux"),
+    "flux": ("flux", "pdcsap_flux", "sap_flux", "kspsap_flux", "det_flux", "corr_flux", "corrected_flux", "fcor",
+             "flux_corr", "detrended_flux", "rate"),
     "quality": ("quality", "sap_quality"),
     "temperature": ("temperature",),
-}
+}  # fmt: skip
+#: Names of times where no column is called time and none is named after its dates, such as BJD.
+OTHER_TIMES = ("t", "date", "datetime", "timestamp")
 #: Part of a frame that times refer to.
 PARTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
-SIGNATURES = {b"SIMPLE  =": "FITS", b"\x89HDF\r\n": "HDF5"}
-ECSV = b"# %ECSV"
+#: Dates of observed light, MJD, from 1845 to 2269.
+DATES_MJD = (-5000.0, 150_000.0)
+#: What a cell of times may be.
+DATE = "a number or a date such as 2026-03-01T12:00:00"
 
 
 @validated
-def read_frames(path: str | Path, mapping: FrameMapping | str | Path | None = None) -> Frames:
+def read_frames(
+    path: str | Path,
+    mapping: FrameMapping | str | Path | None = None,
+    *,
+    quality_bits: str | int | None = None,
+    ignore_checksum: bool = False,
+) -> Frames:
     """Read frames from a file or a folder.
 
     Spectra that take more memory than `MAUVECL_LARGEST_CONTENT_MIB` are reduced to their sum over wavelength while
@@ -65,8 +88,14 @@ def read_frames(path: str | Path, mapping: FrameMapping | str | Path | None = No
         or an array of a store.
     mapping : FrameMapping or path, optional
         Places of the quantities. Files of mauvecl, TESS, Kepler and lightkurve need none.
+    quality_bits : str or int, optional
+        Bits of the quality that exclude a frame, as in the mapping, over which they have precedence.
+    ignore_checksum : bool
+        Whether FITS files are read that their CHECKSUM or DATASUM contradicts.
     """
-    with _parsing(path), _frame_file(path, mapping) as (file, how, stem):
+    with _parsing(path), _frame_file(path, mapping, check=not ignore_checksum) as (file, how, stem):
+        if quality_bits is not None:
+            how = how.model_copy(update={"quality_bits": quality_bits})
         return _frames_in(file, how, stem)
 
 
@@ -102,7 +131,7 @@ def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any 
         )
         mapping = FrameMapping(time="time", flux="flux", wavelength="wavelength",
                                error="flux_err" if "flux_err" in columns else None)  # fmt: skip
-    file = TableFile(container, type(container).__name__)
+    file = MemoryTable(container, type(container).__name__)
     return _frames_in(file, mapping or _recognised(file), str(container.meta.get("LABEL", "frames")))
 
 
@@ -154,9 +183,10 @@ def reduce_frames(
         if len(flux.shape) != 2:
             raise InputError.of("flux", flux.shape, "spectra, shape (n_frame, n_pixel)", where=file.what)
         given = None if weights is None else np.asarray(weights, np.float64)
-        sums = weighted_sums(flux, error, found.quality, given)
+        quality = _masked(found.quality, QualityBits.of(file.header, how.quality_bits, file.what))
+        sums = weighted_sums(flux, error, quality, given)
         curves = tuple(
-            _frames_in(file, how, stem, lambda *_, k=k: sums.light(k, flux.what, found.quality))
+            _frames_in(file, how, stem, lambda *_, k=k: sums.light(k, flux.what, quality))
             for k in range(sums.sums.shape[1])
         )
         return ReducedFrames(curves, sums.pixels)
@@ -169,20 +199,20 @@ def _parsing(path: str | Path) -> AbstractContextManager[None]:
 
 @contextmanager
 def _frame_file(
-    path: str | Path, mapping: FrameMapping | str | Path | None
-) -> Iterator[tuple[FrameFile, FrameMapping, str]]:
+    path: str | Path, mapping: FrameMapping | str | Path | None, check: bool = True
+) -> Iterator[tuple[TableFile, FrameMapping, str]]:
     """Open a file, folder or store, and return its quantities and its name without extension."""
     place, words = without_columns(path)
     given = FrameMapping.read(mapping) if isinstance(mapping, str | Path) else mapping
     name = words[0] if words else None if given is None or given.hdu is None else str(given.hdu)
-    with _open_frames(place, given, name) as (file, how):
+    with _open_frames(place, given, name, check) as (file, how):
         yield file, how, place.stem
 
 
 @contextmanager
 def _open_frames(
-    path: Path, mapping: FrameMapping | None, name: str | None
-) -> Iterator[tuple[FrameFile, FrameMapping]]:
+    path: Path, mapping: FrameMapping | None, name: str | None, check: bool
+) -> Iterator[tuple[TableFile, FrameMapping]]:
     """Open a file with frames, and return where its quantities are."""
     what = f"file {path.name!r}"
     if path.is_dir():
@@ -194,70 +224,31 @@ def _open_frames(
             expected = "a mapping that says where the quantities of its files are"
             raise InputError(f"{what} is not a store of spectra", expected, key="mapping")
         else:
-            yield FolderFile(path, mapping, what, lambda one: _opened(one, f"file {one.name!r}", name)), mapping
+            open_one = partial(_opened, name=name, check=check)
+            yield FolderFile(path, mapping, what, lambda one: open_one(one, f"file {one.name!r}")), mapping
         return
-    with _opened(path, what, name, mapping, large=True) as file:
+    with _opened(path, what, name, mapping, check, large=True) as file:
         yield file, mapping or (file.mapping if isinstance(file, StoredFile) else _recognised(file))
 
 
-@contextmanager
 def _opened(
-    path: Path, what: str, name: str | None, mapping: FrameMapping | None = None, *, large: bool = False
-) -> Iterator[FrameFile]:
-    """Open a file by its first bytes; only `large` ones may exceed MAUVECL_LARGEST_FILE_MIB."""
-    if not large:
-        check_size(path, "file")
-    with open_regular(path, "file") as raw:
-        start = raw.read(16)
-        raw.seek(0)
-        file: IO[bytes] = raw
-        content: bytes | None = None
-        commas = ".csv" in path.suffixes[-2:]
-        if (commas or start.startswith(ECSV)) and not packed(start) and raw.seek(0, io.SEEK_END) > LARGE:
-            raw.seek(0)
-            with open_large(raw, what, commas, FORMATS) as table:
-                yield table
-            return
-        raw.seek(0)
-        if not any(start.startswith(mark) for mark in SIGNATURES):
-            content = unpacked(read_bytes(path, "file"), what)
-            start, file = content[:16], io.BytesIO(content)
-        kind = next((kind for mark, kind in SIGNATURES.items() if start.startswith(mark)), "text")
-        if kind == "FITS":
-            with open_fits(file, what) as hdus:
-                if file.seek(0, io.SEEK_END) <= limit_bytes("MAUVECL_LARGEST_FILE_MIB"):
-                    _checked(hdus, what)
-                with parsing(what, FORMATS):
-                    stored = stored_in_fits(FitsFile(hdus, what), name)
-                    found = stored or FitsFile(hdus, what, name, _wanted(mapping))
-                yield _filled(found)
-        elif kind == "HDF5":
-            with open_hdf5(file, name, what) as scene:
-                yield scene
-        else:
-            try:
-                text = text_of(content or b"")
-            except InputError as error:
-                raise error.within(what) from error
-            if not text.strip():
-                raise InputError(f"{what} is empty", FORMATS, key="file")
-            small = TableFile(text_table(text, what, commas, FORMATS), what)
-            small.header |= keywords_of([line for line in text.splitlines() if line[:1] in "#%!;"])
-            yield _filled(small)
+    path: Path,
+    what: str,
+    name: str | None,
+    mapping: FrameMapping | None = None,
+    check: bool = True,
+    *,
+    large: bool = False,
+) -> AbstractContextManager[TableFile]:
+    """Open a file with frames; only `large` ones may exceed MAUVECL_LARGEST_FILE_MIB."""
 
+    def of_fits(hdus: Any) -> TableFile:
+        return stored_in_fits(FitsTables(hdus, what), name) or FitsTables(hdus, what, name, _wanted(mapping))
 
-def _filled(file: FrameFile) -> FrameFile:
-    """Return a file; raise InputError if it has nothing with rows."""
-    if not file.names:
-        raise InputError(f"{file.what} has no table and no image", "a row for each frame", key="file")
-    return file
-
-
-def _checked(hdus: Any, what: str) -> None:
-    try:
-        check_sums(hdus)
-    except InputError as error:
-        raise error.within(what) from error
+    return open_table(
+        path, what, expected=FORMATS, check=check, large=large, of_fits=of_fits,
+        of_hdf5=lambda file: open_hdf5(file, name, what),
+    )  # fmt: skip
 
 
 def _wanted(mapping: FrameMapping | None) -> tuple[tuple[str, ...], ...]:
@@ -265,13 +256,23 @@ def _wanted(mapping: FrameMapping | None) -> tuple[tuple[str, ...], ...]:
     return (KNOWN["time"], KNOWN["flux"]) if mapping is None else tuple((name,) for name in mapping.times)
 
 
-def _recognised(file: FrameFile) -> FrameMapping:
+def _recognised(file: TableFile) -> FrameMapping:
     """Return the mapping of a file whose columns have known names."""
-    lower = {name.lower(): name for name in file.names}
-    columns = {key: next((lower[n] for n in names if n in lower), None) for key, names in KNOWN.items()}
-    flux = (columns["flux"] or "").lower()
+    # Of FITS files also images, but no columns of other extensions.
+    names = [*file.columns, *(name for name in file.names if "/" not in name and name not in file.columns)]
+    columns = {key: first_of(known, names, file.what) for key, known in KNOWN.items()}
+    if columns["time"] is None:
+        dated = [name for name in names if (said := time_in_name(name)) is not None and said.epoch_mjd is not None]
+        if len(dated) > 1:
+            fault = f"{file.what}: {len(dated)} columns may be the time: {', '.join(map(shortened, dated))}"
+            raise InputError(fault, "a mapping that names one", key="time", value=dated)
+        columns["time"] = dated[0] if dated else first_of(OTHER_TIMES, names, file.what)
+    flux = divided_unit(columns["flux"] or "")[0]
     # Errors of another flux would be wrong ones.
-    columns["error"] = next((lower[n] for n in (f"{flux}_err", f"{flux}_error", "error") if n in lower), None)
+    columns["error"] = first_of((f"{flux}_err", f"{flux}_error", f"{flux}err", f"e_{flux}", "error"), names, file.what)
+    if columns["flux"] is None and (magnitudes := [name for name in names if is_magnitude(name)]):
+        fault = f"{file.what} has magnitudes ({', '.join(map(shortened, magnitudes))}) and no column of linear light"
+        raise InputError(fault, "light in a linear unit, in a column named flux", key="flux", value=magnitudes)
     if columns["time"] is None or columns["flux"] is None:
         raise InputError(
             f"{file.what} has the columns {shortened(', '.join(file.names), 300)}",
@@ -296,7 +297,7 @@ class Quantities:
     wavelength: Values | None
 
     @classmethod
-    def of(cls, file: FrameFile, mapping: FrameMapping) -> Quantities:
+    def of(cls, file: TableFile, mapping: FrameMapping) -> Quantities:
         """Find the quantities of a mapping."""
 
         def found(name: str | None) -> Values | None:
@@ -319,7 +320,7 @@ class Quantities:
         return cls(*spectra_of_rows(times, flux, one.error, one.quality, one.exposure, one.temperature, nm, file.what))
 
 
-def _wavelength(file: FrameFile, mapping: FrameMapping) -> Values | None:
+def _wavelength(file: TableFile, mapping: FrameMapping) -> Values | None:
     if mapping.wavelength_file is not None:
         path = Path(mapping.wavelength_file)
         with _opened(path, f"file {path.name!r}", None) as other:
@@ -337,7 +338,7 @@ def _wavelength(file: FrameFile, mapping: FrameMapping) -> Values | None:
 
 
 def _frames_in(
-    file: FrameFile, mapping: FrameMapping, stem: str, read: Callable[..., Light] = whole_or_reduced
+    file: TableFile, mapping: FrameMapping, stem: str, read: Callable[..., Light] = whole_or_reduced
 ) -> Frames:
     """Build frames from a file and the names of its quantities; `read` returns their light."""
     what = file.what
@@ -352,6 +353,10 @@ def _frames_in(
         if values is not None and values.n_rows != n:
             raise InputError(f"{what}: {values.name!r} has {values.n_rows} rows", f"{n} as the times have",
                              key=values.name, value=values.n_rows)  # fmt: skip
+    if len(found.flux.shape) > 2:
+        pixels = " x ".join(map(str, found.flux.shape[1:]))
+        raise InputError(f"{what}: {found.flux.name!r} holds images of {pixels} pixels, as target pixel files do",
+                         "a light curve, such as lightkurve's `to_lightcurve` makes", key="flux")  # fmt: skip
     time, exposure_s, dates, remarks = _times(found.time, file, mapping)
     if found.exposure is not None:
         exposure_s = converted(found.exposure, mapping.exposure_unit, "s", "exposure_unit").numbers().reshape(n)
@@ -359,7 +364,7 @@ def _frames_in(
         exposure_s = np.full(n, mapping.exposure_s)
     unit, flux, error, more = _light(found, mapping)
     remarks += more
-    wavelength = None if found.wavelength is None else _vacuum_nm(found.wavelength, mapping.wavelength_unit)
+    wavelength = None if found.wavelength is None else _vacuum_nm(found.wavelength, mapping.wavelength_unit, file)
     if len(flux.shape) == 2 and flux.shape[1] == 1 and wavelength is None:
         flux, error = _single(flux), None if error is None else _single(error)
     temperature = None
@@ -367,8 +372,15 @@ def _frames_in(
         temperature = converted(found.temperature, mapping.temperature_unit, "deg_C", "temperature_unit").numbers()
     elif isinstance(nominal := file.header.get("CCD-TEMP"), int | float):
         temperature = np.full(n, float(nominal))
-    light, sd, flags, more = read(flux, error, found.quality)
+    bits = QualityBits.of(file.header, mapping.quality_bits, what)
+    light, sd, flags, more = read(flux, error, _masked(found.quality, bits))
     remarks += more
+    if sd is not None and not np.isfinite(sd).any():
+        # lightkurve writes a column of NaN for errors that it does not know.
+        sd = None
+        remarks += (f"{what} has a column of errors without a number: it is left out",)
+    if found.quality is not None and len(found.quality.shape) == 1:
+        flags = decimal_flags(found.quality.numbers())
     if len(light.shape) == 1:
         wavelength = None
     kept = np.isfinite(time)
@@ -383,7 +395,9 @@ def _frames_in(
         light[kept],
         None if sd is None else sd[kept],
         exposure_s=None if exposure_s is None else exposure_s[kept],
-        quality=None if flags is None else np.where(np.isfinite(flags), flags, 1)[kept],
+        quality=None if flags is None else np.where(np.isfinite(flags), flags, bits.mask & -bits.mask)[kept],
+        quality_mask=bits.mask,
+        mission=bits.mission,
         name=mapping.name or str(file.header.get("OBJECT", "") or file.header.get("star", "") or stem),
         wavelength_nm=wavelength,
         temperature_c=None if temperature is None else temperature.reshape(n)[kept],
@@ -396,53 +410,105 @@ def _frames_in(
     )
     if dates.at != 0.5:
         made = made.shifted((0.5 - dates.at) * made.exposure_s)
+    if made.quality is not None:
+        remarks += bits.remarks(made.quality, made.name)
     return made.with_remarks(remarks)
 
 
+def _masked(quality: Values | None, bits: QualityBits) -> Values | None:
+    """Return quality flags without the bits that do not exclude a frame or a pixel."""
+    if quality is None or bits.mask == ALL_BITS:
+        return quality
+    return quality.mapped(lambda flags: np.where(np.isfinite(flags), bits.mask & flags.astype(np.int64), flags), "")
+
+
 def _times(
-    time: tuple[Values, ...], file: FrameFile, mapping: FrameMapping
+    time: tuple[Values, ...], file: TableFile, mapping: FrameMapping
 ) -> tuple[Float, Float | None, TimeSystem, tuple[str, ...]]:
     """Return times in seconds from the first, exposure times of frames with a start and an end, and their dates."""
     import astropy.units as u
 
     stated = TimeSystem.of(file.header, file.what)
     scale, position = scale_of(mapping.scale) or stated.scale, position_of(mapping.position) or stated.position
-    epoch, remarks, offset = mapping.epoch_mjd, [], stated.offset
+    epoch, remarks = mapping.epoch_mjd, []
     texts = [one.texts() for one in time]
-    if all(text is not None and any(_dated(cell) for cell in text) for text in texts):
-        scale, unit, epoch, offset = scale or "utc", u.d, 0.0, 0.0
+    if all(text is not None and any(is_dated(cell) for cell in text) for text in texts):
+        scale, unit, epoch, offset = scale or stated.default_scale or "utc", u.d, 0.0, 0.0
         edges = [mjd_of(text or [], scale, one.name, file.what) for text, one in zip(texts, time, strict=True)]
-        if not (mapping.scale or stated.scale):
+        if not (mapping.scale or stated.scale or stated.default_scale):
             remarks.append(f"the dates of {file.what} state no time scale and are assumed to be in UTC")
     else:
-        stated_unit = mapping.time_unit or time[0].unit or stated.unit
-        if len({one.unit for one in time}) > 1 and not mapping.time_unit:
-            names = " and ".join(repr(one.name) for one in time)
-            raise InputError(f"{file.what}: {names} have different units", "one unit", key="time")
-        # Checks the unit; times keep theirs, so that long times lose no digits.
-        converted(replace(time[0], unit=stated_unit), mapping.time_unit, "s", "time_unit")
-        unit = unit_in(stated_unit)
-        edges = [one.numbers().ravel() for one in time]
-        epoch = stated.epoch_mjd if epoch is None else epoch
+        edges = [one.numbers(DATE).ravel() for one in time]
+        said, remarks = _time_unit(time, edges[0], file, mapping, stated)
+        unit = u.Unit(said.unit)
+        offset = stated.offset_in(unit, file.what)
+        scale, position = scale or said.scale or stated.default_scale, position or said.position
+        if epoch is None:
+            both = said.epoch_mjd is not None and stated.epoch_mjd is not None
+            if both and abs((said.epoch_mjd or 0.0) - (stated.epoch_mjd or 0.0)) > 1e-5:
+                raise InputError(
+                    f"{file.what}: {time[0].name!r} counts from MJD {said.epoch_mjd:g} by its unit or name and from "
+                    f"{stated.epoch_mjd:g} by its header", "one epoch, or a mapping with epoch", key="epoch",
+                )  # fmt: skip
+            epoch = said.epoch_mjd if stated.epoch_mjd is None else stated.epoch_mjd
     exposure = None if len(edges) == 1 else np.asarray(((edges[1] - edges[0]) * unit).to_value(u.s))
     seconds, first_d = seconds_from_first(np.mean(edges, axis=0) + offset, unit)
     at = 0.5 if len(edges) == 2 else PARTS.get(mapping.time_at or "", stated.at)
+    if epoch is not None and mapping.epoch is None and not DATES_MJD[0] < epoch + first_d < DATES_MJD[1]:
+        span = " and ".join(f"{float(edge):g}" for edge in (np.nanmin(edges[0]), np.nanmax(edges[0])))
+        remarks.append(f"the times of {file.what} have no date, although their unit, name or header says so: {span}")
+        epoch = None
     dates = replace(stated, epoch_mjd=None if epoch is None else epoch + first_d, scale=scale, position=position, at=at)
     return (seconds if epoch is not None else seconds + first_d * DAY_S), exposure, dates, tuple(remarks)
 
 
-def _dated(cell: str) -> bool:
-    """Return whether a text begins as an ISO 8601 date."""
-    return len(cell) >= 8 and cell[:4].isdigit() and cell[4:5] in ("-", ":")
+def _time_unit(
+    time: tuple[Values, ...], values: Float, file: TableFile, mapping: FrameMapping, stated: TimeSystem
+) -> tuple[TimeUnit, list[str]]:
+    """Return the unit of times and what it says of their zero: of the mapping, the column, its name, the header."""
+    if len({one.unit for one in time}) > 1 and not mapping.time_unit:
+        names = " and ".join(repr(one.name) for one in time)
+        raise InputError(f"{file.what}: {names} have different units", "one unit", key="time")
+    text = mapping.time_unit or time[0].unit or unit_in_name(time[0].name)
+    named = time_in_name(time[0].name)
+    said = named if not text else time_unit(text)
+    if said is None:
+        text = text or stated.unit
+        said = time_unit(text) if text else None
+        if said is None and text:
+            # Checks the unit; times keep theirs, so that long times lose no digits.
+            converted(replace(time[0], unit=text), None, "s", "time_unit")
+            said = TimeUnit(str(unit_in(text)))
+    if said is None:
+        words = {str(file.header.get(key, "") or "").strip().upper() for key in ("MISSION", "TELESCOP")}
+        mission = next((one for one in MISSIONS if one in words), None)
+        finite = values[np.isfinite(values)]
+        if mission is None or not (finite.size and 0 < float(np.median(finite)) < 20_000):
+            converted(time[0], None, "s", "time_unit")
+        name = MISSIONS[mission or "TESS"].upper()
+        said = time_unit(name) or TimeUnit("d")
+        return said, [
+            f"ASSUMED: the times of {file.what} are {name}, days, as in files of {mission}; it states no unit"
+        ]
+    if said.epoch_mjd is None and named is not None and named.unit == said.unit:
+        said = named
+    return said, []
 
 
 def _light(found: Quantities, mapping: FrameMapping) -> tuple[str, Values, Values | None, tuple[str, ...]]:
     """Return the unit of the light, and light and errors in it."""
     remarks: tuple[str, ...] = ()
-    unit, stated = mapping.flux_unit or found.flux.unit, found.flux.unit
+    stated = found.flux.unit or unit_in_name(found.flux.name)
+    unit = mapping.flux_unit or stated
     if mapping.flux_unit and stated and mapping.flux_unit != stated:
         remarks = (f"the unit of {found.flux.name!r} is {mapping.flux_unit} as the mapping says, not {stated}",)
-    if "mag" in unit.lower() and "maggie" not in unit.lower():
+    words = set(words_of(found.flux.name))
+    if not unit and (is_magnitude(found.flux.name) or words & {"log", "ln", "dex"}):
+        expected = (
+            "linear light: convert magnitudes and logarithms first, or name a linear unit as flux_unit in a mapping"
+        )
+        raise InputError.of("flux", found.flux.name, expected, where=found.flux.what)
+    if re.match(r"\s*(?:dex|log|db)\b", unit, re.IGNORECASE) or ("mag" in unit.lower() and "magg" not in unit.lower()):
         raise InputError.of("flux_unit", unit, "a linear unit: light in magnitudes must be converted first",
                             where=found.flux.what)  # fmt: skip
     error = found.error
@@ -461,17 +527,19 @@ def _light(found: Quantities, mapping: FrameMapping) -> tuple[str, Values, Value
     return unit, found.flux, error, remarks
 
 
-def _vacuum_nm(wavelength: Values, given: str | None) -> Float:
-    """Return the wavelengths of the pixels, which must be the same in every frame."""
-    plain = (given or "").removesuffix(" air").removesuffix(" vacuum") or None
-    nm = converted(wavelength, plain, "nm", "wavelength_unit")
+def _vacuum_nm(wavelength: Values, given: str | None, file: TableFile) -> Float:
+    """Return the wavelengths of the pixels in vacuum, which must be the same in every frame."""
+    plain, medium = unit_and_medium(given or "")
+    stated, in_unit = unit_and_medium(wavelength.unit)
+    nm = converted(replace(wavelength, unit=stated or ""), plain, "nm", "wavelength_unit")
     rows = np.atleast_2d(nm.rows(0, 1) if len(nm.shape) == 2 else nm.numbers())[0]
     if len(nm.shape) == 2:
         for part in nm.pieces:
             if not np.allclose(nm.rows(part.start, part.stop), rows, rtol=1e-9, atol=0.0):
                 raise InputError(f"{wavelength.what}: the wavelengths change from frame to frame",
                                  "the same in every frame", key="wavelength", value=wavelength.name)  # fmt: skip
-    return vacuum_from_air(rows) if given and given.endswith(" air") else rows
+    found, _ = vacuum_wavelengths(rows, wavelength.name, "", medium or in_unit, partial(medium_of, file.header))
+    return found
 
 
 def _single(values: Values) -> Values:

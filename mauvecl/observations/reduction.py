@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.files.size_limits import limit_bytes
+from mauvecl.host.tables.table import Values
 from mauvecl.observations.frames import dead_pixel_remarks, live_pixels
-from mauvecl.observations.values import Values
 from mauvecl.schema.errors import InputError
 
 Float = NDArray[np.float64]

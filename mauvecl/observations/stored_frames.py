@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from mauvecl.host.files.parsing import parsing
 from mauvecl.host.files.size_limits import check_folder
-from mauvecl.observations.fits_frames import FitsFile
+from mauvecl.host.tables.fits_tables import FitsTables
+from mauvecl.host.tables.table import TableFile, Values
 from mauvecl.observations.frames import MAX_FRAMES
 from mauvecl.observations.mapping import FrameMapping
-from mauvecl.observations.values import FrameFile, Values
 from mauvecl.schema.errors import InputError
 
 Float = NDArray[np.float64]
@@ -44,7 +44,7 @@ class StoredScene:
     frames: NDArray[np.int64] | None  # shape (n_frame,), or None; numbers of the stored frames of each exposure
 
 
-class StoredFile(FrameFile):
+class StoredFile(TableFile):
     """A scene of a store as frames without dark and bias, one exposure after the other."""
 
     def __init__(self, scene: StoredScene, what: str) -> None:
@@ -140,7 +140,7 @@ def open_hdf5(file: IO[bytes], name: str | None, what: str) -> Iterator[StoredFi
         yield _in_groups(opened, name, what)
 
 
-def stored_in_fits(file: FitsFile, name: str | None) -> StoredFile | None:
+def stored_in_fits(file: FitsTables, name: str | None) -> StoredFile | None:
     """Return a scene of a FITS file that `mauvecl realise` wrote, or None for another file."""
     hdus = file.hdus
     scenes = {str(hdu.name): hdu for hdu in hdus if hdu.is_image and hdu.header.get("CTYPE1") == "WAVE-TAB"}

@@ -38,6 +38,18 @@ class DataChoice(Section):
             kind="upload",
         ),
     ] = None
+    quality_bits: Annotated[
+        str | None,
+        Help(
+            "Bits of the quality flag that exclude a frame",
+            "numbers and names as in 'Desat,128', or all, or none",
+            default="lightkurve's default for Kepler and K2, for TESS without ImpulsiveOutlier, else all",
+        ),
+        Flag("--quality-bits"),
+    ] = None
+    ignore_checksum: Annotated[
+        bool, Help("Read FITS files although their CHECKSUM or DATASUM differs"), Flag("--ignore-checksum")
+    ] = False
     report: Annotated[Literal["pdf", "html"], Help("Form of the report"), Flag("--report")] = "html"
 
     barycentric: Annotated[

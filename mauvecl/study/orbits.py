@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import ValidationError, field_validator, model_validator
 
-from mauvecl.host.files.text_table import read_text_table
 from mauvecl.host.orbit.observing_limits import Limits
+from mauvecl.host.tables.names import DECLINATIONS, RIGHT_ASCENSIONS, SPECTRAL_TYPES, STARS, key_of
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, Widget
+from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, Widget, first
 from mauvecl.schema.physical import (
     Distance,
     Duration,
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from mauvecl.host.orbit.orbit import Orbit
     from mauvecl.host.orbit.targets import Target
     from mauvecl.host.orbit.time_grid import TimeGrid
+    from mauvecl.host.tables.rows import Rows
     from mauvecl.lightcurve.flares.rates import Rates
     from mauvecl.lightcurve.search.completeness import DurationLaw
 
@@ -146,6 +147,8 @@ class PlanTarget(Section):
         Help("Share of the light of neighbours within the fibre's radius that enters it", "an assumption"),
     ] = 1.0
 
+    unused: Annotated[tuple[str, ...], Help("Columns of its table that are not read")] = ()
+
     @model_validator(mode="after")
     def _one_distribution(self) -> Self:
         for names in (("mass_msun", "age_myr"), ("alpha", "rate_per_day", "at_erg")):
@@ -217,7 +220,7 @@ class PlanQuestion(Section):
             "--targets",
             kind=Path,
             read=lambda path, _: read_targets(path),
-            help=Help("Table of targets (CSV, ECSV)", "name, and what is known of each"),
+            help=Help("Table of targets (CSV, ECSV, FITS, VOTable)", "name, and what is known of each"),
         ),
     ] = ()
     hours: Annotated[
@@ -283,16 +286,27 @@ def targets_of(orbit: OrbitQuestion, plan: PlanQuestion) -> list[Target]:
 
 
 def read_targets(path: Path) -> list[dict[str, Any]]:
-    """Read targets from a CSV or ECSV table; see `targets_in`. Paths in it are relative to its folder."""
-    return targets_in(
-        read_text_table(path, "table of targets"), f"table of targets {shortened(path.name)}", path.parent
-    )
+    """Read targets from a table of any format; see `targets_in`. Paths in it are relative to its folder."""
+    from mauvecl.host.tables.opening import read_table
+
+    named = f"table of targets {shortened(path.name)}"
+    return targets_in(read_table(path, "table of targets"), named, path.parent)
+
+
+#: Names of columns of targets, in any case, by the keys of `PlanTarget`; keys themselves are names as well.
+TARGET_COLUMNS = {
+    "name": (*STARS, "hostname"), "ra": RIGHT_ASCENSIONS, "dec": DECLINATIONS, "spectral_type": SPECTRAL_TYPES,
+    "magnitude": ("V", "vmag", "mag_v", "v_mag", "johnson_v", "flux_v", "sy_vmag", "mag"),
+    "distance_pc": ("distance", "dist", "d_pc", "dist_pc"), "parallax": ("parallax", "plx", "plx_value"),
+    "mass_msun": ("mass", "st_mass"), "age_myr": ("age",), "coordinates": ("coord", "coords", "position"),
+}  # fmt: skip
 
 
 def targets_in(table: Table, named: str, folder: Path | None = None) -> list[dict[str, Any]]:
-    """Return the targets of a table with a column ``name`` and any other keys of `PlanTarget`.
+    """Return the targets of a table with a column ``name`` and any other keys of `PlanTarget`, in any case.
 
-    ``ra`` and ``dec`` in degrees replace ``coordinates``, and ``V`` replaces ``magnitude``. Empty cells are ignored.
+    ``ra`` and ``dec`` in degrees, or in the unit that they state, replace ``coordinates``; ``V`` replaces ``magnitude``
+    and ``parallax`` a distance. Empty cells are ignored, and other columns are left out.
 
     Parameters
     ----------
@@ -301,43 +315,70 @@ def targets_in(table: Table, named: str, folder: Path | None = None) -> list[dic
     folder : Path, optional
         Folder of paths in the table; without it, columns of paths are refused.
     """
-    columns = {str(name).strip(): name for name in table.colnames}
-    if "V" in columns:
-        columns["magnitude"] = columns.pop("V")
-    if "name" not in columns:
-        raise InputError(f"{named} has the columns {shown(', '.join(columns), 200)}", "one called name", key="name")
-    keys = {*PlanTarget.model_fields, "ra", "dec"} - (set(PATH_KEYS) if folder is None else set())
-    other = next((name for name in columns if name not in keys), None)
-    if other is not None:
-        raise InputError(f"{named} has the column {shortened(other)}", f"some of {', '.join(sorted(keys))}", key=other)
-    if not 1 <= len(table) <= MAX_TARGETS:
-        raise InputError(f"{named} holds {len(table)} targets", f"1 to {MAX_TARGETS}", key="name", value=len(table))
-    cells = ({key: row[name] for key, name in columns.items() if _is_given(row[name])} for row in table)
-    return [_target(row, f"{named}: row {number}", folder) for number, row in enumerate(cells, 1)]
+    from mauvecl.host.tables.rows import Rows
+
+    rows = Rows(table, named)
+    keys = [key for key in PlanTarget.model_fields if key != "unused"]
+    columns = {key: rows.first((key, *TARGET_COLUMNS.get(key, ()))) for key in (*keys, "ra", "dec", "parallax")}
+    if columns["name"] is None:
+        raise InputError(f"{named} has the columns {shown(', '.join(rows.names), 200)}", "one called name", key="name")
+    path = next((held for key in PATH_KEYS if (held := columns[key]) and folder is None), None)
+    if path is not None:
+        raise InputError(f"{named} has the column {shortened(path)}", "no names of files", key=path)
+    for key in ("distance_pc", "mass_msun", "age_myr"):
+        held = columns[key]
+        if held is not None and key_of(held) in ("distance", "dist", "mass", "age") and not rows.unit(held):
+            # A distance in an unknown unit is none.
+            columns[key] = None
+    if not 1 <= rows.n <= MAX_TARGETS:
+        raise InputError(f"{named} holds {rows.n} targets", f"1 to {MAX_TARGETS}", key="name", value=rows.n)
+    unused = tuple(name for name in rows.names if name not in columns.values())
+    return [_target(rows, columns, row, folder, unused) for row in range(rows.n)]
 
 
-def _target(row: dict[str, Any], named: str, folder: Path | None) -> dict[str, Any]:
+def _target(
+    rows: Rows, columns: dict[str, str | None], row: int, folder: Path | None, unused: tuple[str, ...]
+) -> dict[str, Any]:
     """Return the data of a target from the cells of its row."""
-    one = {key: value.item() if hasattr(value, "item") else value for key, value in row.items()}
-    if ("ra" in one) != ("dec" in one) or ("ra" in one and "coordinates" in one):
+    from mauvecl.host.stars.well_known import by_key, name_key
+
+    named = f"{rows.named}: row {row + 1}"
+    one: dict[str, Any] = {}
+    for key, field in PlanTarget.model_fields.items():
+        column = columns.get(key)
+        text = rows.text(column, row)
+        if column is None or not text:
+            continue
+        unit = first(field, Unit)
+        if unit is None and first(field, Range) is None:
+            one[key] = text
+        else:
+            # A text that is no number is refused with the key's own sentence.
+            one[key] = rows.number(column, row, "" if unit is None else unit.name) if _is_number(text) else text
+    ra, dec, parallax = columns["ra"], columns["dec"], columns["parallax"]
+    if parallax is not None and "distance_pc" not in one:
+        value = rows.number(parallax, row, "mas")
+        one |= {"distance_pc": 1000.0 / value} if value is not None and value > 0 else {}
+    given = [name for name in (ra, dec) if rows.text(name, row)]
+    if len(given) == 1 or (given and "coordinates" in one):
         raise InputError(
             f"{named} has only one of ra and dec, or coordinates as well", "both or neither", key="coordinates"
         )
-    odd = next((key for key in ("ra", "dec") if key in one and not _is_number(one[key])), None)
-    if odd is not None:
-        raise InputError(
-            f"{named} has {odd} = {shortened(str(one[odd]))}",
-            "degrees; sexagesimal values belong in a column coordinates",
-            key=odd,
-            value=one[odd],
-        )
-    if "ra" in one:
-        one["coordinates"] = f"{one.pop('ra')} {one.pop('dec')}"
-    if "name" in one:
-        one["name"] = str(one["name"])
+    if ra is not None and dec is not None and given:
+        east, north = (rows.degrees(name, row, right_ascension=name == ra) for name in (ra, dec))
+        one["coordinates"] = f"{east!r} {north!r}"
+    elif (
+        ra is not None and "coordinates" not in one and _is_nan(rows, ra, row) and name_key(one["name"]) not in by_key()
+    ):
+        raise rows.error(
+            f"row {row + 1} has {ra} = nan, and {shortened(one['name'])} is not in the embedded list",
+            "its coordinates, or a name of the list", ra,
+        )  # fmt: skip
     for key in PATH_KEYS:
         if folder is not None and isinstance(one.get(key), str):
             one[key] = folder / one[key]
+    if unused:
+        one["unused"] = unused
     try:
         PlanTarget.model_validate(one)
     except ValidationError as error:
@@ -345,13 +386,15 @@ def _target(row: dict[str, Any], named: str, folder: Path | None) -> dict[str, A
     return one
 
 
-def _is_given(cell: Any) -> bool:
+def _is_nan(rows: Rows, name: str, row: int) -> bool:
+    """Return whether a cell is not a number, instead of empty."""
     import numpy as np
 
-    return not np.ma.is_masked(cell) and bool(str(cell).strip())
+    cell = rows.table[name][row]
+    return not np.ma.is_masked(cell) and str(cell).strip().lower() == "nan"
 
 
-def _is_number(cell: Any) -> bool:
+def _is_number(cell: str) -> bool:
     try:
         float(cell)
     except ValueError:

@@ -50,7 +50,7 @@ def amplitudes_in(path: Path, _: str) -> list[float]:
 
 
 #: Keys that only apply to a star from a file.
-FILE_KEYS = ("file", "wavelength_unit", "flux_unit", "extend")
+FILE_KEYS = ("file", "wavelength_unit", "flux_unit", "extend", "ignore_checksum")
 #: Keys that describe one star and are dropped when another star replaces it.
 STAR_KEYS = (
     *FILE_KEYS, "distance_pc", "radius_rsun", "effective_temperature_k", "neighbours", "neighbours_of"
@@ -138,6 +138,11 @@ class Star(Section):
             group="Own spectrum",
             kind="library",
         ),
+    ] = None
+    ignore_checksum: Annotated[
+        bool | None,
+        Help("Read FITS files although their CHECKSUM or DATASUM differs"),
+        Flag("--ignore-checksum"),
     ] = None
     bin_nm: Annotated[BinWidth | None, Help("Width of bins over which the spectrum is averaged"), Flag("--bin-nm")] = (
         None
@@ -241,8 +246,9 @@ class Star(Section):
             source = Source.from_library(spectrum_name(self.library))
         else:
             source = Source.read(
-                self.file or "", wavelength_unit=self.wavelength_unit, flux_unit=self.flux_unit, extend=self.extend
-            )
+                self.file or "", wavelength_unit=self.wavelength_unit, flux_unit=self.flux_unit, extend=self.extend,
+                ignore_checksum=bool(self.ignore_checksum),
+            )  # fmt: skip
         return self.applied(source)
 
     def applied(self, source: Source) -> Source:

@@ -12,10 +12,10 @@ from typing import Any, Union, get_args, get_origin
 
 from pydantic import BaseModel
 
-from mauvecl.host.files.ecsv import read_ecsv
 from mauvecl.host.files.parsing import parsing, read_text, toml
 from mauvecl.host.files.size_limits import read_bytes
 from mauvecl.host.spectra.formats import without_columns
+from mauvecl.host.tables.ecsv import read_ecsv
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 from mauvecl.study.calibrations import PATHS

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.files.columns import columns
 from mauvecl.host.files.parsing import LARGEST, SMALLEST, read_text
+from mauvecl.host.tables.columns import columns
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 

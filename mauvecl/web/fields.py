@@ -180,7 +180,7 @@ def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
     check : bool
         Whether their positions must be known, and all must differ.
     """
-    from mauvecl.host.files.text_table import text_table
+    from mauvecl.host.tables.text_table import text_table
     from mauvecl.study.orbits import PlanTarget, targets_in
 
     lines = [line.strip() for line in text.splitlines() if line.strip()]
@@ -216,8 +216,8 @@ def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
 
 def neighbours(text: str) -> str | None:
     """Check that a text is a CSV table of neighbours without names of files, and return it; None for nothing."""
-    from mauvecl.host.files.text_table import text_table
     from mauvecl.host.neighbour_table import FILES
+    from mauvecl.host.tables.text_table import text_table
 
     if not text.strip():
         return None

@@ -102,7 +102,8 @@ class State:
 
     def _check_target(self) -> None:
         """Raise InputError if the sky depends on a target without a position."""
-        from mauvecl.host.sky.helioecliptic import offline, parse_position
+        from mauvecl.host.sky.helioecliptic import parse_position
+        from mauvecl.host.tables.times import offline
 
         if self.entered["sky"] == "target and time":
             with offline():
@@ -110,7 +111,8 @@ class State:
 
     def _check_time(self) -> None:
         """Raise InputError if the sky depends on an invalid time."""
-        from mauvecl.host.sky.helioecliptic import offline, parse_time
+        from mauvecl.host.sky.helioecliptic import parse_time
+        from mauvecl.host.tables.times import offline
 
         if self.entered["sky"] == "target and time":
             with offline():

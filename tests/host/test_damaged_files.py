@@ -12,7 +12,8 @@ from astropy.io import fits
 from astropy.table import Table
 from refusals import refused
 
-from mauvecl.host.files.parsing import parsing, part_to_name
+from mauvecl.host.files.parsing import parsing
+from mauvecl.host.spectra.column_choice import as_typed
 from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.observations.frames import Reason
 from mauvecl.observations.mapping import FrameMapping
@@ -76,16 +77,14 @@ def test_messages_hold_no_text_of_another_library(error: Exception, said: str) -
 
 
 @pytest.mark.parametrize(
-    ("names", "said"),
+    ("name", "said"),
     [
-        (["a, b", "c"], "one: name it as in FILE[c]"),
-        (["a[1]", '"q"', " ", "x" * 41], "another"),
-        (["a", "a", "b"], "one: name it as in FILE[b]"),
-        (["two words"], "one: name it as in FILE[two words]"),
+        ("a, b", "FILE[row 2]"), ("a[1]", "FILE[row 2]"), ('"q"', "FILE[row 2]"), (" ", "FILE[row 2]"),
+        ("x" * 41, "FILE[row 2]"), ("two words", "FILE[two words]"), ("twice", "FILE[row 2]"),
     ],
-)
-def test_suggested_part_can_be_typed(names: list[str], said: str) -> None:
-    assert part_to_name(names, "another") == said
+)  # fmt: skip
+def test_suggested_part_can_be_typed(name: str, said: str) -> None:
+    assert as_typed(name, "row", 1, ["twice", "twice", "two words"]) == said
 
 
 def rows_named(names: list[str]) -> Any:

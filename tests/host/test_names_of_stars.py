@@ -6,11 +6,12 @@ import pytest
 from refusals import refused
 
 from mauvecl.host.orbit.targets import Target
-from mauvecl.host.sky.helioecliptic import offline, parse_position
+from mauvecl.host.sky.helioecliptic import parse_position
 from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.host.stars import catalogue, well_known
 from mauvecl.host.stars.source import Source
 from mauvecl.host.stars.star_names import all_names, near_names, resolve, spectrum_name
+from mauvecl.host.tables.times import offline
 
 
 @pytest.mark.parametrize(

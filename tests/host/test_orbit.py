@@ -12,7 +12,7 @@ from mauvecl.host.orbit.earth import direction
 from mauvecl.host.orbit.elements import Elements
 from mauvecl.host.orbit.orbit import MEAN_FROM_D, Orbit, Track
 from mauvecl.host.orbit.time_grid import TimeGrid, utc_text
-from mauvecl.host.sky.helioecliptic import offline
+from mauvecl.host.tables.times import offline
 from mauvecl.schema.errors import InputError
 
 VECTORS = Path(sgp4.__file__).parent

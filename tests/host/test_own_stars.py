@@ -94,6 +94,22 @@ def test_invalid_star_names_raise(tmp_path: Path) -> None:
         add(file, "a b") and add(file, "a_b")
 
 
+def test_names_in_other_letters_are_kept_side_by_side(tmp_path: Path) -> None:
+    """Names of files have no Greek letters: those of two stars were the same, and the wrong one was removed."""
+    for k, name in enumerate(("β Pic", "γ Pic", "_ Pic x"), 1):
+        add(text_file(tmp_path / f"{k}.txt", float(k)), name)
+    assert sorted(star.name for star in own_stars.kept()) == ["_ Pic x", "β Pic", "γ Pic"]
+    fluxes = [Source.from_library(name).flux_flam[100] for name in ("β Pic", "γ Pic")]
+    assert fluxes[1] == pytest.approx(2 * fluxes[0])
+    own_stars.remove("γ Pic")
+    assert sorted(star.name for star in own_stars.kept()) == ["_ Pic x", "β Pic"]
+    add(text_file(tmp_path / "2.txt", 2.0), "γ Pic")
+    own_stars.remove("β Pic")
+    assert sorted(star.name for star in own_stars.kept()) == ["_ Pic x", "γ Pic"]
+    with refused("name", "β Pic"):
+        own_stars.remove("β Pic")
+
+
 def test_changed_file_raises(tmp_path: Path) -> None:
     kept = add(text_file(tmp_path / "mine.txt"), "mine")
     text = kept.path.read_text()

@@ -21,8 +21,9 @@ from mauvecl.host.orbit.season import elongation_deg, zodiacal_light
 from mauvecl.host.orbit.targets import Target
 from mauvecl.host.orbit.time_grid import TimeGrid
 from mauvecl.host.orbit.visibility import Visibility
-from mauvecl.host.sky.helioecliptic import helioecliptic, offline
+from mauvecl.host.sky.helioecliptic import helioecliptic
 from mauvecl.host.sky.zodiacal import zodiacal_brightness
+from mauvecl.host.tables.times import offline
 
 AXIS_KM = 6879.0
 

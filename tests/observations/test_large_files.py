@@ -118,8 +118,8 @@ def test_pieces_give_what_the_whole_gives(tmp_path: Path, monkeypatch: pytest.Mo
     flux[:, 4], flux[11, 5] = np.nan, np.nan
     path, mapping = LAYOUTS["FITS table, row per frame"](Truth(**(vars(truth) | {"flux": flux})), tmp_path)
     whole = read_frames(path, mapping)
-    monkeypatch.setattr("mauvecl.observations.values.PIECE_BYTES", 8 * 50 * 400)
-    monkeypatch.setattr("mauvecl.observations.fits_frames.PIECE_BYTES", 0)
+    monkeypatch.setattr("mauvecl.host.tables.table.PIECE_BYTES", 8 * 50 * 400)
+    monkeypatch.setattr("mauvecl.host.tables.fits_tables.PIECE_BYTES", 0)
     monkeypatch.setenv("MAUVECL_LARGEST_CONTENT_MIB", "1")
     pieces = read_frames(path, mapping)
     assert pieces.error is not None
@@ -197,6 +197,8 @@ TABLES = {
     "long row": ["time,flux,error", *CELLS[:-5], "55,1000,5,6", *CELLS[-4:]],
     "decimal commas": ["time;flux;error", *(f"{k},5;1000,0;5" for k in range(60))],
     "no rows": ["time,flux,error"],
+    "separators at the end": ["time,flux,error", *(f"{line}," for line in CELLS)],
+    "an empty last column": ["time,flux,error,note", *(f"{line}," for line in CELLS)],
 }
 REFUSED = {"text among numbers": "in row 56", "short row": "2 cells in row 56", "long row": "4 cells in row 56",
            "decimal commas": "'0,5' in row 1", "no rows": "has no rows"}  # fmt: skip
@@ -208,8 +210,8 @@ def test_tables_in_pieces_are_those_read_whole(name: str, tmp_path: Path, monkey
     path.write_text("\n".join(TABLES[name]) + "\n")
     mapping = FrameMapping(time="time", time_unit=None if name == "dates" else "s", flux="flux", error="error")
     for large, piece in ((2**40, 2**20), (0, 200)):
-        monkeypatch.setattr("mauvecl.observations.reading.LARGE", large)
-        monkeypatch.setattr("mauvecl.observations.large_tables.PIECE", piece)
+        monkeypatch.setattr("mauvecl.host.tables.opening.LARGE", large)
+        monkeypatch.setattr("mauvecl.host.tables.large_tables.PIECE", piece)
         if name in REFUSED:
             with pytest.raises(InputError, match=REFUSED[name]):
                 read_frames(path, mapping)

@@ -204,7 +204,7 @@ TEXTS: dict[str, tuple[Callable[[str], bytes], Columns, Expected]] = {
                          kept(reasons={9: Reason.NOT_FINITE})),
     "exponents of Fortran": (lambda text: text.replace(f",{FLUX[9]},", f",{FLUX[9] / 1000:.6f}D3,", 1).encode(), {},
                              kept()),
-    "a web page": (lambda _: b"<html><body>404</body></html>", {}, "column"),
+    "a web page": (lambda _: b"<html><body>404</body></html>", {}, "file"),
     "random bytes": (lambda _: np.random.default_rng(1).bytes(5000), {}, "file"),
     "gzip cut short": (lambda text: gzip.compress(text.encode())[:-200], {}, "file"),
     "bzip2": (lambda text: bz2.compress(text.encode()), {}, kept()),

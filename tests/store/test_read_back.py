@@ -55,7 +55,7 @@ def test_stores_are_reduced_in_pieces(
     path = f"{_written(tmp_path, study(40, **SINGLE), engine, ending)}[star-1/flare-1]"
     light, error = read_frames(path).white_light
     # Seven frames at once, which divide realisations of two frames.
-    monkeypatch.setattr("mauvecl.observations.values.PIECE_BYTES", 7 * 8 * 197)
+    monkeypatch.setattr("mauvecl.host.tables.table.PIECE_BYTES", 7 * 8 * 197)
     (curve,) = reduce_frames(path).light_curves
     np.testing.assert_allclose(curve.flux, light, rtol=1e-12)
     assert curve.error is not None

@@ -131,7 +131,7 @@ def test_two_temperatures_of_a_photosphere_raise() -> None:
 @pytest.mark.parametrize(
     ("text", "key"),
     [
-        ("name,colour\na,red\n", "colour"),
+        ("name,ra,dec\nnew,nan,nan\n", "ra"),
         ("nom\na\n", "name"),
         ("name\n", "name"),
         ("name,ra\neps Eri,10\n", "coordinates"),

@@ -35,6 +35,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.messages import Message, of_kind
 from mauvecl.schema.physical import DAY_S
 from mauvecl.schema.tables import Column, View, number, percent, table_of
+from mauvecl.schema.text import printable
 from mauvecl.study.cases import Case
 from mauvecl.study.messages import SATURATED, collect_messages
 from mauvecl.study.study import Study
@@ -292,6 +293,9 @@ class PlanAnswer(Answer):
             lines.append(Message(text, "false alarms"))
         if study.plan.along_orbit and study.processes.particle_processes:
             lines.append("The rate of particles in [processes] is not used: it follows the orbit (plan.along_orbit).")
+        unused = dict.fromkeys(name for one in study.plan.targets for name in one.unused)
+        if unused:
+            lines.append(f"Columns of the table of targets that are not used: {printable(', '.join(unused), 300)}.")
         lines += self.seen.messages
         return list(dict.fromkeys(lines))
 

@@ -278,6 +278,9 @@ FRAMES = (
     Column("error", "level.error", "", "standard deviation of a quiescent frame"),
     Column("reason", lambda one: np.array([Reason.words(int(value)) for value in one.level.reasons]), "",
            "why the frame is not searched; empty if it is"),
+    Column("quality", lambda one: np.zeros(one.frames.n_frames, np.int64) if one.frames.quality is None
+           else one.frames.quality, "", "quality flag of the file"),
+    Column("excluded_by", lambda one: np.array(one.frames.flags), "", "bits of the flag that exclude the frame"),
     Column("rays", lambda one: np.zeros(one.frames.n_frames, np.int64) if one.spectra is None
            else one.spectra.cleaned.rays, "", "single values that a fit to the other pixels replaces, such as those of "
            "cosmic rays"),
@@ -528,7 +531,8 @@ def analyse(
     if frames is None:
         if study.data.file is None:
             raise InputError("no observed frames are given", "data.file, or frames", key="data.file")
-        frames = read_frames(study.data.file, study.data.mapping)
+        frames = read_frames(study.data.file, study.data.mapping, quality_bits=study.data.quality_bits,
+                             ignore_checksum=study.data.ignore_checksum)  # fmt: skip
     if study.data.barycentric is not None:
         frames = barycentric(frames, Target.of(study.data.barycentric), _orbit(study, frames))
     search = study.search

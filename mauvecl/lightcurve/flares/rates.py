@@ -14,8 +14,9 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.host.files.text_table import read_text_table
 from mauvecl.host.stars.flare_spectra import Blackbody, FlareSpectrum
+from mauvecl.host.tables.opening import read_table
+from mauvecl.host.tables.rows import Rows
 from mauvecl.lightcurve.flares.energies import flux_in_band
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -187,23 +188,17 @@ class RateTable(Rates):
 
     @classmethod
     def read(cls, path: str | Path, band: str = "Kepler") -> Self:
-        """Read CSV or ECSV with the columns ``energy`` (erg) and ``rate`` (flares per day with at least the energy)."""
+        """Read a table with the columns ``energy`` (erg) and ``rate`` (flares per day with at least the energy)."""
         path = Path(path)
-        table = read_text_table(path, "table of rates")
-        missing = next((name for name in ("energy", "rate") if name not in table.colnames), None)
-        if missing is not None:
-            raise InputError(
-                f"table of rates {shortened(path.name)} has no column {missing!r}",
-                "energy and rate",
-                key="columns",
-                value=missing,
-            )
+        rows = Rows(read_table(path, "table of rates"), f"table of rates {shortened(path.name)}")
         columns = []
-        for name in ("energy", "rate"):
-            values = np.ma.filled(np.ma.asarray(table[name]), np.nan)
-            if values.dtype.kind not in "iuf":
-                raise InputError.of(name, "text", "plain numbers", where=f"table of rates {shortened(path.name)}")
-            columns.append(np.asarray(values, np.float64))
+        for name, unit in (("energy", "erg"), ("rate", "1 / d")):
+            held = rows.first((name,))
+            if held is None:
+                fault = f"{rows.named} has no column {name!r}"
+                raise InputError(fault, "energy and rate", key="columns", value=name)
+            values = [rows.number(held, row, unit) for row in range(rows.n)]
+            columns.append(np.array([np.nan if value is None else value for value in values]))
         energy, rate = columns
         rates = cls(energy_erg=energy, per_day=rate, band=band, source=path.name)
         return replace(rates, measured_erg=(float(energy[0]), float(energy[-1])))

@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-import io
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.host.files.parsing import parsing
-from mauvecl.host.spectra.air import vacuum_from_air
-from mauvecl.host.spectra.fits_files import BLOCK, check_extensions, check_sizes, text_at
-from mauvecl.host.spectra.fits_images import axis_of
-from mauvecl.observations.values import PIECE_BYTES, FrameFile, Values
 from mauvecl.schema.errors import InputError
+
+from .fits import BLOCK, column_values, reading, text_at
+from .fits_images import axis_of
+from .names import matched
+from .table import PIECE_BYTES, TableFile, Values
 
 if TYPE_CHECKING:
     from astropy.io import fits
 
-EXPECTED = "a whole FITS file"
 #: Scales that astropy writes for a column of times (TCTYPn), which then holds two parts of a Julian date.
 SCALES = ("UTC", "TAI", "TT", "TDB", "TCG", "TCB", "UT1")
 
 
-class FitsFile(FrameFile):
+class FitsTables(TableFile):
     """An open FITS file.
 
     Parameters
@@ -67,12 +62,16 @@ class FitsFile(FrameFile):
                                 "TREFPOS": header.get(f"TRPOS{k}", header.get("TREFPOS", ""))}  # fmt: skip
 
     @property
+    def columns(self) -> list[str]:
+        """Names of the columns of the chosen table."""
+        return [] if self.chosen is None else [str(name) for name in self.hdus[self.chosen].columns.names]
+
+    @property
     def names(self) -> list[str]:
         """Names of the columns of the chosen table, of images, and of the columns of other tables."""
-        chosen = [] if self.chosen is None else [str(name) for name in self.hdus[self.chosen].columns.names]
         others = [f"{self._label(k)}/{name}" for k in self.tables if k != self.chosen
                   for name in self.hdus[k].columns.names]  # fmt: skip
-        return [*chosen, *(self._label(k) for k in self.images), *others]
+        return [*self.columns, *(self._label(k) for k in self.images), *others]
 
     def named(self, name: str) -> Values | None:
         """Return a column of the chosen table, an image, ``EXTENSION/COLUMN``, or a column of one other table."""
@@ -109,12 +108,9 @@ class FitsFile(FrameFile):
             values, unit, kind, _ = axis_of(header, self.hdus[0].header, n)
         except InputError as error:
             raise error.within(self.what) from error
-        axis = Values.of("the header", values, unit, self.what)
-        if kind != "AWAV":
-            return axis
-        from mauvecl.observations.values import converted
-
-        return converted(axis, None, "nm", "wavelength_unit").mapped(vacuum_from_air, "nm")
+        # The name says the medium.
+        name = {"AWAV": "air wavelength", "WAVE": "vacuum wavelength"}.get(kind, "wavelength")
+        return Values.of(name, values, unit, self.what)
 
     def _tabulated(self, header: Any) -> Values:
         """Return an axis that refers to the column of a table (-TAB, FITS standard 4.0, section 8.3)."""
@@ -139,34 +135,30 @@ class FitsFile(FrameFile):
         shape = tuple(hdu.shape)
 
         def read(start: int, stop: int) -> Any:
-            with _reading(self.what):
+            with reading(self.what):
                 return hdu.section[start:stop]
 
         return Values(self._label(number), shape, read, text_at(hdu.header, "BUNIT"), self.what)
 
     def _column(self, number: int, name: str) -> Values | None:
         hdu = self.hdus[number]
-        found = next((c for c in hdu.columns if str(c.name).lower() == name.lower()), None)
-        if found is None:
+        title = matched(name, map(str, hdu.columns.names), self.what)
+        if title is None:
             return None
+        found = hdu.columns[title]
         n_rows = int(hdu.header["NAXIS2"])
         small = int(hdu.header["NAXIS1"]) * n_rows + int(hdu.header.get("PCOUNT", 0)) <= PIECE_BYTES
         if not small and int(hdu.header.get("PCOUNT", 0)):
             raise InputError(f"{self.what}: the table {self._label(number)} has columns of variable length and more "
                              f"than {PIECE_BYTES >> 20} MiB", "columns of fixed length", key="hdu")  # fmt: skip
         pair = str(self.header.get(f"TCTYP{hdu.columns.names.index(found.name) + 1}", "")).upper() in SCALES
-        missing = found.null
-        bits = str(found.format).endswith("X")
 
         def read(start: int, stop: int) -> Any:
-            with _reading(self.what):
-                values = (hdu.data[start:stop] if small else _piece(hdu, start, stop)).field(found.name)
-            if bits:
-                # Flags: a number that is zero if no bit is set.
-                return np.count_nonzero(values.reshape(len(values), -1), axis=1)
+            with reading(self.what):
+                values = column_values(hdu.data[start:stop] if small else _piece(hdu, start, stop), found)
             if pair and values.ndim == 2 and number == self.chosen:
                 return (values[:, 0] - 2_400_000.5) + values[:, 1]
-            return np.ma.masked_equal(values, missing) if isinstance(missing, int) else values
+            return values
 
         one = np.shape(read(0, min(1, n_rows)))
         width = 0 if small else 2 * int(hdu.header["NAXIS1"])
@@ -185,46 +177,3 @@ def _piece(hdu: Any, start: int, stop: int) -> Any:
     for key in ("CHECKSUM", "DATASUM"):
         header.remove(key, ignore_missing=True)
     return fits.BinTableHDU.fromstring(header.tostring().encode() + raw + b"\0" * (-len(raw) % BLOCK)).data
-
-
-@contextmanager
-def _reading(what: str) -> Iterator[None]:
-    with parsing(what, EXPECTED), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
-
-
-@contextmanager
-def open_fits(file: IO[bytes], what: str) -> Iterator[fits.HDUList]:
-    """Open a FITS file after a check of its sizes; its data are read on access."""
-    from astropy.io import fits
-
-    try:
-        check_sizes(_Content(file))
-    except InputError as error:
-        raise error.within(what) from error
-    file.seek(0)
-    with _reading(what):
-        hdus = fits.open(file, mode="readonly", memmap=False, lazy_load_hdus=False)
-    with hdus:
-        try:
-            with parsing("it", EXPECTED):
-                check_extensions(hdus)
-        except InputError as error:
-            raise error.within(what) from error
-        yield hdus
-
-
-class _Content:
-    """Bytes of a file that are read on access."""
-
-    def __init__(self, file: IO[bytes]) -> None:
-        self.file = file
-        self.size = file.seek(0, io.SEEK_END)
-
-    def __len__(self) -> int:
-        return self.size
-
-    def __getitem__(self, part: slice) -> bytes:
-        self.file.seek(part.start)
-        return self.file.read(part.stop - part.start)

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
-from .parsing import as_text, parsing
-from .size_limits import LONGEST_LINE, limit_bytes, read_bytes, unpacked
+from ..files.parsing import as_text, parsing
+from ..files.size_limits import LONGEST_LINE, limit_bytes, read_bytes, unpacked
 
 if TYPE_CHECKING:
     import numpy as np
@@ -44,12 +44,16 @@ def parse_ecsv(text: str, what: str, expected: str = "an ECSV table") -> Table:
     expected : str
         Expected content, for messages.
     """
-    # The import is slow and only needed here.
+    # These imports are slow and only needed here.
     from astropy.table import Table
+
+    from .times import with_mission_formats
 
     lines = text.splitlines()
     check_header(lines, what)
     check_cells([line for line in lines if not line.startswith("#")], what)
+    # Those of lightkurve have times in the days of the missions.
+    with_mission_formats()
     with parsing(what, expected), warnings.catch_warnings():
         # astropy warns of many headers that it can read.
         warnings.simplefilter("ignore")

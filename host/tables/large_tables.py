@@ -11,12 +11,13 @@ from typing import IO, Any
 
 import numpy as np
 
-from mauvecl.host.files.ecsv import MOST_HEADER
-from mauvecl.host.files.size_limits import lines_in
-from mauvecl.host.files.text_table import text_table
-from mauvecl.observations.folder_frames import keywords_of
-from mauvecl.observations.values import FrameFile, TableFile, Values
 from mauvecl.schema.errors import InputError
+
+from ..files.size_limits import lines_in
+from .ecsv import MOST_HEADER
+from .names import matched
+from .table import MemoryTable, TableFile, Values
+from .text_table import keywords_of, text_table
 
 #: Size of a text from which it is read in pieces, and of a piece, bytes.
 LARGE, PIECE = 16 * 2**20, 2**20
@@ -24,22 +25,22 @@ LARGE, PIECE = 16 * 2**20, 2**20
 CELL = 40
 
 
-class LargeTable(FrameFile):
+class LargeTable(TableFile):
     """Rows of a text table in a temporary file, which disappears with this object."""
 
     def __init__(self, pieces: Iterator[Any], what: str) -> None:
-        first = TableFile(next(pieces), what)
+        first = MemoryTable(next(pieces), what)
         # One row has the names and units.
-        self.table, self.n_rows = TableFile(first.table[:1], what), 0
+        self.table, self.n_rows = MemoryTable(first.table[:1], what), 0
         super().__init__(what, first.header)
         self.row = np.dtype([(name, "f8" if _numbers(first.find(name)) else f"U{CELL}") for name in first.names])
         self.file = tempfile.TemporaryFile()  # noqa: SIM115
         self._keep(first)
         del first
         for piece in pieces:
-            self._keep(TableFile(piece, what))
+            self._keep(MemoryTable(piece, what))
 
-    def _keep(self, piece: TableFile) -> None:
+    def _keep(self, piece: MemoryTable) -> None:
         n, first = len(piece.table), self.n_rows
         rows = np.zeros(n, self.row)
         for name in self.names:
@@ -69,7 +70,7 @@ class LargeTable(FrameFile):
 
     def named(self, name: str) -> Values | None:
         """Return a column."""
-        found = next((one for one in self.names if one.lower() == name.lower()), None)
+        found = matched(name, self.names, self.what)
         if found is None:
             return None
         return Values(name, (self.n_rows,), lambda start, stop: self._rows(start, stop)[found],

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
-from .parsing import parsing, read_text
+from ..files.parsing import parsing, read_text
 
 
 def read_columns(what: str, kind: str, path: Path) -> NDArray[np.float64]:

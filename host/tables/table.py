@@ -12,10 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.files.units import unit_of
-from mauvecl.host.spectra.text import number_in
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
+
+from .names import divided_unit, matched
+from .text_table import number_in
+from .times import time_unit
+from .units import unit_of
 
 Float = NDArray[np.float64]
 
@@ -55,22 +58,22 @@ class Values:
         step = self.piece_rows
         return [slice(k, min(k + step, self.n_rows)) for k in range(0, self.n_rows, step)]
 
-    def rows(self, start: int, stop: int) -> Float:
-        """Return rows as numbers; NaN where they are missing."""
+    def rows(self, start: int, stop: int, expected: str = "a number") -> Float:
+        """Return rows as numbers; NaN where they are missing. `expected` says what a cell may be, for messages."""
         values: Any = np.ma.asarray(self.read(start, stop))
         if values.dtype.kind == "O":
             values = self._stacked(values)
         if values.dtype.kind in "US":
-            return self._parsed(values, start)
+            return self._parsed(values, start, expected)
         if values.dtype.kind not in "iufb":
             raise InputError(f"{self.what}: {self.name!r} holds no numbers", "numbers", key=self.name)
         return np.asarray(np.ma.filled(values.astype(np.float64), np.nan))
 
-    def numbers(self) -> Float:
-        """Return all rows as numbers, read in pieces."""
+    def numbers(self, expected: str = "a number") -> Float:
+        """Return all rows as numbers, read in pieces; see `rows`."""
         found = np.empty(self.shape)
         for part in self.pieces:
-            found[part] = self.rows(part.start, part.stop)
+            found[part] = self.rows(part.start, part.stop, expected)
         return found
 
     def texts(self) -> list[str] | None:
@@ -102,7 +105,7 @@ class Values:
             raise InputError(f"{self.what}: the rows of {self.name!r} differ in length", "one length", key=self.name)
         return np.ma.asarray(np.stack([np.asarray(one) for one in values]) if len(values) else values.astype(float))
 
-    def _parsed(self, values: Any, start: int) -> Float:
+    def _parsed(self, values: Any, start: int, expected: str) -> Float:
         """Return texts as numbers; raises InputError that names the first text that is not a number."""
         texts = [_plain(one) for one in np.ma.filled(values, "").ravel().tolist()]
         parsed = np.empty(len(texts))
@@ -112,7 +115,7 @@ class Values:
             except ValueError as error:
                 row = start + place // max(1, int(np.prod(values.shape[1:]))) + 1
                 raise InputError(
-                    f"{self.what}: {self.name!r} = {shortened(text, 40)} in row {row}", "a number", key=self.name,
+                    f"{self.what}: {self.name!r} = {shortened(text, 40)} in row {row}", expected, key=self.name,
                     value=text,
                 ) from error  # fmt: skip
         return parsed.reshape(values.shape)
@@ -143,7 +146,7 @@ def converted(values: Values, given: str | None, unit: str, key: str) -> Values:
     """
     import astropy.units as u
 
-    stated = given or values.unit
+    stated = given or values.unit or unit_in_name(values.name)
     if not stated:
         expected = f"a mapping with {key}, such as {unit}"
         raise InputError(f"{values.what}: the unit of {values.name!r} is not stated", expected, key=key)
@@ -160,9 +163,9 @@ def unit_in(text: str) -> Any:
     """Return the unit in a text, as astropy and archives spell it."""
     import astropy.units as u
 
-    if text.upper().startswith("BJD"):
-        # TESS and Kepler write "BJD - 2457000, days"; the epoch is in the header.
-        return u.d
+    said = time_unit(text)
+    if said is not None and said.epoch_mjd is None:
+        return u.Unit(said.unit)
     spelt = {"degc": "deg_C", "c": "deg_C", "celsius": "deg_C", "deg c": "deg_C", "°c": "deg_C"}
     try:
         return u.Unit(spelt.get(text.strip().lower(), text))
@@ -170,7 +173,16 @@ def unit_in(text: str) -> Any:
         return unit_of(text)
 
 
-class FrameFile(ABC):
+def unit_in_name(name: str) -> str:
+    """Return the unit in brackets at the end of a column's name; empty if there is none."""
+    text = divided_unit(name)[1]
+    try:
+        return text if text and unit_in(text) is not None else ""
+    except (ValueError, TypeError):
+        return ""
+
+
+class TableFile(ABC):
     """A file with frames: its named values, and the keywords of its header."""
 
     def __init__(self, what: str, header: dict[str, Any]) -> None:
@@ -180,6 +192,22 @@ class FrameFile(ABC):
     @abstractmethod
     def names(self) -> list[str]:
         """Names of everything that has values."""
+
+    @property
+    def columns(self) -> list[str]:
+        """Names of the columns of its table."""
+        return self.names
+
+    def loaded(self) -> Any:
+        """Return the columns as a table of astropy, masked where they are undefined."""
+        from astropy.table import MaskedColumn, Table
+
+        columns = []
+        for name in self.columns:
+            values = self.find(name)
+            cells = np.ma.array(values.read(0, values.n_rows), copy=True)
+            columns.append(MaskedColumn(cells, name, unit=values.unit or None))
+        return Table(columns, meta=self.header)
 
     @abstractmethod
     def named(self, name: str) -> Values | None:
@@ -225,8 +253,8 @@ class FrameFile(ABC):
         raise InputError(f"{self.what} has no coordinates of images", "a FITS image", key="wavelength", value="wcs")
 
 
-class TableFile(FrameFile):
-    """A table in memory: CSV, ECSV, text."""
+class MemoryTable(TableFile):
+    """A table in memory: CSV, ECSV, VOTable, text."""
 
     def __init__(self, table: Any, what: str) -> None:
         from astropy.time import Time
@@ -234,7 +262,6 @@ class TableFile(FrameFile):
         meta = table.meta if isinstance(table.meta, dict) else {}
         super().__init__(what, {str(key): value for key, value in meta.items()})
         self.table = table
-        self.lower = {str(name).lower(): str(name) for name in table.colnames}
         for name in table.colnames:
             if isinstance(table[name], Time):
                 # A column of dates with their scale.
@@ -249,9 +276,10 @@ class TableFile(FrameFile):
         """Return a column."""
         from astropy.time import Time
 
-        if name.lower() not in self.lower:
+        title = matched(name, self.names, self.what)
+        if title is None:
             return None
-        column = self.table[self.lower[name.lower()]]
+        column = self.table[title]
         if isinstance(column, Time):
             return Values.of(name, np.asarray(np.ma.filled(column.mjd, np.nan)), "d", self.what)
         return Values.of(name, getattr(column, "value", column), getattr(column, "unit", None), self.what)

@@ -39,9 +39,21 @@ def paired_images(hdus: Any) -> list[tuple[str, Any, Any]]:
     return pairs
 
 
-def rows_of(hdu: Any, telescope: str) -> tuple[Any, tuple[str, ...], tuple[str, ...]]:
+def is_survey_image(hdu: Any, telescope: str) -> bool:
+    """Return whether an image holds one spectrum with its errors and masks, as files of LAMOST and SDSS-I/II do.
+
+    https://dr5.lamost.org/v3/doc/data-production-description and https://classic.sdss.org/dr7/dm/flatFiles/spSpec.html:
+    the first row is the flux; the others are its inverse variance or error, wavelengths and masks.
+    """
+    header = hdu.header
+    known = re.match(r"LAMOST|SDSS", telescope, re.IGNORECASE) and "COEFF0" in header
+    return bool(known and header.get("NAXIS", 0) == 2 and header.get("NAXIS2", 0) <= MAX_PLANES)
+
+
+def rows_of(hdu: Any, telescope: str, asked: bool) -> tuple[Any, tuple[str, ...], tuple[str, ...]]:
     """Return the fluxes of an image, the names of its rows if it has several, and a note.
 
+    Of IRAF's bands (`apall`: spectrum, raw, background, sigma) the first is the flux, unless the user asks for a part.
     Raises InputError for an image of more dimensions than rows and wavelengths.
     """
     header = hdu.header
@@ -56,10 +68,11 @@ def rows_of(hdu: Any, telescope: str) -> tuple[Any, tuple[str, ...], tuple[str, 
     flux = np.asanyarray(hdu.data).reshape(-1, shape[0])
     if len(flux) == 1:
         return flux[0], (), ()
-    if len(flux) <= MAX_PLANES and re.match(r"LAMOST|SDSS", telescope, re.IGNORECASE) and "COEFF0" in header:
-        # https://dr5.lamost.org/v3/doc/data-production-description and https://classic.sdss.org/dr7/dm/flatFiles/spSpec.html:
-        # the first row is the flux; the others are its inverse variance or error, wavelengths and masks.
+    if is_survey_image(hdu, telescope):
         return flux[0], (), (f"the first of {len(flux)} rows is its flux",)
+    bands = shape[2] if len(shape) > 2 else shape[1]
+    if not asked and str(header.get("BANDID1", "")).strip().lower().startswith("spectrum") and len(flux) == bands:
+        return flux[0], (), (f"the first of {bands} bands (BANDID1) is its flux",)
     return flux, tuple(str(header.get(f"BANDID{k + 1}", "")).strip() for k in range(len(flux))), ()
 
 

@@ -1,0 +1,1 @@
+"""Tables of users in any form: one place for units, names, times, coordinates, checksums and missing values."""

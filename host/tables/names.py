@@ -1,0 +1,83 @@
+"""Names of columns: an exact match wins, otherwise case, blanks and underscores do not matter."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
+
+#: Names of columns of stars: of the Gaia archive, SIMBAD, astroquery, VizieR, MAST and CDS X-Match, and plain ones.
+STARS = ("name", "designation", "source_id", "source", "main_id", "id", "dr3name", "target", "target_name", "targname",
+         "object", "star", "tic", "tic_id", "kic", "kepid", "epic", "hip")  # fmt: skip
+RIGHT_ASCENSIONS = ("ra", "ra_deg", "ra_icrs", "_raj2000", "raj2000", "ra_j2000", "_ra_icrs", "_ra", "s_ra", "ra_hours",
+                    "ra_h", "ra_rad", "right_ascension", "alpha_j2000")  # fmt: skip
+DECLINATIONS = ("dec", "dec_deg", "de_icrs", "_dej2000", "dej2000", "dec_j2000", "_de_icrs", "dec_icrs", "_de", "s_dec",
+                "de", "dec_rad", "declination", "delta_j2000")  # fmt: skip
+SPECTRAL_TYPES = ("spectral_type", "sptype", "sp_type", "spt", "spectype", "st_spectype")
+_UNIT = re.compile(r"(?s)(.*\S)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*")
+#: Columns of magnitudes: ``mag``, ``Vmag``, ``mag_err``, ``INST_MAG1``, ``delta magnitude``.
+_MAGNITUDE = re.compile(r"(?:^|[^a-z])[a-z]{0,5}(?:mag|mags|magnitude|magnitudes)(?:$|[^a-z])")
+
+
+def divided_unit(name: str) -> tuple[str, str]:
+    """Divide ``flux (ct/s)`` or ``time [d]`` into name and unit, which is empty if there is none."""
+    match = _UNIT.fullmatch(name.strip())
+    return (name.strip(), "") if match is None else (match[1], (match[2] or match[3] or "").strip())
+
+
+def key_of(name: str) -> str:
+    """Normalise a name: lower case, one underscore for blanks and underscores, no quotes."""
+    return re.sub(r"[\s_]+", "_", name.strip().strip("\"'").casefold())
+
+
+def matched(name: str, names: Iterable[str], what: str = "") -> str | None:
+    """Return the one of some names that is meant, or None.
+
+    Raises InputError if several differ in case only and none is exactly the name.
+    """
+    held = list(names)
+    if name in held:
+        return name
+    fitting = [one for one in held if one.strip() == name.strip()] or [
+        one for one in held if one.strip().casefold() == name.strip().casefold()
+    ]
+    if len(fitting) > 1:
+        place = f"{what}: " if what else ""
+        raise InputError(
+            f"{place}{len(fitting)} columns are called {shortened(name)} but for case ({', '.join(fitting)})",
+            "the exact name of one", key="column", value=name,
+        )  # fmt: skip
+    return fitting[0] if fitting else None
+
+
+def first_of(wanted: Sequence[str], names: Iterable[str], what: str = "") -> str | None:
+    """Return the name that is the first of some wanted ones, in any spelling and with or without a unit in brackets.
+
+    Raises InputError if several fit the same wanted name.
+    """
+    held = list(names)
+    for one in wanted:
+        key = key_of(one)
+        fitting = (
+            [name for name in held if name == one]
+            or [name for name in held if key_of(name) == key]
+            or [name for name in held if key_of(divided_unit(name)[0]) == key]
+        )
+        if len(fitting) > 1:
+            place = f"{what}: " if what else ""
+            raise InputError(
+                f"{place}several columns may be {one}: {', '.join(map(shortened, fitting))}",
+                "one of them, or a mapping that names it", key=one, value=fitting,
+            )  # fmt: skip
+        if fitting:
+            return fitting[0]
+    return None
+
+
+def is_magnitude(name: str) -> bool:
+    """Return whether the name of a column is that of magnitudes."""
+    # Capitals divide words: VMag, instMag.
+    spaced = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
+    return any(_MAGNITUDE.search(one.lower()) is not None for one in (name, spaced))
