@@ -1,0 +1,201 @@
+"""Light curves of stars that rotate, of red noise, few counts and short windows: false alarms and energies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+
+from mauvecl.lightcurve.flares.shapes import SHAPES, Shape
+from mauvecl.observations.analysis import Analysis, analyse_frames
+from mauvecl.observations.events import ObservedEvent
+from mauvecl.observations.frames import Frames
+from mauvecl.observations.process import Covariance, Process, ProcessTerm, level_fit
+from mauvecl.observations.process_search import ProcessSearch
+from mauvecl.observations.reading import read_frames
+from mauvecl.observations.search import bank_of, stare_of
+
+Float = NDArray[np.float64]
+DAVENPORT = SHAPES["davenport2014"]
+CASES = Path(__file__).parent.parent / "data" / "cases"
+#: Rotation and correlated noise, in standard deviations of a frame.
+ROTATOR = Process(
+    (
+        ProcessTerm("rotation", tuple(np.log([20.0, 40_000.0, 10.0, 1.0, 0.3]))),
+        ProcessTerm("correlated", tuple(np.log([0.5, 1000.0]))),
+    ),
+    1.0,
+)
+
+
+def flare(time_s: Float, frame_s: float, peak_s: float, half_width_s: float, shape: Shape = DAVENPORT) -> Float:
+    edges = np.column_stack([time_s - frame_s / 2, time_s + frame_s / 2])
+    return shape.mean_over(edges, peak_s, half_width_s)
+
+
+def detected(analysis: Analysis) -> list[ObservedEvent]:
+    return [one for one in analysis.events if one.kind == "flare" and one.value >= analysis.threshold]
+
+
+def one_over_f(rng: np.random.Generator, n: int, rms: float) -> Float:
+    """Draw 1/f noise as a part of a series four times as long."""
+    frequency = np.fft.rfftfreq(4 * n)
+    amplitude = rng.standard_normal(frequency.size) + 1j * rng.standard_normal(frequency.size)
+    amplitude[0] = 0.0
+    amplitude[1:] /= np.sqrt(frequency[1:])
+    series = np.fft.irfft(amplitude)[:n]
+    return rms * series / series.std()
+
+
+def test_covariance_is_that_of_dense_matrices() -> None:
+    rng = np.random.default_rng(400)
+    time = np.sort(rng.uniform(0, 1e5, 200))
+    variance = rng.uniform(0.5, 2.0, 200)
+    dense = ROTATOR.at(time[:, None] - time) + np.diag(variance)
+    made: Covariance = ROTATOR.covariance(time, variance)
+    values = rng.standard_normal((200, 3))
+    np.testing.assert_allclose(dense @ made.solve(values), values, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(made.coloured(made.whitened(values)), values, rtol=1e-9, atol=1e-9)
+    assert made.log_determinant == pytest.approx(np.linalg.slogdet(dense)[1], rel=1e-10)
+    ones = np.linalg.solve(dense, np.ones(200))
+    fit = level_fit(made, values[:, 0])
+    assert fit.mean == pytest.approx(float(ones @ values[:, 0] / ones.sum()))
+    assert fit.mean_variance == pytest.approx(1 / float(ones.sum()))
+
+
+@pytest.mark.parametrize("n", [300, 2500])
+def test_statistics_have_unit_variance_over_gaps_and_changing_noise(n: int) -> None:
+    """Denominators against dense matrices at 40 random onsets of each template: exact near gaps, to 2 % elsewhere."""
+    rng = np.random.default_rng(401)
+    kept = rng.random(n) > 0.03
+    kept[n // 3 : n // 3 + 30] = False
+    time = np.flatnonzero(kept) * 120.0
+    frames = Frames.of(time, np.ones(time.size), exposure_s=120.0)
+    stare = stare_of(frames, np.ones(time.size, np.bool_))
+    variance = 1 + 0.05 * rng.standard_normal(time.size)
+    search = ProcessSearch(bank_of(stare, np.ones((1, 1)), DAVENPORT), stare, (ROTATOR,), variance)
+    dense = np.linalg.inv(ROTATOR.at(time[:, None] - time) + np.diag(variance))
+    ones = dense.sum(axis=1)
+    dense -= np.outer(ones, ones) / ones.sum()
+    for row in search.rows:
+        tried = np.flatnonzero(row.per_amplitude[0] > 0)
+        # The gap of 30 frames hides the peaks of short templates.
+        assert tried.size > row.peaks.size - 45
+        for onset in rng.choice(tried, min(40, tried.size), replace=False):
+            peak = search.peak_s(row, np.array([onset]))[0]
+            shape = flare(stare.middle_s, 120.0, peak, row.template.half_width_s)
+            assert row.per_amplitude[0, onset] == pytest.approx(np.sqrt(shape @ dense @ shape), rel=0.02)
+
+
+def test_flare_brighter_than_its_window_has_its_energy() -> None:
+    """264 frames of 5 s, of which 93 show the quiescent star: the interval of 95 % and the level, at one seed."""
+    rng = np.random.default_rng(402)
+    time = (np.arange(264) + 0.5) * 5.0
+    frames = Frames.of(time, 1e6 * (1 + 10 * flare(time, 5.0, 528.0, 60.0)) + 2500 * rng.standard_normal(264),
+                       np.full(264, 2500.0))  # fmt: skip
+    analysis = analyse_frames(frames)
+    (event,) = analysis.events
+    truth = 10 * 60 * DAVENPORT.equivalent_duration
+    assert event.energy.fitted_s == pytest.approx(truth, rel=2e-3)
+    assert event.energy.low_s[1] - 1.0 < truth < event.energy.high_s[1] + 1.0
+    inside = 10 * float(flare(time, 5.0, 528.0, 60.0).sum()) * 5.0
+    assert event.energy.summed_s == pytest.approx(inside, rel=2e-3)
+    assert np.median(analysis.level.level) == pytest.approx(1e6, rel=2e-3)
+
+
+def test_faint_star_with_a_great_flare_has_its_energy() -> None:
+    """340 frames of mean 30.4 and noise 5.5, amplitude 120: the error is that of the level, to which it is relative."""
+    rng = np.random.default_rng(403)
+    time = (np.arange(340) + 0.5) * 5.0
+    flux = 30.4 * (1 + 120 * flare(time, 5.0, 900.0, 90.0)) + 5.5 * rng.standard_normal(340)
+    (event,) = analyse_frames(Frames.of(time, flux, np.full(340, 5.5))).events
+    error = (event.energy.high_s[0] - event.energy.low_s[0]) / 2
+    assert abs(event.energy.fitted_s - 19_730) < 3 * error
+    assert 0.005 < error / event.energy.fitted_s < 0.03
+
+
+@pytest.mark.parametrize(("period_d", "cadence_s", "noise"), [(1.0, 120.0, 1e-4), (3.0, 1800.0, 1e-4)])
+def test_rotation_is_no_flare(period_d: float, cadence_s: float, noise: float) -> None:
+    """Sinusoids of 1 % at one false alarm a century: fails by chance once in 2000 times or less."""
+    rng = np.random.default_rng(404)
+    time = np.arange(2000) * cadence_s
+    flux = 1 + 0.01 * np.sin(2 * np.pi * time / (period_d * 86_400)) + noise * rng.standard_normal(time.size)
+    analysis = analyse_frames(Frames.of(time, flux, np.full(time.size, noise)), false_alarms=0.01, per="year")
+    assert not detected(analysis)
+    assert analysis.level.used.mean() > 0.95
+    assert float(np.median(analysis.level.error)) == pytest.approx(noise, rel=0.1)
+
+
+@pytest.mark.parametrize("name", ["fast-2min", "slow-30min"])
+def test_files_of_rotating_stars_have_no_flare(name: str) -> None:
+    analysis = analyse_frames(read_frames(CASES / "rotating-star" / f"{name}.fits"), false_alarms=0.01, per="year")
+    assert not detected(analysis)
+    assert analysis.level.used.mean() > 0.95
+
+
+def test_files_that_once_failed_have_an_answer() -> None:
+    folder = CASES / "analyse-fault"
+    assert analyse_frames(read_frames(folder / "flaring-rotator-1.fits")).events
+    (event, *_) = sorted(
+        analyse_frames(read_frames(folder / "rise-in-gap.fits", folder / "rise-in-gap.toml")).events,
+        key=lambda one: -one.value,
+    )
+    assert np.isfinite([event.energy.fitted_s, *event.energy.low_s, *event.energy.high_s]).all()
+
+
+@pytest.mark.long
+def test_red_noise_has_as_many_false_alarms_as_promised() -> None:
+    """White noise and 1/f of 0.5 sigma, 20 stares at 2 events a star-day; fails by chance once in a thousand times."""
+    rng = np.random.default_rng(405)
+    count, days = 0, 0.0
+    for _ in range(20):
+        time = np.arange(500) * 30.0
+        flux = 1000 + one_over_f(rng, 500, 0.5) + rng.standard_normal(500)
+        analysis = analyse_frames(Frames.of(time, flux, np.ones(500)), false_alarms=2.0, per="day")
+        count, days = count + len(detected(analysis)), days + analysis.days
+    assert count <= stats.poisson.ppf(0.999, 2.0 * days)
+
+
+@pytest.mark.long
+def test_few_counts_have_their_mean_and_pulls() -> None:
+    """Counts of mean 3.64 with a flare: level within 1 %, pulls of unit deviation; fails once in a thousand times."""
+    rng = np.random.default_rng(406)
+    pulls, levels, number = [], [], 30
+    for _ in range(number):
+        time = (np.arange(1500) + 0.5) * 5.0
+        peak = rng.uniform(2500, 5000)
+        light = 3.64 * (1 + 6 * flare(time, 5.0, peak, 40.0))
+        analysis = analyse_frames(Frames.of(time, rng.poisson(light).astype(np.float64)), per="day")
+        best = max(analysis.events, key=lambda one: one.value)
+        first, last = best.first, best.last
+        truth = 6 * float(flare(time, 5.0, peak, 40.0)[first : last + 1].sum()) * 5.0
+        pulls.append((best.energy.summed_s - truth) / best.energy.summed_error_s)
+        levels.append(float(np.median(analysis.level.level)))
+    assert np.mean(levels) == pytest.approx(3.64, rel=0.01)
+    low, high = np.sqrt(stats.chi2.ppf([0.0005, 0.9995], number - 1) / (number - 1))
+    assert low < np.std(pulls, ddof=1) < high
+
+
+@pytest.mark.long
+def test_recommended_energies_are_in_their_intervals() -> None:
+    """Flares of S/N 10 to 3000 of two shapes in windows of 2 to 15 half-widths; each range fails once in a thousand."""
+    rng = np.random.default_rng(407)
+    inside, number = np.zeros(2), 60
+    for k in range(number):
+        shape = list(SHAPES.values())[k % 2]
+        width = rng.uniform(30, 120)
+        time = (np.arange(int((rng.uniform(2, 15) + 5) * width / 5) + 40) + 0.5) * 5.0
+        peak = 200 + rng.uniform(0, 3) * width
+        light = flare(time, 5.0, peak, width, shape)
+        size = np.exp(rng.uniform(np.log(12), np.log(3000))) / np.sqrt(float(light @ light))
+        flux = 1e4 + size * light + rng.standard_normal(time.size)
+        analysis = analyse_frames(Frames.of(time, flux, np.ones(time.size)), per="day")
+        energy = max(analysis.events, key=lambda one: one.value).energy
+        truth = size / 1e4 * width * shape.equivalent_duration
+        inside += [low <= truth <= high for low, high in zip(energy.low_s, energy.high_s, strict=True)]
+    for count, share in zip(inside, (0.6827, 0.95), strict=True):
+        low, high = stats.binom.ppf([0.0005, 0.9995], number, share)
+        assert low <= count <= high, inside
