@@ -61,14 +61,17 @@ class MeasuredFlare(ExpectedMeasurement):
 
     def fitted_dn(self) -> tuple[Float, Float]:
         """Return the mean of the fitted flare in the first exposure, and the best values of unknowns, DN."""
-        mean = self.fitted.counts(np.exp(self.found.log_k[0]), self.found.amplitudes[0])
+        found = self.found
+        mean = self.fitted.counts(np.exp(found.log_k[0]), found.factor[0] * found.amplitudes[0])
         if self.unknown is None:
             return mean, np.zeros_like(mean)
-        variance, used = usable_variance(self.quiet, mean, self.skipped_nm)
-        spectra = self.unknown.spectra * used
+        unknown, expected = self.unknown.around(mean), self.unknown.mean_dn
+        variance, used = usable_variance(self.quiet, mean, self.skipped_nm, unknown)
+        spectra = unknown.spectra * used
         weighted = np.divide(spectra, variance, out=np.zeros_like(spectra), where=used)
-        information = np.diag(self.unknown.sd**-2.0) + weighted @ spectra.T
-        return mean, np.linalg.solve(information, weighted @ (self.frame - mean)) @ self.unknown.spectra
+        information = np.diag(unknown.sd**-2.0) + weighted @ spectra.T
+        left = self.frame - mean - expected
+        return mean, expected + np.linalg.solve(information, weighted @ left) @ unknown.spectra
 
     def rows(self) -> QTable:
         """Return one row per quantity."""
@@ -321,7 +324,7 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
     expected = expected_measurements(case, amplitude, flare)
     models, unknown = [one.fitted for one in expected], expected[0].unknown
     skipped = study.measure.skipped_nm
-    weights = matched_filter(quiet, flare, unknown, skipped_nm=skipped)[0]
+    weights = matched_filter(quiet, flare, case.unknowns(), skipped_nm=skipped)[0]
 
     def fitted(start: int, count: int) -> Arrays:
         raw = engine.realise(flare, start=start, count=count, seed=study.run.seed, **case.draw_options)

@@ -1,0 +1,113 @@
+"""Unknown factor on all light of an exposure, which dims a flare as it dims the star.
+
+A fit of weighted sums finds the flare as it is recorded. Quantities of the flare itself are those of the recorded one
+over the factor, so that their profile intervals at a given temperature are those of a ratio of two normal estimates
+(Fieller 1954, doi 10.1111/j.2517-6161.1954.tb00159.x).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LightFactor:
+    """Weighted sum of an exposure that estimates the factor on its light, and its means for the flares of a model.
+
+    Attributes
+    ----------
+    weights : ndarray, shape (n_pixel,)
+        Weights per DN; the sum has unit variance if the flare is known.
+    scale : float
+        Change of the sum for a change of the factor by one.
+    expected : float
+        Factor for which the mean of the sum is zero without a flare.
+    log_k, hot : ndarray, shape (n_node,)
+        Temperatures of the model, and mean sums for a blackbody of amplitude 1.
+    fixed : ndarray, shape (n_linear - 1,)
+        Mean sums of the other components for unit amplitude.
+    """
+
+    weights: Float
+    scale: float
+    expected: float
+    log_k: Float
+    hot: Float
+    fixed: Float
+
+    @cached_property
+    def spline(self) -> scipy.interpolate.CubicSpline:
+        """Mean sum of the blackbody over log temperature."""
+        return scipy.interpolate.CubicSpline(self.log_k, self.hot)
+
+    def with_second(self, log_k: float, end: int) -> Self:
+        """Return the factor next to a blackbody of a second temperature, as another component of fixed shape."""
+        fixed = np.concatenate([[float(self.spline(log_k))], self.fixed])
+        return replace(self, log_k=self.log_k[:end], hot=self.hot[:end], fixed=fixed)
+
+    def estimate(self, sums: Float, log_k: Float, linear: Float) -> Float:
+        """Return the best factor, (n, ...), for sums (n,), temperatures (n, ...) and amplitudes (n, ..., n_linear)."""
+        flare = linear[..., 0] * self.spline(log_k) + linear[..., 1:] @ self.fixed
+        own = sums.reshape(sums.shape + (1,) * (log_k.ndim - 1))
+        return np.asarray(self.expected + (own - flare) / self.scale)
+
+    def weights_of(self, log_k: Float) -> Float:
+        """Return the decrease of the best factor per unit of each amplitude, shape (..., n_linear)."""
+        hot = self.spline(log_k)[..., None]
+        return np.asarray(np.concatenate([hot, np.broadcast_to(self.fixed, (*log_k.shape, self.fixed.size))], -1)
+                          / self.scale)  # fmt: skip
+
+
+def undimmed(values: Float, factor: Float) -> Float:
+    """Return light (n, k) over the factor by which it was dimmed, (n,); infinite where the factor is not above zero."""
+    lost = (factor <= 0.0)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(
+            np.where(values == 0.0, 0.0, np.where(lost, np.copysign(np.inf, values), values / factor[:, None]))
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Ratio:
+    """Ratio of two normal estimates, such as a flux as it is recorded and the factor on the light."""
+
+    top: Float
+    bottom: Float
+    # Variances of both, and their covariance.
+    top_variance: Float
+    bottom_variance: Float
+    covariance: Float
+
+    @property
+    def value(self) -> Float:
+        """Ratio of the estimates; that of a bottom of at most zero is undefined."""
+        return np.divide(self.top, self.bottom, out=np.full_like(self.top, np.nan), where=self.bottom > 0.0)
+
+    def variance_at(self, ratio: Float) -> Float:
+        """Return the variance of top - ratio x bottom."""
+        return self.top_variance - 2.0 * ratio * self.covariance + ratio**2 * self.bottom_variance
+
+    def end(self, left: Float, sign: float) -> Float:
+        """Return the end of the set of ratios that raise chi-squared by at most `left`, with a positive bottom.
+
+        The end is infinite if the bottom may be zero.
+        """
+        left = np.maximum(left, 0.0)
+        a = self.bottom**2 - left * self.bottom_variance
+        b = self.top * self.bottom - left * self.covariance
+        c = self.top**2 - left * self.top_variance
+        root = np.sqrt(np.maximum(b**2 - a * c, 0.0))
+        sure = (a > 0.0) & (self.bottom > 0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            closed = (b + sign * root) / a
+            # Where the bottom may be zero, the ratio ends only on the side of zero, if the top is not zero.
+            open_end = np.where((c > 0.0) & (sign * self.top < 0.0), c / (b - sign * root), sign * np.inf)
+        return np.asarray(np.where(sure, closed, open_end))
