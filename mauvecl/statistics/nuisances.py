@@ -159,12 +159,16 @@ class Nuisances(ContentEquality):
 
     def with_spectrum(self, name: str, spectrum: Float, sd: float) -> Nuisances:
         """Return the parameters with another one that leaves the light of a flare as it is."""
+        return self.joined(Nuisances((name,), spectrum[None], np.array([sd])))
+
+    def joined(self, other: Nuisances) -> Nuisances:
+        """Return these parameters and others."""
         return Nuisances(
-            (*self.names, name),
-            np.vstack([self.spectra, spectrum]),
-            np.append(self.sd, sd),
-            np.vstack([self.of_flare, np.zeros_like(spectrum)]),
-            np.append(self.mean, 0.0),
+            (*self.names, *other.names),
+            np.vstack([self.spectra, other.spectra]),
+            np.append(self.sd, other.sd),
+            np.vstack([self.of_flare, other.of_flare]),
+            np.append(self.mean, other.mean),
         )
 
     def with_prior(self, name: str, mean: float, sd: float) -> Nuisances:
