@@ -366,6 +366,9 @@ def _coverage(found: Measurement, truth: Float, level: int, which: NDArray[np.bo
 
 
 def _scatter(estimates: Float) -> Float:
+    """Return half of the central 68.27 % of the estimates, shape (n_derived,); undefined for a single one."""
+    if len(estimates) < 2:
+        return np.full(estimates.shape[1], np.nan)
     low, high = np.quantile(estimates, [0.15865, 0.84135], axis=0)
     return np.asarray((high - low) / 2)
 

@@ -253,10 +253,10 @@ def check_enough(quiet: Expectation, used: NDArray[np.bool_], parameters: int) -
     """Raise InputError unless more pixels are used than parameters are fitted."""
     count = int(used.sum())
     if count <= parameters:
-        fault = f"all but {count} pixels of {quiet.name} saturate or are left out"
+        fault = f"{count} of {used.size} pixels of {quiet.name} can be used, since others saturate or are left out"
+        expected = f"more than the {parameters} parameters of the fit"
         if not count:
-            fault = f"every pixel of {quiet.name} saturates or is left out"
-        expected = f"more than {parameters}, which are the parameters of the fit" if parameters else "some that count"
+            fault, expected = f"every pixel of {quiet.name} saturates or is left out", "some that count"
         raise InputError(fault, expected, key="skipped_nm", value=count)
 
 
