@@ -41,6 +41,9 @@ class Nuisances(ContentEquality):
         flares use it; statistics test for a flare, and use the spectra without one.
     mean : ndarray, shape (k,), optional
         Prior means of the amplitudes in fits of flares, 0 by default.
+    factor_prior : ndarray, shape (2, n), optional
+        Values of the factor on all light, in standard deviations from its mean, and their probabilities, if its prior
+        is not normal; fits of flares use it.
     """
 
     names: tuple[str, ...]
@@ -48,6 +51,7 @@ class Nuisances(ContentEquality):
     sd: Float
     of_flare: Float = field(default_factory=lambda: np.zeros((0, 0)))
     mean: Float = field(default_factory=lambda: np.zeros(0))
+    factor_prior: Float = field(default_factory=lambda: np.zeros((2, 0)))
 
     def __post_init__(self) -> None:
         shapes = np.shape(self.spectra), np.shape(self.sd)
@@ -153,9 +157,9 @@ class Nuisances(ContentEquality):
         return self._rows([i for i, name in enumerate(self.names) if name not in names])
 
     def _rows(self, kept: Sequence[int]) -> Nuisances:
-        names = tuple(self.names[i] for i in kept)
         kept = list(kept)
-        return Nuisances(names, self.spectra[kept], self.sd[kept], self.of_flare[kept], self.mean[kept])
+        spectra, sd, of_flare, mean = (one[kept] for one in (self.spectra, self.sd, self.of_flare, self.mean))
+        return Nuisances(tuple(self.names[i] for i in kept), spectra, sd, of_flare, mean, self.factor_prior)
 
     def with_spectrum(self, name: str, spectrum: Float, sd: float) -> Nuisances:
         """Return the parameters with another one that leaves the light of a flare as it is."""
@@ -169,6 +173,7 @@ class Nuisances(ContentEquality):
             np.append(self.sd, other.sd),
             np.vstack([self.of_flare, other.of_flare]),
             np.append(self.mean, other.mean),
+            np.hstack([self.factor_prior, other.factor_prior]),
         )
 
     def with_prior(self, name: str, mean: float, sd: float) -> Nuisances:

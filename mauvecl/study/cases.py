@@ -181,6 +181,8 @@ class Case:
         The factor on all light has the mean and, unless the study states another, the standard deviation of what is
         drawn; those of a stare are of the stare. The documented set leaves the star's own level free as well.
         """
+        import numpy as np
+
         from mauvecl.noise.factor_distributions import FactorDistributions
 
         quiet = self.quiet if quiet is None else quiet
@@ -195,7 +197,12 @@ class Case:
         light = None if drawn is None else drawn.spreads.get("light")
         if light is None:
             return unknown.without(["light"]) if given is None else unknown
-        return unknown.with_prior("light", light.mean - 1.0, light.sd if given is None else given)
+        if given is not None:
+            return unknown.with_prior("light", light.mean - 1.0, given)
+        unknown = unknown.with_prior("light", light.mean - 1.0, light.sd)
+        if light.normal:
+            return unknown
+        return replace(unknown, factor_prior=np.array([(light.values - light.mean) / light.sd, light.weights]))
 
     def detect_options(self, quiet: Expectation | None = None) -> dict[str, Any]:
         """Return all arguments of `Engine.detect` except expectations and seed; `quiet` as for `unknowns`."""

@@ -49,6 +49,8 @@ BATCH = 2048
 #: Fits more of exposures with pixels near saturation; the logarithmic step of the number of such pixels of those that
 #: share the others in the first fit, and the least share of their pixels that all must be able to use there.
 SATURATED_REFITS, SATURATED_STEP, LEAST_SHARED = 4, 0.05, 0.5
+#: Pixels on both sides of one near saturation that are not used.
+NEIGHBOURS = 4
 #: Factor by which the largest flare of a group may exceed the mean one.
 NEAR_GROUP = 1.1
 
@@ -226,14 +228,16 @@ def fit(
     # Exposures with saturated pixels start far from the flare, which decides on the pixels that saturate.
     saturated = [np.flatnonzero(cut)] * (SATURATED_REFITS if cut.any() else 0)
     for rows in [*saturated, *[every] * (REFITS - 1)]:
-        for some, reduction in variance_groups(expectation, model, log_k[rows], linear[rows], reduction_of, nuisances):
+        some_of = replace(exposures, raw=exposures.raw[rows])
+        groups = variance_groups(expectation, model, log_k[rows], linear[rows], reduction_of, nuisances, some_of)
+        for some, reduction in groups:
             own = rows[some]
             for start in range(0, own.size, BATCH):
                 batch = own[start : start + BATCH]
                 best = _estimated(exposures, batch, reduction)
                 log_k[batch], linear[batch] = best.log_k, best.linear
     parts: list[tuple[NDArray[np.intp], dict[str, Any]]] = []
-    for some, reduction in variance_groups(expectation, model, log_k, linear, reduction_of, nuisances):
+    for some, reduction in variance_groups(expectation, model, log_k, linear, reduction_of, nuisances, exposures):
         for start in range(0, some.size, BATCH):
             batch = some[start : start + BATCH]
             parts.append((batch, _fitted(exposures, batch, model, reduction, levels)))
@@ -296,13 +300,22 @@ def _pilot(
         rows = np.flatnonzero((alike == key) & (counts > 0))
         for start in range(0, rows.size, BATCH):
             some = rows[start : start + BATCH]
-            clipped = exposures.raw[some] > ceiling
-            if (~clipped.any(axis=0) & used).sum() >= LEAST_SHARED * (used.sum() - counts[some].max()):
-                best(some, reduction_of(None, clipped=clipped.any(axis=0)))
+            shared = clipped_pixels(exposures, quiet, some)
+            if (~shared & used).sum() >= LEAST_SHARED * (used.sum() - counts[some].max()):
+                best(some, reduction_of(None, clipped=shared))
                 continue
-            for row, own in zip(some, clipped, strict=True):
-                best(np.array([row]), reduction_of(None, clipped=own))
+            for row in some:
+                best(np.array([row]), reduction_of(None, clipped=clipped_pixels(exposures, quiet, np.array([row]))))
     return log_k, linear, counts > 0
+
+
+def clipped_pixels(exposures: Exposures, quiet: Expectation, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Return which pixels are near saturation in any of some exposures, and their neighbours, shape (n_pixel,).
+
+    Neighbours are left out so that the noise of single pixels does not select the pixels of a fit.
+    """
+    clipped = (exposures.raw[rows] > _highest_usable(quiet)).any(axis=0)
+    return np.convolve(clipped, np.ones(2 * NEIGHBOURS + 1), "same") > 0.5
 
 
 def _highest_usable(quiet: Expectation) -> Float:
@@ -319,12 +332,16 @@ def variance_groups(
     log_k: Float,
     linear: Float,
     reduction_of: Callable[..., Reduction],
-    nuisances: Nuisances | None = None,
+    nuisances: Nuisances | None,
+    exposures: Exposures,
 ) -> Iterator[tuple[NDArray[np.intp], Reduction]]:
     """Yield groups of frames whose fitted flares have nearly the same variance, with their reduction."""
     n_pixel = quiet.wavelength_nm.size
     edges = np.linspace(0, n_pixel, VARIANCE_RANGES + 1).astype(np.intp)[:-1]
-    relative = quiet.gain_dn_per_electron / quiet.unsaturated_variance_dn2
+    ceiling = _highest_usable(quiet)
+    # Pixels that saturate in every frame have no say.
+    seen = exposures.raw.min(axis=0) <= ceiling
+    relative = seen * quiet.gain_dn_per_electron / quiet.unsaturated_variance_dn2
     averaged = np.diff(np.append(edges, n_pixel))
     hot = np.add.reduceat(model.hot * relative, edges, axis=1) / averaged
     fixed = np.add.reduceat(model.fixed * relative, edges, axis=1) / averaged
@@ -333,7 +350,6 @@ def variance_groups(
     keys = np.rint(np.log1p(np.maximum(added, -0.9)) / VARIANCE_STEP).astype(np.int64)
     _, number, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
     order = np.argsort(number, kind="stable")
-    ceiling = _highest_usable(quiet)
     # Single frames may have all the light that an exposure loses on average.
     undimmed = 1.0 / min(1.0, nuisances.mean_factor) if nuisances else 1.0
     for rows in np.split(order, np.cumsum(counts)[:-1]):
@@ -343,7 +359,10 @@ def variance_groups(
         if (quiet.n_frames * quiet.mean_raw_dn + NEAR_GROUP * highest > ceiling).any():
             each = (linear[k, 0] * model.hot_spline(log_k[k]) + linear[k, 1:] @ model.fixed for k in rows)
             highest = undimmed * np.max(list(each), axis=0) if rows.size <= BATCH else NEAR_GROUP * highest
-        yield rows, reduction_of(mean, highest_dn=highest)
+        clipped = None
+        if (exposures.raw[rows].max(axis=0) > ceiling).any():
+            clipped = clipped_pixels(exposures, quiet, rows)
+        yield rows, reduction_of(mean, highest_dn=highest, clipped=clipped)
 
 
 def _estimated(exposures: Exposures, rows: NDArray[np.intp], reduction: Reduction) -> BestFit:

@@ -8,7 +8,7 @@ over the factor, so that their profile intervals at a given temperature are thos
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Self
 
 import numpy as np
@@ -16,6 +16,27 @@ import scipy
 from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
+
+
+#: Shares of a prior in the variance of a ratio at which thresholds are computed, and steps of their bisection.
+SHARES, HALVINGS = np.linspace(0.0, 1.0, 65), 40
+
+
+@lru_cache(maxsize=16)
+def _thresholds(prior: bytes, allowed: float) -> Float:
+    """Return squared thresholds at `SHARES` that deviations exceed as often as normal ones exceed `allowed`."""
+    deviation, weight = np.frombuffer(prior).reshape(2, -1)
+    # A small normal part keeps the distribution continuous.
+    normal = np.sqrt(np.maximum(1.0 - SHARES, 1e-4))[:, None]
+    moved = np.sqrt(SHARES)[:, None] * deviation
+    level = 2.0 * scipy.special.ndtr(np.sqrt(allowed)) - 1.0
+    low, high = np.zeros(SHARES.size), np.full(SHARES.size, 10.0)
+    for _ in range(HALVINGS):
+        middle = ((low + high) / 2.0)[:, None]
+        inside = scipy.special.ndtr((middle - moved) / normal) - scipy.special.ndtr((-middle - moved) / normal)
+        enough = inside @ weight >= level
+        low, high = np.where(enough, low, middle[:, 0]), np.where(enough, middle[:, 0], high)
+    return np.asarray(((low + high) / 2.0) ** 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +55,10 @@ class LightFactor:
         Temperatures of the model, and mean sums for a blackbody of amplitude 1.
     fixed : ndarray, shape (n_linear - 1,)
         Mean sums of the other components for unit amplitude.
+    prior_share : float
+        Share of the prior in the information on the factor if the flare is known.
+    prior : ndarray, shape (2, n)
+        Deviations of the prior in standard deviations, and their probabilities; empty if it is normal.
     """
 
     weights: Float
@@ -42,6 +67,8 @@ class LightFactor:
     log_k: Float
     hot: Float
     fixed: Float
+    prior_share: float
+    prior: Float
 
     @cached_property
     def spline(self) -> scipy.interpolate.CubicSpline:
@@ -52,6 +79,18 @@ class LightFactor:
         """Return the factor next to a blackbody of a second temperature, as another component of fixed shape."""
         fixed = np.concatenate([[float(self.spline(log_k))], self.fixed])
         return replace(self, log_k=self.log_k[:end], hot=self.hot[:end], fixed=fixed)
+
+    def change(self, ratio: Ratio, allowed: float) -> Float | float:
+        """Return how far the threshold of a ratio to the factor is from `allowed`, since the prior is not normal.
+
+        The part of the ratio's scatter that comes from the prior has the distribution of the prior.
+        """
+        if not self.prior.size:
+            return 0.0
+        value = np.nan_to_num(ratio.value)
+        total = np.maximum(ratio.variance_at(value), 1e-300)
+        share = np.clip(value**2 * self.prior_share / self.scale**2 / total, 0.0, 1.0)
+        return np.interp(share, SHARES, _thresholds(self.prior.tobytes(), allowed)) - allowed
 
     def estimate(self, sums: Float, log_k: Float, linear: Float) -> Float:
         """Return the best factor, (n, ...), for sums (n,), temperatures (n, ...) and amplitudes (n, ..., n_linear)."""

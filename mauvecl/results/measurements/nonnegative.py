@@ -8,7 +8,7 @@ amplitude are rejected. Only the blackbody depends on the temperature, so each f
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, combinations
@@ -32,6 +32,9 @@ Float = NDArray[np.float64]
 REFINEMENTS, NARROWER = 3, 8.0
 #: The search for the best temperature starts from every `COARSE`-th node of the model.
 COARSE = 4
+#: Distance in nodes at which the gain beside the best temperature is tried, its least rise there that is climbed, and
+#: the number of halved steps of the climb.
+BESIDE, LEAST_RISE, HALVINGS = 0.05, 1e-4, 14
 #: Amplitudes below minus this many standard errors are negative; smaller deviations are due to rounding.
 ROUNDING = 1e-9
 
@@ -194,7 +197,25 @@ class BoundedProfile(Profile):
             reached = self.gain(vertex)
             x = np.where(reached >= g.max(axis=1), vertex, three)
             step /= NARROWER
-        return self.solution(x)
+        return self.solution(self._climbed(x))
+
+    def _climbed(self, x: Float) -> Float:
+        """Return temperatures at which a higher gain next to them is climbed: bounds bend the gain sharply."""
+        low, high = self.nodes[0], self.nodes[-1]
+        node = float(self.nodes[1] - self.nodes[0])
+        nearby = np.clip(x[:, None] + BESIDE * node * np.array([-1.0, 0.0, 1.0]), low, high)
+        g = self.gain(nearby)
+        rising = np.flatnonzero(g.max(axis=1) > g[:, 1] + LEAST_RISE)
+        if not rising.size:
+            return x
+        own, best, step = BoundedProfile(self.reduction, self.sums[rising]), x[rising], COARSE * node
+        for _ in range(HALVINGS):
+            there = np.clip(best[:, None] + step * np.array([-1.0, 0.0, 1.0]), low, high)
+            best = there[np.arange(best.size), np.argmax(own.gain(there), axis=1)]
+            step /= 2.0
+        found = x.copy()
+        found[rising] = best
+        return found
 
     def solution(self, log_k: Float) -> BestFit:
         """Return the best fits at temperatures (n,)."""
@@ -224,11 +245,15 @@ def bounded_intervals(
         without = profile.factor(x, np.zeros((*x.shape, len(model.linear))))
         of_light = without, np.moveaxis(light.weights_of(x), -1, 0), light.scale**-2.0
 
+    def change(ratio: Ratio) -> Float | float:
+        """Return the change of the threshold by a prior of the factor that is not normal."""
+        return 0.0 if light is None else light.change(ratio, allowed)
+
     def ends(one: Derived, spline: CubicSpline | None) -> tuple[Float, Float]:
         if spline is None:
             return np.where(np.isnan(low), -np.inf, np.exp(low)), np.where(np.isnan(high), np.inf, np.exp(high))
         if one.ratio is None:
-            return _linear_ends(faces, np.moveaxis(spline(x), -1, 0), least, of_light)
+            return _linear_ends(faces, np.moveaxis(spline(x), -1, 0), least, of_light, change)
         lowest, highest = _ratio_ends(products, faces, spline(x), least)
         return one.offset + lowest, one.offset + highest
 
@@ -238,7 +263,11 @@ def bounded_intervals(
 
 
 def _linear_ends(
-    faces: list[Face], factors: Float, least: Float, of_light: tuple[Float, Float, float] | None
+    faces: list[Face],
+    factors: Float,
+    least: Float,
+    of_light: tuple[Float, Float, float] | None,
+    threshold: Callable[[Ratio], Float | float],
 ) -> tuple[Float, Float]:
     """Return the ends of a quantity that is linear in the amplitudes, with factors (n_linear, n, n_sample).
 
@@ -259,6 +288,7 @@ def _linear_ends(
             dims = face.change(of_light[1])
             covariance = face.product(factors, dims)
             ratio = Ratio(middle, of_light[0] - face.value(of_light[1]), variance, dims[2] + of_light[2], -covariance)
+            left = np.maximum(left + threshold(ratio), 0.0)
         else:
             dims, ratio = change, None
         for sign, found, which in ((-1.0, lows, np.minimum), (1.0, highs, np.maximum)):

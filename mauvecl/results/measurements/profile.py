@@ -245,6 +245,8 @@ def _linear_interval(
     ratio = ratio_at(profile, spline, x, linear, variance, hot)
     value, spread, known = ratio.top, ratio.top_variance, profile.reduction.light is None
     estimate = value if known else ratio.value
+    if profile.reduction.light is not None:
+        left = left + np.where(left >= 0.0, profile.reduction.light.change(ratio, allowed), 0.0)
     outside = left < 0.0
     outside[:, [0, -1]] = False  # rounding decides at the ends themselves
 

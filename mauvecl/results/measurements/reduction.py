@@ -169,12 +169,14 @@ def light_factor(model: FlareModel, unknown: Nuisances | None, rows: Float) -> L
     """Return the factor on all light if it is among the unknowns, from `Nuisances.around` and its `rows`."""
     if unknown is None or not unknown.has_factor:
         return None
-    assert unknown.mean is not None
     # The last row of the Cholesky factor's inverse depends on the factor alone, given the other unknowns.
     row, precision = rows[-1], float(unknown.sd[-1]) ** -2.0
     own = float(row @ unknown.spectra[-1])
     scale = (own + np.sqrt(own**2 + 4.0 * precision)) / 2.0
-    return LightFactor(row, scale, 1.0 + float(unknown.mean[-1]), model.log_k, model.hot @ row, model.fixed @ row)
+    return LightFactor(
+        row, scale, 1.0 + float(unknown.mean[-1]), model.log_k, model.hot @ row, model.fixed @ row,
+        precision / scale**2, unknown.factor_prior,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,6 +273,12 @@ def skipped_pixels(quiet: Expectation, skipped_nm: Ranges) -> NDArray[np.bool_]:
 
 def check_distinct(kept: Float, whole: Float, nuisances: Nuisances | None) -> None:
     """Raise InputError if marginalisation over nuisances removes the S/N^2 of a component."""
+    if not (whole > 0.0).all():
+        raise InputError(
+            "a component of the flare has no light in the pixels that neither saturate nor are left out",
+            "a model whose components have light there",
+            key="model",
+        )
     if not (kept > LEAST_KEPT * whole).all():
         unknown = join_names(nuisances.names) if nuisances else "nothing"
         raise InputError(

@@ -107,7 +107,8 @@ def fit_two_temperatures(
     allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
     parts, order, whole = [], [], TwoTemperatures(model)
     recorded = single.amplitudes * single.factor[:, None]
-    for rows, reduction in variance_groups(expectation, model, single.log_k, recorded, reduction_of, nuisances):
+    groups = variance_groups(expectation, model, single.log_k, recorded, reduction_of, nuisances, exposures)
+    for rows, reduction in groups:
         sums, rest, light = exposures.sums_and_rest(reduction, rows)
         found = _Search(model, reduction, sums, allowed, light).measured()
         best, low, high, second, estimates, factor = found
