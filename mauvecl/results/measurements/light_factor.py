@@ -137,16 +137,16 @@ class Ratio:
     def end(self, left: Float, sign: float) -> Float:
         """Return the end of the set of ratios that raise chi-squared by at most `left`, with a positive bottom.
 
-        The end is infinite if the bottom may be zero.
+        The end is infinite if the bottom may be zero, and of the other sign if it cannot be positive: there is no ratio.
         """
         left = np.maximum(left, 0.0)
         a = self.bottom**2 - left * self.bottom_variance
         b = self.top * self.bottom - left * self.covariance
         c = self.top**2 - left * self.top_variance
         root = np.sqrt(np.maximum(b**2 - a * c, 0.0))
-        sure = (a > 0.0) & (self.bottom > 0.0)
+        positive = self.bottom > 0.0
         with np.errstate(divide="ignore", invalid="ignore"):
             closed = (b + sign * root) / a
             # Where the bottom may be zero, the ratio ends only on the side of zero, if the top is not zero.
             open_end = np.where((c > 0.0) & (sign * self.top < 0.0), c / (b - sign * root), sign * np.inf)
-        return np.asarray(np.where(sure, closed, open_end))
+        return np.asarray(np.where(a > 0.0, np.where(positive, closed, -sign * np.inf), open_end))

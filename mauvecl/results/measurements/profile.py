@@ -218,6 +218,9 @@ def ends_of_quantities(
     columns: list[tuple[Float, Float]] = []
     for one, spline, (first, times) in zip(model.derived, model.splines, model.multiples, strict=True):
         low, high = columns[first] if first < len(columns) else ends(one, spline)
+        # Light that contradicts every factor above zero limits nothing.
+        none = low > high
+        low, high = np.where(none, -np.inf, low), np.where(none, np.inf, high)
         columns.append((times * low, times * high))
     return np.column_stack([low for low, _ in columns]), np.column_stack([high for _, high in columns])
 
