@@ -81,7 +81,7 @@ def test_intervals_cover_where_light_is_lost(
 
 
 def test_light_that_the_star_alone_loses_was_not_enough() -> None:
-    """Check that a nuisance of the star's light alone misses the amplitude by the loss, so that the cases above tell."""
+    """Check that a nuisance of the star's light alone misses the amplitude by the loss: the cases above tell."""
     x = quiet()
     m = FlareModel.of(star("M3V", 7.0), MAUVE, x)
     lit = expect(star("M3V", 7.0).flaring(0.5, 10_000.0), MAUVE, exposure=50.0)

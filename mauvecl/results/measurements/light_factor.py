@@ -137,7 +137,7 @@ class Ratio:
     def end(self, left: Float, sign: float) -> Float:
         """Return the end of the set of ratios that raise chi-squared by at most `left`, with a positive bottom.
 
-        The end is infinite if the bottom may be zero, and of the other sign if it cannot be positive: there is no ratio.
+        The end is infinite if the bottom may be zero, and of the other sign, no end, if it cannot be positive.
         """
         left = np.maximum(left, 0.0)
         a = self.bottom**2 - left * self.bottom_variance
