@@ -228,7 +228,7 @@ def fit(
     # Exposures with saturated pixels start far from the flare, which decides on the pixels that saturate.
     saturated = [np.flatnonzero(cut)] * (SATURATED_REFITS if cut.any() else 0)
     for rows in [*saturated, *[every] * (REFITS - 1)]:
-        some_of = replace(exposures, raw=exposures.raw[rows])
+        some_of = replace(exposures, raw=exposures.raw[rows]) if cut.any() else None
         groups = variance_groups(expectation, model, log_k[rows], linear[rows], reduction_of, nuisances, some_of)
         for some, reduction in groups:
             own = rows[some]
@@ -237,7 +237,8 @@ def fit(
                 best = _estimated(exposures, batch, reduction)
                 log_k[batch], linear[batch] = best.log_k, best.linear
     parts: list[tuple[NDArray[np.intp], dict[str, Any]]] = []
-    for some, reduction in variance_groups(expectation, model, log_k, linear, reduction_of, nuisances, exposures):
+    near = exposures if cut.any() else None
+    for some, reduction in variance_groups(expectation, model, log_k, linear, reduction_of, nuisances, near):
         for start in range(0, some.size, BATCH):
             batch = some[start : start + BATCH]
             parts.append((batch, _fitted(exposures, batch, model, reduction, levels)))
@@ -285,7 +286,9 @@ def _pilot(
     used = usual.variance > 0.0
     ceiling = _highest_usable(quiet)
     for start in range(0, n, BATCH):
-        counts[start : start + BATCH] = (exposures.raw[start : start + BATCH] > ceiling)[:, used].sum(axis=1)
+        raw = exposures.raw[start : start + BATCH]
+        if (raw.max(axis=0) > ceiling)[used].any():
+            counts[start : start + BATCH] = (raw > ceiling)[:, used].sum(axis=1)
 
     def best(rows: NDArray[np.intp], reduction: Reduction) -> None:
         for start in range(0, rows.size, BATCH):
@@ -333,14 +336,17 @@ def variance_groups(
     linear: Float,
     reduction_of: Callable[..., Reduction],
     nuisances: Nuisances | None,
-    exposures: Exposures,
+    exposures: Exposures | None,
 ) -> Iterator[tuple[NDArray[np.intp], Reduction]]:
-    """Yield groups of frames whose fitted flares have nearly the same variance, with their reduction."""
+    """Yield groups of frames whose fitted flares have nearly the same variance, with their reduction.
+
+    The exposures are needed if pixels are near saturation in some of them.
+    """
     n_pixel = quiet.wavelength_nm.size
     edges = np.linspace(0, n_pixel, VARIANCE_RANGES + 1).astype(np.intp)[:-1]
     ceiling = _highest_usable(quiet)
     # Pixels that saturate in every frame have no say.
-    seen = exposures.raw.min(axis=0) <= ceiling
+    seen = True if exposures is None else exposures.raw.min(axis=0) <= ceiling
     relative = seen * quiet.gain_dn_per_electron / quiet.unsaturated_variance_dn2
     averaged = np.diff(np.append(edges, n_pixel))
     hot = np.add.reduceat(model.hot * relative, edges, axis=1) / averaged
@@ -360,7 +366,7 @@ def variance_groups(
             each = (linear[k, 0] * model.hot_spline(log_k[k]) + linear[k, 1:] @ model.fixed for k in rows)
             highest = undimmed * np.max(list(each), axis=0) if rows.size <= BATCH else NEAR_GROUP * highest
         clipped = None
-        if (exposures.raw[rows].max(axis=0) > ceiling).any():
+        if exposures is not None and (exposures.raw[rows].max(axis=0) > ceiling).any():
             clipped = clipped_pixels(exposures, quiet, rows)
         yield rows, reduction_of(mean, highest_dn=highest, clipped=clipped)
 

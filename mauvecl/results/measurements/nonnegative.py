@@ -32,9 +32,9 @@ Float = NDArray[np.float64]
 REFINEMENTS, NARROWER = 3, 8.0
 #: The search for the best temperature starts from every `COARSE`-th node of the model.
 COARSE = 4
-#: Distance in nodes at which the gain beside the best temperature is tried, its least rise there that is climbed, and
-#: the number of halved steps of the climb.
-BESIDE, LEAST_RISE, HALVINGS = 0.05, 1e-4, 14
+#: Share of a refinement's step above which a best temperature still moves; distance in nodes at which the gain beside
+#: it is then tried, its least rise that counts, and the number of narrowing grids that follow it.
+SETTLED, BESIDE, LEAST_RISE, CLIMBS = 0.5, 0.05, 1e-3, 4
 #: Amplitudes below minus this many standard errors are negative; smaller deviations are due to rounding.
 ROUNDING = 1e-9
 
@@ -196,23 +196,27 @@ class BoundedProfile(Profile):
             vertex = np.where(good, vertex, three)
             reached = self.gain(vertex)
             x = np.where(reached >= g.max(axis=1), vertex, three)
+            # A smooth maximum moves less and less; bounds may bend the gain sharply.
+            moving = np.abs(x - there[:, 1]) > SETTLED * step
             step /= NARROWER
-        return self.solution(self._climbed(x))
+        return self.solution(self._climbed(x, np.flatnonzero(moving)))
 
-    def _climbed(self, x: Float) -> Float:
-        """Return temperatures at which a higher gain next to them is climbed: bounds bend the gain sharply."""
+    def _climbed(self, x: Float, moving: NDArray[np.intp]) -> Float:
+        """Return temperatures of which some, where gain rises beside them, are moved to the highest gain nearby."""
+        if not moving.size:
+            return x
         low, high = self.nodes[0], self.nodes[-1]
-        node = float(self.nodes[1] - self.nodes[0])
-        nearby = np.clip(x[:, None] + BESIDE * node * np.array([-1.0, 0.0, 1.0]), low, high)
-        g = self.gain(nearby)
-        rising = np.flatnonzero(g.max(axis=1) > g[:, 1] + LEAST_RISE)
+        step = float(self.nodes[1] - self.nodes[0])
+        beside = np.clip(x[moving, None] + BESIDE * step * np.array([-1.0, 0.0, 1.0]), low, high)
+        gain = BoundedProfile(self.reduction, self.sums[moving]).gain(beside)
+        rising = moving[gain.max(axis=1) > gain[:, 1] + LEAST_RISE]
         if not rising.size:
             return x
-        own, best, step = BoundedProfile(self.reduction, self.sums[rising]), x[rising], COARSE * node
-        for _ in range(HALVINGS):
-            there = np.clip(best[:, None] + step * np.array([-1.0, 0.0, 1.0]), low, high)
+        own, best = BoundedProfile(self.reduction, self.sums[rising]), x[rising]
+        for _ in range(CLIMBS):
+            there = np.clip(best[:, None] + step * np.linspace(-1.0, 1.0, 9), low, high)
             best = there[np.arange(best.size), np.argmax(own.gain(there), axis=1)]
-            step /= 2.0
+            step /= 4.0
         found = x.copy()
         found[rising] = best
         return found

@@ -247,7 +247,9 @@ def _linear_interval(
 ) -> tuple[Float, Float]:
     ratio = ratio_at(profile, spline, x, linear, variance, hot)
     value, spread, known = ratio.top, ratio.top_variance, profile.reduction.light is None
-    estimate = value if known else ratio.value
+    # The ratio is straight where the recorded quantity less the ratio times the factor is.
+    middle = ratio.value[:, SAMPLES // 2, None]
+    estimate = value if known else value - middle * ratio.bottom
     if profile.reduction.light is not None:
         left = left + np.where(left >= 0.0, profile.reduction.light.change(ratio, allowed), 0.0)
     outside = left < 0.0
@@ -261,9 +263,13 @@ def _linear_interval(
     ends = [_hull(reached(left, sign), outside, sign)[0] for sign in (-1.0, 1.0)]
     bend = np.abs(estimate[:, 0] + estimate[:, -1] - 2 * estimate[:, SAMPLES // 2])
     # Simulated fits need the error of the temperature, which its interval gives if it has both ends.
-    wide = ends[1] - ends[0]
+    wide = (ends[1] - ends[0]) * (1.0 if known else ratio.bottom[:, SAMPLES // 2])
     bent = np.flatnonzero(closed & np.isfinite(wide) & (bend > CURVED * np.sqrt(allowed) * wide))
     if bent.size:
+        if not known and profile.reduction.light is not None:
+            nodes, light = profile.nodes, profile.reduction.light
+            factors = spline(nodes) + float(np.median(middle[bent])) * light.weights_of(nodes)
+            spline = scipy.interpolate.CubicSpline(nodes, factors)
         thresholds = _Thresholds(profile, spline)
         room, error = left[bent], (x[bent, -1] - x[bent, 0]) / np.sqrt(4 * allowed)
         for end, sign in zip(ends, (-1.0, 1.0), strict=True):
@@ -272,8 +278,10 @@ def _linear_interval(
             # Share of the variance that is not the factor's; the factor is straight.
             share = np.ones(bent.size)
             if not known:
-                total = ratio.variance_at(ratio.value)[bent, which]
-                share = np.clip(spread[bent, which] / total, 0.0, 1.0)
+                at = middle[bent, 0]
+                total = ratio.variance_at(middle)[bent, which]
+                own = light.scale**-2.0 * at**2
+                share = np.clip(1.0 - own / total, 0.0, 1.0)
             moved = sign * np.sqrt(np.maximum(room[place], 0.0) * share)
             change = share * (thresholds.at(bent, x[bent, which], moved, error, allowed) - allowed)
             changed = room + change[:, None]
