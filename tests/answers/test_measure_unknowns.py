@@ -67,6 +67,13 @@ def test_fits_take_the_factor_on_light_as_it_is_drawn() -> None:
     assert Case(study_of()).unknowns_of_fits() is None
 
 
+def test_what_is_drawn_and_not_marginalised_is_said(engine: Engine) -> None:
+    settings = ["flare.amplitudes=[0.5]", "processes.pointing_loss={uniform=[0, 0.05]}"]
+    for more, said in (([], True), (["nuisances.light='free'"], False)):
+        answer = measure(study_of(*settings, *more, fits=10), engine)
+        assert any("NOT MARGINALISED: light" in text for text in answer.messages) == said
+
+
 def test_single_fits_have_no_scatter(engine: Engine) -> None:
     rows = measure(study_of("flare.amplitudes=[0.5]", fits=1), engine).flares[0].rows()
     assert np.isnan(rows["scatter"]).all()

@@ -20,6 +20,7 @@ from mauvecl.answers.measurements.expected import ExpectedMeasurement, expected_
 from mauvecl.answers.progress import reported
 from mauvecl.device.engine import Engine
 from mauvecl.lightcurve.stares.measured_bins import MeasuredBins
+from mauvecl.noise.factor_distributions import FactorDistributions
 from mauvecl.results.measurements.fit import LEVELS, Measurement
 from mauvecl.results.measurements.reduction import usable_variance
 from mauvecl.runs.checkpoint import kept
@@ -28,6 +29,7 @@ from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column, View, number, percent, records, stacked, table_of
 from mauvecl.statistics.intervals import Interval, clopper_pearson
+from mauvecl.statistics.nuisances import join_names
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import amplitude_column, place_columns
 from mauvecl.study.messages import collect_messages
@@ -315,6 +317,7 @@ def measure(
     stares = [measured_stare(case, engine) for case in prepared if study.measure.along_stare]
     messages = collect_messages(expectations)
     messages += [one.drawn for one in stares if isinstance(one.drawn, str)]
+    messages += dict.fromkeys(line for case in prepared for line in _not_marginalised(case))
     return MeasureAnswer(study, flares, [*messages, *_faint(flares), *_wrong(flares)], stares)
 
 
@@ -371,6 +374,19 @@ def _scatter(estimates: Float) -> Float:
         return np.full(estimates.shape[1], np.nan)
     low, high = np.quantile(estimates, [0.15865, 0.84135], axis=0)
     return np.asarray((high - low) / 2)
+
+
+def _not_marginalised(case: Case) -> list[str]:
+    """Return a message on drawn factors over which fits do not marginalise."""
+    drawn = FactorDistributions.from_processes(case.processes, case.quiet)
+    unknown = case.unknowns_of_fits()
+    names = [name for name in (drawn.spreads if drawn else ()) if unknown is None or name not in unknown.names]
+    if not names:
+        return []
+    return [
+        f"NOT MARGINALISED: {join_names(names)}. Exposures are drawn with other levels than fits expect, so that "
+        f"intervals miss the truth; `nuisances.{names[0]}` marginalises over one."
+    ]
 
 
 def _faint(flares: Sequence[MeasuredFlare]) -> list[str]:
