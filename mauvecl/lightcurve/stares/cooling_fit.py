@@ -21,8 +21,8 @@ from mauvecl.lightcurve.flares.events import Event
 from mauvecl.lightcurve.flares.shapes import Shape, shape_of
 from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.measured_bins import checked_frames, known_strengths, less_known
-from mauvecl.results.measurements.fit import LEVELS, Measurement
-from mauvecl.results.measurements.reduction import EVERY, Ranges, Reduction
+from mauvecl.results.measurements.fit import LEVELS, Measurement, clipped_pixels
+from mauvecl.results.measurements.reduction import EVERY, Exposures, Ranges, Reduction
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import Duration, Moment, Probability, Wavelength
@@ -287,7 +287,8 @@ def fit_cooling(
     Raises
     ------
     InputError
-        If the frames have another shape, the model has a jump or lines, or the stare contains no light of the flare.
+        If the frames have another shape, the model has a jump or lines, the stare contains no light of the flare, or
+        every pixel is near saturation in a frame.
     """
     if len(model.linear) > 1:
         raise InputError(f"a model of {', '.join(model.linear)}", "a blackbody alone", key="model", value=model.linear)
@@ -383,7 +384,8 @@ def _data(
     skipped_nm: Ranges,
 ) -> _Data:
     # The unknowns are parameters of the stare, so the weights of single frames do not remove them.
-    reduction = Reduction.of(model, quiet, skipped_nm=skipped_nm)
+    clipped = clipped_pixels(Exposures(raw, quiet.recorded_dn), quiet, np.arange(len(raw)))
+    reduction = Reduction.of(model, quiet, skipped_nm=skipped_nm, clipped=clipped)
     weights, strengths = reduction.weights, known_strengths(stare, quiet)
     sums = less_known(raw, quiet, strengths, weights)
     constant, each = Components(quiet, np.zeros((0, weights.shape[1])), weights).sum_cumulants(2)
