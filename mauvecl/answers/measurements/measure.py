@@ -342,7 +342,8 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
     parts: list[Arrays] = []
     for start in range(0, study.measure.fits, BATCH):
         count = min(BATCH, study.measure.fits - start)
-        depends_on = ("measure", quiet, flare, unknown, models, study.text(), start, count)
+        # The number changes with the arrays that a fit keeps.
+        depends_on = ("measure", 2, quiet, flare, unknown, models, study.text(), start, count)
         parts.append(kept(checkpoint, depends_on, partial(fitted, start, count)))
     selected = np.concatenate([arrays["detected"] for arrays in parts])
     measured = []
