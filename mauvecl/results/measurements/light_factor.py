@@ -80,17 +80,23 @@ class LightFactor:
         fixed = np.concatenate([[float(self.spline(log_k))], self.fixed])
         return replace(self, log_k=self.log_k[:end], hot=self.hot[:end], fixed=fixed)
 
-    def change(self, ratio: Ratio, allowed: float) -> Float | float:
-        """Return how far the threshold of a ratio to the factor is from `allowed`, since the prior is not normal.
+    def change(self, value: Float, factor: Float, width: Float, allowed: float) -> Float:
+        """Return how far the thresholds of quantities are from `allowed`, since the prior is not normal, shape (n,).
 
-        The part of the ratio's scatter that comes from the prior has the distribution of the prior.
+        The part of a quantity's scatter that comes from the prior has the distribution of the prior.
+
+        Parameters
+        ----------
+        value, factor : ndarray, shape (n,)
+            Quantity, and the best factor on light.
+        width : ndarray, shape (n,)
+            Width of the quantity's interval for a rise of chi-squared by `allowed`.
         """
-        if not self.prior.size:
-            return 0.0
-        value = np.nan_to_num(ratio.value)
-        total = np.maximum(ratio.variance_at(value), 1e-300)
-        share = np.clip(value**2 * self.prior_share / self.scale**2 / total, 0.0, 1.0)
-        return np.interp(share, SHARES, _thresholds(self.prior.tobytes(), allowed)) - allowed
+        share = np.zeros_like(value)
+        known = np.isfinite(value) & np.isfinite(width) & (width > 0.0) & (factor > 0.0)
+        by_prior = value[known] * np.sqrt(self.prior_share) / (self.scale * factor[known])
+        share[known] = np.clip(4.0 * allowed * (by_prior / width[known]) ** 2, 0.0, 1.0)
+        return np.asarray(np.interp(share, SHARES, _thresholds(self.prior.tobytes(), allowed)) - allowed)
 
     def estimate(self, sums: Float, log_k: Float, linear: Float) -> Float:
         """Return the best factor, (n, ...), for sums (n,), temperatures (n, ...) and amplitudes (n, ..., n_linear)."""

@@ -8,7 +8,7 @@ amplitude are rejected. Only the blackbody depends on the temperature, so each f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, combinations
@@ -249,15 +249,18 @@ def bounded_intervals(
         without = profile.factor(x, np.zeros((*x.shape, len(model.linear))))
         of_light = without, np.moveaxis(light.weights_of(x), -1, 0), light.scale**-2.0
 
-    def change(ratio: Ratio) -> Float | float:
-        """Return the change of the threshold by a prior of the factor that is not normal."""
-        return 0.0 if light is None else light.change(ratio, allowed)
-
     def ends(one: Derived, spline: CubicSpline | None) -> tuple[Float, Float]:
         if spline is None:
             return np.where(np.isnan(low), -np.inf, np.exp(low)), np.where(np.isnan(high), np.inf, np.exp(high))
         if one.ratio is None:
-            return _linear_ends(faces, np.moveaxis(spline(x), -1, 0), least, of_light, change)
+            factors = np.moveaxis(spline(x), -1, 0)
+            found = _linear_ends(faces, factors, least, of_light)
+            if light is None or not light.prior.size:
+                return found
+            factor = profile.factor(best.log_k, best.linear)
+            value = np.einsum("nl,nl->n", spline(best.log_k), best.linear) / factor
+            moved = light.change(value, factor, found[1] - found[0], allowed)
+            return _linear_ends(faces, factors, least - moved[:, None], of_light)
         lowest, highest = _ratio_ends(products, faces, spline(x), least)
         return one.offset + lowest, one.offset + highest
 
@@ -271,7 +274,6 @@ def _linear_ends(
     factors: Float,
     least: Float,
     of_light: tuple[Float, Float, float] | None,
-    threshold: Callable[[Ratio], Float | float],
 ) -> tuple[Float, Float]:
     """Return the ends of a quantity that is linear in the amplitudes, with factors (n_linear, n, n_sample).
 
@@ -292,7 +294,6 @@ def _linear_ends(
             dims = face.change(of_light[1])
             covariance = face.product(factors, dims)
             ratio = Ratio(middle, of_light[0] - face.value(of_light[1]), variance, dims[2] + of_light[2], -covariance)
-            left = np.maximum(left + threshold(ratio), 0.0)
         else:
             dims, ratio = change, None
         for sign, found, which in ((-1.0, lows, np.minimum), (1.0, highs, np.maximum)):

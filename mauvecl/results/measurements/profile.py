@@ -250,8 +250,6 @@ def _linear_interval(
     # The ratio is straight where the recorded quantity less the ratio times the factor is.
     middle = ratio.value[:, SAMPLES // 2, None]
     estimate = value if known else value - middle * ratio.bottom
-    if profile.reduction.light is not None:
-        left = left + np.where(left >= 0.0, profile.reduction.light.change(ratio, allowed), 0.0)
     outside = left < 0.0
     outside[:, [0, -1]] = False  # rounding decides at the ends themselves
 
@@ -261,13 +259,20 @@ def _linear_interval(
         return Ratio(*(one[rows] for one in vars(ratio).values())).end(room, sign)
 
     ends = [_hull(reached(left, sign), outside, sign)[0] for sign in (-1.0, 1.0)]
+    light = profile.reduction.light
+    if light is not None and light.prior.size:
+        half = SAMPLES // 2
+        change = light.change(ratio.value[:, half], ratio.bottom[:, half], ends[1] - ends[0], allowed)
+        left = left + change[:, None]
+        outside |= left < 0.0
+        ends = [_hull(reached(left, sign), outside, sign)[0] for sign in (-1.0, 1.0)]
     bend = np.abs(estimate[:, 0] + estimate[:, -1] - 2 * estimate[:, SAMPLES // 2])
     # Simulated fits need the error of the temperature, which its interval gives if it has both ends.
     wide = (ends[1] - ends[0]) * (1.0 if known else ratio.bottom[:, SAMPLES // 2])
     bent = np.flatnonzero(closed & np.isfinite(wide) & (bend > CURVED * np.sqrt(allowed) * wide))
     if bent.size:
-        if not known and profile.reduction.light is not None:
-            nodes, light = profile.nodes, profile.reduction.light
+        if light is not None:
+            nodes = profile.nodes
             factors = spline(nodes) + float(np.median(middle[bent])) * light.weights_of(nodes)
             spline = scipy.interpolate.CubicSpline(nodes, factors)
         thresholds = _Thresholds(profile, spline)
@@ -277,7 +282,7 @@ def _linear_interval(
             place = np.arange(bent.size), which
             # Share of the variance that is not the factor's; the factor is straight.
             share = np.ones(bent.size)
-            if not known:
+            if light is not None:
                 at = middle[bent, 0]
                 total = ratio.variance_at(middle)[bent, which]
                 own = light.scale**-2.0 * at**2
