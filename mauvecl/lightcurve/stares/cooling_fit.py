@@ -148,8 +148,11 @@ class _Data:
         inside = (log_k > self.model.log_k[0]) & (log_k < self.model.log_k[-1])
         return of_rise, of_log_k * inside
 
-    def whitening(self, theta: Float | None) -> _Whitening:
-        """Return the whitening of residuals for the covariances of a flare, or of frames without one."""
+    def whitening(self, theta: Float | None, *, none: bool = False) -> _Whitening:
+        """Return the whitening of residuals for the covariances of a flare, or of frames without one.
+
+        With `none`, the unknown levels are those of frames without a flare, whose residuals are then compared.
+        """
         covariance, flare = self.quiet_covariance, None
         if theta is not None:
             flare = self.strengths(theta)
@@ -160,7 +163,7 @@ class _Data:
         inverse = np.linalg.inv(np.linalg.cholesky(covariance))
         if not self.unknown:
             return _Whitening(inverse, np.zeros((0, self.sums.size)), np.zeros(0))
-        changes = np.array([one.around(flare) for one in self.unknown])
+        changes = np.array([one.around(None if none else flare) for one in self.unknown])
         spectra = np.einsum("tij,utj->tiu", inverse, changes).reshape(self.sums.size, -1)
         # The prior acts as one more datum, which is not among the residuals because its mean is zero.
         scale = np.linalg.cholesky(spectra.T @ spectra + np.diag([one.sd**-2.0 for one in self.unknown]))
@@ -329,7 +332,8 @@ def fit_cooling(
                 ends[side, k, q] = end
     dof = data.sums.size - free.size - sum(np.isinf(one.sd) for one in data.unknown)
     empty = np.full(theta.shape, -np.inf)
-    none = float(np.sum(data.residuals(np.where(np.arange(theta.size) == 2, empty, theta), whitening) ** 2))
+    without = data.whitening(theta, none=True)
+    none = float(np.sum(data.residuals(np.where(np.arange(theta.size) == 2, empty, theta), without) ** 2))
     return Measurement(
         tuple(names), tuple(one.unit for one in quantities), (-np.inf,) + (0.0,) * (len(quantities) - 1),
         estimates[None], spread[None], tuple(levels), ends[0][:, None], ends[1][:, None], np.array([best]),
