@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,12 +15,13 @@ from mauvecl.results.measurements.fit import Forecast, Measurement, fit, forecas
 from mauvecl.results.measurements.flare_model import FlareModel
 from mauvecl.results.measurements.light_factor import Ratio
 from mauvecl.results.measurements.profile import Profile, ratio_at
-from mauvecl.results.measurements.reduction import Ranges, Reduction, usable_variance
+from mauvecl.results.measurements.reduction import Ranges, Reduction, usable_variance, variance_of
 from mauvecl.results.measurements.two_temperatures import (
     TwoTemperatures,
     fit_two_temperatures,
     forecast_two_temperatures,
 )
+from mauvecl.schema.errors import InputError
 from mauvecl.study.measurements import fitted_models
 from mauvecl.study.unknowns import throughput_cases
 
@@ -55,12 +56,19 @@ class ExpectedMeasurement(InCell):
         return f"{self.title}, flare {100 * self.amplitude:g} %, {self.model}"
 
     def forecasts(self, factors: Float, unknown: Nuisances | None) -> list[Forecast]:
-        """Return the expected errors for the flare times factors, with unknowns marginalised or all of them known."""
+        """Return the expected errors for the flare times factors, with unknowns marginalised or all of them known.
+
+        Errors of a flare that leaves too few pixels below saturation are undefined.
+        """
         log_k, linear = self.perfect.log_k[0], self.perfect.amplitudes[0]
-        return [
-            forecast_model(self.quiet, self.fitted, log_k, factor * linear, unknown, self.skipped_nm)
-            for factor in factors
-        ]
+
+        def at(factor: float) -> Forecast:
+            try:
+                return forecast_model(self.quiet, self.fitted, log_k, factor * linear, unknown, self.skipped_nm)
+            except InputError:
+                return replace(self.ahead, errors=np.full_like(self.ahead.errors, np.nan))
+
+        return [at(float(factor)) for factor in factors]
 
     def region(self, rise: float, n: int = 161) -> tuple[Float, Float, Float]:
         """Return the expected confidence region of temperature and amplitude, with everything else profiled.
@@ -189,12 +197,13 @@ def expected_measurements(
     lit = flare.recorded_dn - quiet.recorded_dn
     known_snr, snr = (matched_filter(quiet, flare, one, lit, skipped)[1] for one in (None, case.unknowns()))
     calibrated = throughput_cases(case)
+    # A fit in few pixels may differ from the flare in those that saturate, which its errors must not use.
+    lost = (*skipped, *_saturated_nm(flare))
     expected = []
     for name, model in (models or models_of(case)).items():
         perfect = fit_model(_mean_exposure(quiet, lit, unknown), quiet, model, unknown, skipped)
         known, ahead = (
-            forecast_model(quiet, model, perfect.log_k[0], perfect.amplitudes[0], one, skipped)
-            for one in (None, unknown)
+            forecast_model(quiet, model, perfect.log_k[0], perfect.amplitudes[0], one, lost) for one in (None, unknown)
         )
         true = np.array([truth.value(quantity) for quantity in model.names])
         of_throughput = None
@@ -240,6 +249,14 @@ def _errors_of_throughput(
         exposure = _mean_exposure(quiet, flare.recorded_dn - case.quiet.recorded_dn, unknown)
         moved.append(fit_model(exposure, quiet, model, unknown, skipped_nm).estimates[0] - perfect.estimates[0])
     return np.asarray(np.sqrt(np.sum(np.square(moved), axis=0)))
+
+
+def _saturated_nm(flare: Expectation) -> list[tuple[float, float]]:
+    """Return the wavelengths of runs of pixels near saturation."""
+    near = ~variance_of(flare)[1]
+    steps = np.flatnonzero(np.diff(np.concatenate([[0], near.astype(np.int8), [0]])))
+    nm = flare.wavelength_nm
+    return [(float(nm[first]), float(nm[end - 1])) for first, end in steps.reshape(-1, 2)]
 
 
 def _mean_exposure(quiet: Expectation, added_dn: Float, unknown: Nuisances | None) -> Float:
