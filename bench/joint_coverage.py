@@ -3,9 +3,9 @@
     python bench/joint_coverage.py [--fits 300] [--device NAME] [--output bench/results/joint_coverage.ecsv]
 
 M3V at V = 9, 60 frames of 5 s, a flare that cools from 14 000 to 7000 K with a fold of 80 s and a half-width of 40 s.
-Frames are drawn pixel by pixel, each from an expectation of its own. "free": dark level with no prior and star with
-one of 2 %, the same in all frames of a stare, drawn as dark 0.5 deg C and star 2 %. The faint flare takes five times
-as long, for the ends of its cooling are often open, and has a third of the fits.
+Frames are drawn pixel by pixel, each from an expectation of its own. "free": dark level with no prior and all light,
+that of the flare included, with one of 2 %, the same in all frames of a stare, drawn as dark 0.5 deg C and light 2 %.
+The faint flare takes five times as long, for the ends of its cooling are often open, and has a third of the fits.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mauvecl.statistics.intervals import clopper_pearson
 COOLING = Cooling(14_000.0, 7000.0, 80.0)
 #: Amplitude and share of the fits, by what is unknown.
 CASES = (("known", 1.5, 1.0), ("free", 1.5, 1.0), ("known", 0.3, 1 / 3))
-#: Standard deviations with which unknowns are drawn: deg C of the dark current, and a share of the star.
+#: Standard deviations with which unknowns are drawn: deg C of the dark current, and a share of all light.
 DRAWN = (0.5, 0.02)
 
 
@@ -55,6 +55,7 @@ def main() -> None:
         if unknown == "free":
             sizes = np.random.default_rng(seed).standard_normal((count, len(DRAWN))) * DRAWN
             raw += (sizes @ free.spectra)[:, None]
+            raw += sizes[:, 1, None, None] * np.array([one.net_source_dn - quiet.net_source_dn for one in frames])
         how = {"peak_s": 50.0, "half_width_s": 30.0}
         nuisances = free if unknown == "free" else None
         mean = np.array([one.recorded_dn for one in frames])

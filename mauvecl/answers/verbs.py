@@ -105,6 +105,17 @@ def _budgets_or_star(given: dict[str, Any]) -> Study:
     return Study() if named else PAPER_BUDGETS
 
 
+def _formula_grid(given: dict[str, Any]) -> Study:
+    """Return a study that sweeps what no flag states: magnitudes, exposures, or both, as `gaussian` does."""
+    from mauvecl.answers.detection.gaussian import grid
+    from mauvecl.study.study import Study
+
+    magnitudes, exposure = given["magnitude"], given["exposure"]
+    if not magnitudes and exposure is None:
+        return Study()
+    return Study().model_copy(update={"sweep": grid(magnitude=not magnitudes, exposure_s=exposure)})
+
+
 #: By name, in the order of `mauvecl --help`: one star, flares, hours and campaigns.
 VERBS: dict[str, Verb] = {
     one.name: one
@@ -203,7 +214,8 @@ VERBS: dict[str, Verb] = {
 
     Its S/N, intervals and false alarms are compared with those of realisations.
 
-    Without a sweep: magnitudes from 4 to 12, exposures of 5, 50 and 600 s.
+    Without a sweep: magnitudes from 4 to 12 and exposures of 5, 50 and 600 s, where --magnitude or --exposure states
+    no others.
 
     Example: mauvecl gaussian --star G2V --sweep magnitude=6,10 --sweep exposure=5,50
     """,
@@ -211,6 +223,7 @@ VERBS: dict[str, Verb] = {
             counts="realisations",
             older=("gaussian_report",),
             defaults=FEWER,
+            default=_formula_grid,
         ),
         Verb(
             "measure",

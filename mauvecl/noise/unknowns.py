@@ -95,6 +95,8 @@ class Nuisance(Unknown):
     treatment: Treatment = "marginalised"
     #: Function of a quiescent expectation that returns DN of the exposure for unit amplitude, shape (n_pixel,).
     spectrum: Callable[[Expectation], Float]
+    #: Function that returns the relative change of a flare's light for unit amplitude; None if it does not change.
+    of_flare: Callable[[Expectation], Float] | None = None
     unit: str = "%"  # unit in messages; relative amplitudes are shown in per cent
     process: str = ""  # process that draws it in the documented set
     scatter: float = math.nan  # root mean square of the amplitude that this process draws
@@ -160,6 +162,10 @@ def _dark_follows(at: Conditions, temperature_c: Float) -> Float:
 def _lost(key: str) -> Callable[[Conditions, Float], Float]:
     """Return the change of light by a loss that replaces the expectation's."""
     return lambda at, lost: (at[key] - lost) / (1.0 - at[key])
+
+
+def _tilt(quiet: Expectation) -> Float:
+    return (quiet.wavelength_nm - MIDDLE_NM) / TILT_NM
 
 
 def _by_name(*rows: Row) -> dict[str, Row]:
@@ -235,6 +241,7 @@ NUISANCES = _by_name(
         of="light",
         label="the light level",
         spectrum=lambda quiet: quiet.recorded_light_dn,
+        of_flare=lambda quiet: 1.0 + 0.0 * quiet.wavelength_nm,
         process="jitter",
         scatter=0.05 / 3**0.5,
         prior=Amplitude(math.inf),
@@ -254,7 +261,8 @@ NUISANCES = _by_name(
         name="tilt",
         of="response",
         label="the response's colour",
-        spectrum=lambda quiet: quiet.recorded_light_dn * (quiet.wavelength_nm - MIDDLE_NM) / TILT_NM,
+        spectrum=lambda quiet: quiet.recorded_light_dn * _tilt(quiet),
+        of_flare=_tilt,
     ),
 )
 #: Nuisance parameters of the documented set.

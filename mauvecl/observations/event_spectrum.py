@@ -201,7 +201,10 @@ def measure_flare(
     exposure = model.exposure(series.light, variance, n)
     unknown = {name: row * n / model.per_dn for name, row in model.unknowns(series.light).items()}
     sd = drifts(survey, series, taken, n)
-    nuisances = Nuisances(tuple(unknown), np.array(list(unknown.values())), np.array([sd[name] for name in unknown]))
+    spectra, errors = np.array(list(unknown.values())), np.array([sd[name] for name in unknown])
+    # What changes the light of the star changes that of the flare alike.
+    of_flare = np.array([np.full(summed.size, float(name == "light")) for name in unknown])
+    nuisances = Nuisances(tuple(unknown), spectra, errors, of_flare)
     try:
         return fit((summed / model.per_dn + exposure.recorded_dn)[None], exposure, model.flares_of(n), nuisances)
     except InputError as error:

@@ -35,14 +35,17 @@ def change_against_magnitude(plt: Any, answer: ChangeAnswer) -> Any:
             own = own[: len(own) // answer.many]
             x = np.array([row.magnitude for row in own])
             y = np.array([row.smallest.one for row in own]) * (1 if unit else 100)
-            axis.plot(x[np.isfinite(y)], y[np.isfinite(y)], color=colour, label=name)
+            if np.isfinite(y).any():
+                axis.plot(x[np.isfinite(y)], y[np.isfinite(y)], color=colour, label=name)
         magnitude = answer.study.star[0].magnitude
         if magnitude is not None:
             axis.axvline(magnitude, color=NULL, linewidth=0.8, linestyle=":")
-        axis.set(yscale="log", xlabel=f"magnitude ({answer.study.star[0].band})",
-                 ylabel=f"smallest change ({unit or '%'})")  # fmt: skip
-        plain_numbers(axis)
-        axis.legend()
+        axis.set(xlabel=f"magnitude ({answer.study.star[0].band})", ylabel=f"smallest change ({unit or '%'})")
+        # Without a pixel that does not saturate there is nothing to show.
+        if axis.get_legend_handles_labels()[1]:
+            axis.set(yscale="log")
+            plain_numbers(axis)
+            axis.legend()
     visits, exposure = answer.study.change.visits, answer.study.observation.exposure_s
     headline(figure, f"{title}: smallest change between {visits} visits of {exposure:g} s", titles.note)
     return figure

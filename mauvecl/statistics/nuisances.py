@@ -7,7 +7,7 @@ variances S of their amplitudes. An amplitude of infinite variance is projected 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,11 +36,22 @@ class Nuisances(ContentEquality):
         DN of the exposure for unit amplitude.
     sd : ndarray, shape (k,)
         Prior standard deviations of the amplitudes; infinite for a flat prior.
+    of_flare : ndarray, shape (k, n_pixel), optional
+        Relative change of the light of a flare for unit amplitude: 1 for a factor on all light, 0 by default. Fits of
+        flares use it; statistics test for a flare, and use the spectra without one.
+    mean : ndarray, shape (k,), optional
+        Prior means of the amplitudes in fits of flares, 0 by default.
+    factor_prior : ndarray, shape (2, n), optional
+        Values of the factor on all light, in standard deviations from its mean, and their probabilities, if its prior
+        is not normal; fits of flares use it.
     """
 
     names: tuple[str, ...]
     spectra: Float
     sd: Float
+    of_flare: Float = field(default_factory=lambda: np.zeros((0, 0)))
+    mean: Float = field(default_factory=lambda: np.zeros(0))
+    factor_prior: Float = field(default_factory=lambda: np.zeros((2, 0)))
 
     def __post_init__(self) -> None:
         shapes = np.shape(self.spectra), np.shape(self.sd)
@@ -67,6 +78,13 @@ class Nuisances(ContentEquality):
                     key="sd",
                     value=sd,
                 )
+        for name, expected in (("of_flare", np.shape(self.spectra)), ("mean", np.shape(self.sd))):
+            given = getattr(self, name)
+            values = np.asarray(given, np.float64) if np.size(given) else np.zeros(expected)
+            if values.shape != expected or not np.isfinite(values).all():
+                raise InputError(f"{name} of the unknowns has the shape {values.shape}", f"finite numbers, {expected}",
+                                 key=name, value=values.shape)  # fmt: skip
+            object.__setattr__(self, name, values)
 
     @classmethod
     def of(
@@ -88,8 +106,11 @@ class Nuisances(ContentEquality):
             If a name has no spectrum, or a spectrum is zero everywhere.
         """
         own = own or {}
-        spectra = []
+        spectra, of_flare = [], []
         for name in sd:
+            row = None if name in own else NUISANCES.get(name)
+            shape = quiet.wavelength_nm.shape
+            of_flare.append(np.zeros(shape) if row is None or row.of_flare is None else row.of_flare(quiet))
             if name in own:
                 spectrum = np.asarray(own[name], np.float64)
                 if spectrum.shape != quiet.wavelength_nm.shape:
@@ -110,7 +131,12 @@ class Nuisances(ContentEquality):
                 )
             spectra.append(spectrum)
         shape = len(spectra), quiet.wavelength_nm.size
-        return cls(tuple(sd), np.array(spectra).reshape(shape), np.array(list(sd.values()), np.float64))
+        return cls(
+            tuple(sd),
+            np.array(spectra).reshape(shape),
+            np.array(list(sd.values()), np.float64),
+            np.array(of_flare).reshape(shape),
+        )
 
     def _line(self) -> str:
         return ", ".join(
@@ -128,8 +154,62 @@ class Nuisances(ContentEquality):
 
     def without(self, names: Collection[str]) -> Nuisances:
         """Return all parameters but those named."""
-        kept = [i for i, name in enumerate(self.names) if name not in names]
-        return Nuisances(tuple(self.names[i] for i in kept), self.spectra[kept], self.sd[kept])
+        return self._rows([i for i, name in enumerate(self.names) if name not in names])
+
+    def _rows(self, kept: Sequence[int]) -> Nuisances:
+        kept = list(kept)
+        spectra, sd, of_flare, mean = (one[kept] for one in (self.spectra, self.sd, self.of_flare, self.mean))
+        return Nuisances(tuple(self.names[i] for i in kept), spectra, sd, of_flare, mean, self.factor_prior)
+
+    def with_spectrum(self, name: str, spectrum: Float, sd: float) -> Nuisances:
+        """Return the parameters with another one that leaves the light of a flare as it is."""
+        return self.joined(Nuisances((name,), spectrum[None], np.array([sd])))
+
+    def joined(self, other: Nuisances) -> Nuisances:
+        """Return these parameters and others."""
+        return Nuisances(
+            (*self.names, *other.names),
+            np.vstack([self.spectra, other.spectra]),
+            np.append(self.sd, other.sd),
+            np.vstack([self.of_flare, other.of_flare]),
+            np.append(self.mean, other.mean),
+            np.hstack([self.factor_prior, other.factor_prior]),
+        )
+
+    def with_prior(self, name: str, mean: float, sd: float) -> Nuisances:
+        """Return the parameters with another prior of one amplitude."""
+        chosen = np.array([one == name for one in self.names])
+        return replace(self, sd=np.where(chosen, sd, self.sd), mean=np.where(chosen, mean, self.mean))
+
+    @property
+    def has_factor(self) -> bool:
+        """Whether the last parameter multiplies all light, that of a flare included; see `around`."""
+        return bool(self.names) and bool((self.of_flare[-1] == 1.0).all())
+
+    def around(self, flare_dn: Float) -> Nuisances:
+        """Return the parameters for fits of a flare next to one that is recorded with these DN.
+
+        The factor on all light is the last one, and its spectrum is that without a flare: fits find the flare as it is
+        recorded. The spectra of the others include the flare.
+        """
+        order, factors = np.arange(len(self.names)), np.flatnonzero((self.of_flare == 1.0).all(axis=1))
+        if factors.size:
+            order = np.append(np.delete(order, factors[0]), factors[0])
+        found = self._rows(order.tolist())
+        spectra = found.spectra + found.of_flare * flare_dn
+        if factors.size:
+            spectra[-1] = found.spectra[-1]
+        return replace(found, spectra=spectra)
+
+    @property
+    def mean_factor(self) -> float:
+        """Prior mean of the factor on all light, that of a flare included."""
+        return 1.0 + float(self.mean[(self.of_flare == 1.0).all(axis=1)].sum())
+
+    @property
+    def mean_dn(self) -> Float:
+        """Mean change of the exposure by the priors' means, DN, shape (n_pixel,)."""
+        return np.asarray(self.mean @ self.spectra)
 
     def finite(self, spectra: Float) -> Float:
         """Return the spectra with finite priors times their standard deviations, shape (k_finite, n)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -173,6 +174,35 @@ class Case:
         Their spectra are those of `quiet`, by default the star without a flare.
         """
         return self.study.nuisances.marginalised(self.quiet if quiet is None else quiet)
+
+    def unknowns_of_fits(self, quiet: Expectation | None = None, stare: Stare | None = None) -> Nuisances | None:
+        """Return the nuisance parameters of fits of flares, or None; `quiet` as for `unknowns`.
+
+        The factor on all light has the mean and, unless the study states another, the standard deviation of what is
+        drawn; those of a stare are of the stare. The documented set leaves the star's own level free as well.
+        """
+        import numpy as np
+
+        from mauvecl.noise.factor_distributions import FactorDistributions
+
+        quiet = self.quiet if quiet is None else quiet
+        unknown, given = self.unknowns(quiet), self.study.nuisances.light
+        if unknown is None or "light" not in unknown.names or given == "free":
+            return unknown
+        if given is None and "star" not in unknown.names:
+            unknown = unknown.with_spectrum("star", quiet.net_source_dn, math.inf)
+        if stare is not None:
+            return unknown.without(["light"]) if given is None else unknown
+        drawn = FactorDistributions.from_processes(self.processes, quiet)
+        light = None if drawn is None else drawn.spreads.get("light")
+        if light is None:
+            return unknown.without(["light"]) if given is None else unknown
+        if given is not None:
+            return unknown.with_prior("light", light.mean - 1.0, given)
+        unknown = unknown.with_prior("light", light.mean - 1.0, light.sd)
+        if light.normal:
+            return unknown
+        return replace(unknown, factor_prior=np.array([(light.values - light.mean) / light.sd, light.weights]))
 
     def detect_options(self, quiet: Expectation | None = None) -> dict[str, Any]:
         """Return all arguments of `Engine.detect` except expectations and seed; `quiet` as for `unknowns`."""

@@ -222,3 +222,62 @@ def test_answer_holds_every_change_and_magnitude() -> None:
     assert np.all(np.asarray(short["smallest"]) > np.asarray(long["smallest"]))
     assert len(answer.magnitude_table) == len(answer.table) * 17
     assert np.all(answer.table["error"] >= answer.table["error_known"])
+
+
+FLAT = Source(np.linspace(150.0, 760.0, 611), np.full(611, 1e-12), "flat", "test")
+
+
+@pytest.mark.parametrize("limits", [(300.0, 301.0), (310.03, 317.58), (400.0, 500.0)])
+def test_bands_have_the_light_between_their_edges(limits: tuple[float, float], quiet: Expectation) -> None:
+    """Compare the share of a flat spectrum in each pixel, added up over wavelengths, with the width of the band."""
+    part, whole = (
+        Change.named(f"{low}-{high}", FLAT, quiet, MAUVE, "paper", None, "V").counts_dn
+        for low, high in (limits, (150.0, 760.0))
+    )
+    # Each pixel has the band's share of its line function, whose sum over pixels is the band's width.
+    share = part / whole * np.gradient(quiet.wavelength_nm)
+    assert float(share.sum()) == pytest.approx(limits[1] - limits[0], rel=2e-4)
+    centre = float(share @ quiet.wavelength_nm / share.sum())
+    assert centre == pytest.approx(sum(limits) / 2, abs=1e-3)
+
+
+@pytest.mark.parametrize(("name", "edge"), [("balmer jump", 364.6), ("colour", 450.0)])
+def test_changes_below_an_edge_end_there(name: str, edge: float, quiet: Expectation) -> None:
+    """Compare with the same change as a band, and find the edge where a pixel has half of the light."""
+    below, band = counts(name, quiet), counts(f"150-{edge}", quiet)
+    unit = 0.4 * np.log(10.0) if name == "colour" else 1.0
+    np.testing.assert_allclose(below, unit * band, rtol=1e-12, atol=1e-12 * band.max())
+    parts = [Change.named(one, FLAT, quiet, MAUVE, "paper", None, "V").counts_dn for one in (name, "150-760")]
+    share = parts[0] / parts[1] / unit
+    assert float(np.interp(0.5, share[::-1], quiet.wavelength_nm[::-1])) == pytest.approx(edge, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("magnitude", "none", "marked"),
+    [(-1.0, {"Ca II", "H beta", "H alpha", "320-700"}, {"Mg II", "balmer jump", "200-320", "colour"}),
+     (0.75, set(), {"H beta", "320-700", "colour"}), (6.0, set(), set())],
+)  # fmt: skip
+def test_rows_with_saturated_pixels_are_marked(magnitude: float, none: set[str], marked: set[str]) -> None:
+    """Check that rows without a pixel have no number, and that indices with a saturated pixel have none."""
+    answer = change(Study().with_settings([f"star=[{{library='G2V', magnitude={magnitude}}}]"]))
+    for row in answer.changes:
+        name = row.change.name
+        assert np.isnan(row.error) == (name in none)
+        assert ("saturate" in row.note) == (name in none | marked), row.note
+    for index in answer.indices:
+        lost = index.value.index.name in none | marked
+        assert np.isnan(index.value.value) == np.isnan(index.snr) == np.isnan(index.error) == lost
+        assert bool(index.note) == lost
+    assert not any("HIDDEN" in text for text in answer.messages)
+
+
+def test_a_colour_of_magnitudes_is_not_linear() -> None:
+    """Check that the faintest star's smallest colour is a few magnitudes, and that of a bright one proportional."""
+    faint, bright = (
+        change(Study().with_settings([f"star=[{{library='M3V', magnitude={v}}}]", "change.of=['colour', '150-450']"]))
+        for v in (16.0, 6.0)
+    )
+    for answer in (faint, bright):
+        colour, band = (row.smallest.one for row in answer.changes)
+        assert colour == pytest.approx(2.5 * np.log10(1.0 + band), rel=1e-6)
+    assert faint.changes[0].smallest.one < 10.0

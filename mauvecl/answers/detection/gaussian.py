@@ -25,7 +25,8 @@ from mauvecl.schema.calls import validated
 from mauvecl.schema.tables import Column, View, number, table_of
 from mauvecl.study.labels import place_columns
 from mauvecl.study.questions import Axis, Sweep
-from mauvecl.study.study import Study
+from mauvecl.study.sections import Observation
+from mauvecl.study.study import PAPER_STARS, Study
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -77,13 +78,15 @@ WORST_COLUMNS = (
            description="largest significant difference of a detection probability from the closed form",
            heading="detection off by", format="+.4f"),
 )  # fmt: skip
-#: Default sweep.
-GRID = Sweep(
-    axes=(
-        Axis(quantity="magnitude", values=(4.0, 6.0, 8.0, 10.0, 12.0)),
-        Axis(quantity="exposure", values=(5.0, 50.0, 600.0)),
-    )
-)
+#: Magnitudes and exposures of the default sweep.
+MAGNITUDES, EXPOSURES_S = (4.0, 6.0, 8.0, 10.0, 12.0), (5.0, 50.0, 600.0)
+
+
+def grid(*, magnitude: bool = True, exposure_s: float | None = None) -> Sweep:
+    """Return the default sweep over magnitudes, or without them, and over exposures, or at a given one."""
+    axes = [Axis(quantity="magnitude", values=MAGNITUDES)] if magnitude else []
+    exposures = EXPOSURES_S if exposure_s is None else (exposure_s,)
+    return Sweep(axes=(*axes, Axis(quantity="exposure", values=exposures)))
 
 
 def coverage(result: SnrResult) -> NDArray[np.float64]:
@@ -264,14 +267,18 @@ def gaussian(
     Parameters
     ----------
     study : Study
-        Without a sweep: magnitudes from 4 to 12, exposures of 5, 50 and 600 s.
+        Without a sweep: magnitudes from 4 to 12 and exposures of 5, 50 and 600 s, unless it states the magnitudes of
+        its stars, or another exposure than the default.
     engine : Engine or Pool, optional
     progress : callable, optional
         Called as ``progress(done, total)`` in stars, each of which is drawn for its S/N and then for its flares.
     """
     engine = engine or Engine()
-    if not study.sweep.axes:
-        study = study.model_copy(update={"sweep": GRID})
+    stated = study.star != PAPER_STARS and all(one.magnitude is not None for one in study.star)
+    if not study.sweep.axes and not stated:
+        own = study.observation.exposure_s
+        usual = own == Observation().exposure_s
+        study = study.model_copy(update={"sweep": grid(exposure_s=None if usual else own)})
 
     def progress_of(part: int) -> Callable[[int, int], None]:
         def report(done: int, total: int) -> None:

@@ -76,7 +76,7 @@ def measured_stare(case: Case, engine: Engine | Pool) -> MeasuredStare:
         raise InputError(f"a stare with {len(events)} flares", "one, which a joint fit is of", key="measure.joint_fit")
     quiet, stare, seed = staring.quiet, staring.stare, study.run.seed
     name, model = last_of_one_temperature(models_of(case.one_frame))
-    unknown = case.unknowns(quiet)
+    unknown = case.unknowns_of_fits(quiet, stare)
     processes = study.processes.additive_only
 
     def draw(components: Components) -> Float:

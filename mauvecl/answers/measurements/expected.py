@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,12 +13,15 @@ from mauvecl.answers.answer import InCell
 from mauvecl.answers.measurements.truth import Truth
 from mauvecl.results.measurements.fit import Forecast, Measurement, fit, forecast
 from mauvecl.results.measurements.flare_model import FlareModel
-from mauvecl.results.measurements.reduction import Ranges, Reduction, usable_variance
+from mauvecl.results.measurements.light_factor import Ratio
+from mauvecl.results.measurements.profile import Profile, ratio_at
+from mauvecl.results.measurements.reduction import Ranges, Reduction, usable_variance, variance_of
 from mauvecl.results.measurements.two_temperatures import (
     TwoTemperatures,
     fit_two_temperatures,
     forecast_two_temperatures,
 )
+from mauvecl.schema.errors import InputError
 from mauvecl.study.measurements import fitted_models
 from mauvecl.study.unknowns import throughput_cases
 
@@ -43,7 +46,7 @@ class ExpectedMeasurement(InCell):
     perfect: Measurement  # the fit to the mean exposure: estimates without noise
     fitted: FlareModel | TwoTemperatures
     quiet: Expectation
-    unknown: Nuisances | None
+    unknown: Nuisances | None  # of the fits
     of_throughput: Float | None  # standard errors by the calibration of the throughput, which exposures share
     skipped_nm: Ranges  # wavelength ranges that are not used
 
@@ -53,12 +56,19 @@ class ExpectedMeasurement(InCell):
         return f"{self.title}, flare {100 * self.amplitude:g} %, {self.model}"
 
     def forecasts(self, factors: Float, unknown: Nuisances | None) -> list[Forecast]:
-        """Return the expected errors for the flare times factors, with unknowns marginalised or all of them known."""
+        """Return the expected errors for the flare times factors, with unknowns marginalised or all of them known.
+
+        Errors of a flare that leaves too few pixels below saturation are undefined.
+        """
         log_k, linear = self.perfect.log_k[0], self.perfect.amplitudes[0]
-        return [
-            forecast_model(self.quiet, self.fitted, log_k, factor * linear, unknown, self.skipped_nm)
-            for factor in factors
-        ]
+
+        def at(factor: float) -> Forecast:
+            try:
+                return forecast_model(self.quiet, self.fitted, log_k, factor * linear, unknown, self.skipped_nm)
+            except InputError:
+                return replace(self.ahead, errors=np.full_like(self.ahead.errors, np.nan))
+
+        return [at(float(factor)) for factor in factors]
 
     def region(self, rise: float, n: int = 161) -> tuple[Float, Float, Float]:
         """Return the expected confidence region of temperature and amplitude, with everything else profiled.
@@ -76,35 +86,44 @@ class ExpectedMeasurement(InCell):
             Smallest and largest amplitude at each temperature.
         """
         assert isinstance(self.fitted, FlareModel)
-        best, linear = self.perfect.log_k[0], self.perfect.amplitudes[0]
-        mean_dn = self.fitted.counts(np.exp(best), linear)
+        best, linear = self.perfect.log_k, self.perfect.factor[0] * self.perfect.amplitudes[0]
+        mean_dn = self.fitted.counts(float(np.exp(best[0])), linear)
         reduction = Reduction.of(self.fitted, self.quiet, mean_dn, self.unknown, self.skipped_nm)
-        basis, _ = reduction.basis
         mean = linear[0] * reduction.spline(best) + linear[1:] @ reduction.fixed
-        rest = mean - (mean @ basis.T) @ basis
+        light = reduction.light
+        of_light = None
+        if light is not None:
+            # The sum of the factor on light for the fitted flare.
+            flare = linear[0] * light.spline(best) + linear[1:] @ light.fixed
+            of_light = light.scale * (self.perfect.factor - light.expected) + flare
+        profile = Profile(reduction, mean, of_light)
+        gain = float(mean[0] @ mean[0])
+        amplitude = self.fitted.splines[self.fitted.names.index("amplitude")]
+        assert amplitude is not None
 
-        def at(log_k: Float) -> tuple[Float, Float, Float]:
-            hot = reduction.spline(log_k)
-            hot = hot - (hot @ basis.T) @ basis
-            power = np.einsum("tk,tk->t", hot, hot)
-            amplitude = hot @ rest / power
-            return amplitude, power, rise - (rest @ rest - amplitude**2 * power)
+        def at(log_k: Float) -> tuple[Float, Ratio]:
+            """Return what is left of the rise at temperatures, and the amplitude there."""
+            x = log_k[None]
+            value, variance, hot = profile.parts(x)
+            along = float(profile.along[0] @ profile.along[0])
+            left = rise - (gain - along - value**2 / variance)
+            return left, ratio_at(profile, amplitude, x, profile.linear(x, value, hot), variance, hot)
 
         nodes = np.linspace(reduction.log_k[0], reduction.log_k[-1], 8 * reduction.log_k.size)
-        inside = np.flatnonzero(at(nodes)[2] >= 0.0)
+        inside = np.flatnonzero(at(nodes)[0][0] >= 0.0)
         # From the outermost node inside to the next one, where the region ends, or from the fit.
-        known = nodes[inside[[0, -1]]] if inside.size else np.array([best, best])
+        known = nodes[inside[[0, -1]]] if inside.size else np.array([best[0], best[0]])
         beyond = np.searchsorted(nodes, known[0]) - 1, np.searchsorted(nodes, known[1], side="right")
         ends = [
-            scipy.optimize.brentq(lambda x: float(at(np.array([x]))[2][0]), inner, nodes[k])
+            scipy.optimize.brentq(lambda x: float(at(np.array([x]))[0][0, 0]), inner, nodes[k])
             if 0 <= k < nodes.size else inner
             for inner, k in zip(known, beyond, strict=True)
         ]  # fmt: skip
         # Dense at the ends, where the two amplitudes converge like a root.
         log_k = (ends[0] + ends[1]) / 2 + (ends[1] - ends[0]) / 2 * np.sin(np.linspace(-np.pi / 2, np.pi / 2, n))
-        amplitude, power, left = at(log_k)
-        reach = np.sqrt(np.maximum(left, 0.0) / power)
-        return np.exp(log_k), np.maximum(amplitude - reach, 0.0), amplitude + reach
+        left, found = at(log_k)
+        low, high = (found.end(left, sign)[0] for sign in (-1.0, 1.0))
+        return np.exp(log_k), np.maximum(low, 0.0), high
 
 
 def fit_model(
@@ -172,18 +191,19 @@ def expected_measurements(
     case: Case, amplitude: float, flare: Expectation, models: dict[str, FlareModel | TwoTemperatures] | None = None
 ) -> list[ExpectedMeasurement]:
     """Forecast the measurement of a flare with each model, by default those of `models_of`."""
-    quiet, light, unknown = case.quiet, case.study.flare.light(), case.unknowns()
+    quiet, light, unknown = case.quiet, case.study.flare.light(), case.unknowns_of_fits()
     band, skipped = case.study.flare.band, case.study.measure.skipped_nm
     truth = Truth(case.star, case.source, case.flaring(amplitude), light, band, quiet.exposure_s)
     lit = flare.recorded_dn - quiet.recorded_dn
-    known_snr, snr = (matched_filter(quiet, flare, one, lit, skipped)[1] for one in (None, unknown))
+    known_snr, snr = (matched_filter(quiet, flare, one, lit, skipped)[1] for one in (None, case.unknowns()))
     calibrated = throughput_cases(case)
+    # A fit in few pixels may differ from the flare in those that saturate, which its errors must not use.
+    lost = (*skipped, *_saturated_nm(flare))
     expected = []
     for name, model in (models or models_of(case)).items():
-        perfect = fit_model(flare.recorded_dn, quiet, model, unknown, skipped)
+        perfect = fit_model(_mean_exposure(quiet, lit, unknown), quiet, model, unknown, skipped)
         known, ahead = (
-            forecast_model(quiet, model, perfect.log_k[0], perfect.amplitudes[0], one, skipped)
-            for one in (None, unknown)
+            forecast_model(quiet, model, perfect.log_k[0], perfect.amplitudes[0], one, lost) for one in (None, unknown)
         )
         true = np.array([truth.value(quantity) for quantity in model.names])
         of_throughput = None
@@ -226,9 +246,23 @@ def _errors_of_throughput(
     moved = []
     for case in calibrated:
         (flare,) = case.expect(case.flaring(amplitude))
-        exposure = quiet.recorded_dn + flare.recorded_dn - case.quiet.recorded_dn
+        exposure = _mean_exposure(quiet, flare.recorded_dn - case.quiet.recorded_dn, unknown)
         moved.append(fit_model(exposure, quiet, model, unknown, skipped_nm).estimates[0] - perfect.estimates[0])
     return np.asarray(np.sqrt(np.sum(np.square(moved), axis=0)))
+
+
+def _saturated_nm(flare: Expectation) -> list[tuple[float, float]]:
+    """Return the wavelengths of runs of pixels near saturation."""
+    near = ~variance_of(flare)[1]
+    steps = np.flatnonzero(np.diff(np.concatenate([[0], near.astype(np.int8), [0]])))
+    nm = flare.wavelength_nm
+    return [(float(nm[first]), float(nm[end - 1])) for first, end in steps.reshape(-1, 2)]
+
+
+def _mean_exposure(quiet: Expectation, added_dn: Float, unknown: Nuisances | None) -> Float:
+    """Return the mean of an exposure with a flare at the prior mean of the factor on all light, DN."""
+    factor = unknown.mean_factor if unknown else 1.0
+    return np.asarray(quiet.recorded_dn + (factor - 1.0) * quiet.recorded_light_dn + factor * added_dn)
 
 
 def matched_filter(

@@ -20,6 +20,7 @@ from mauvecl.answers.measurements.expected import ExpectedMeasurement, expected_
 from mauvecl.answers.progress import reported
 from mauvecl.device.engine import Engine
 from mauvecl.lightcurve.stares.measured_bins import MeasuredBins
+from mauvecl.noise.factor_distributions import FactorDistributions
 from mauvecl.results.measurements.fit import LEVELS, Measurement
 from mauvecl.results.measurements.reduction import usable_variance
 from mauvecl.runs.checkpoint import kept
@@ -28,6 +29,7 @@ from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column, View, number, percent, records, stacked, table_of
 from mauvecl.statistics.intervals import Interval, clopper_pearson
+from mauvecl.statistics.nuisances import join_names
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import amplitude_column, place_columns
 from mauvecl.study.messages import collect_messages
@@ -61,14 +63,17 @@ class MeasuredFlare(ExpectedMeasurement):
 
     def fitted_dn(self) -> tuple[Float, Float]:
         """Return the mean of the fitted flare in the first exposure, and the best values of unknowns, DN."""
-        mean = self.fitted.counts(np.exp(self.found.log_k[0]), self.found.amplitudes[0])
+        found = self.found
+        mean = self.fitted.counts(np.exp(found.log_k[0]), found.factor[0] * found.amplitudes[0])
         if self.unknown is None:
             return mean, np.zeros_like(mean)
-        variance, used = usable_variance(self.quiet, mean, self.skipped_nm)
-        spectra = self.unknown.spectra * used
+        unknown, expected = self.unknown.around(mean), self.unknown.mean_dn
+        variance, used = usable_variance(self.quiet, mean, self.skipped_nm, unknown)
+        spectra = unknown.spectra * used
         weighted = np.divide(spectra, variance, out=np.zeros_like(spectra), where=used)
-        information = np.diag(self.unknown.sd**-2.0) + weighted @ spectra.T
-        return mean, np.linalg.solve(information, weighted @ (self.frame - mean)) @ self.unknown.spectra
+        information = np.diag(unknown.sd**-2.0) + weighted @ spectra.T
+        left = self.frame - mean - expected
+        return mean, expected + np.linalg.solve(information, weighted @ left) @ unknown.spectra
 
     def rows(self) -> QTable:
         """Return one row per quantity."""
@@ -312,6 +317,7 @@ def measure(
     stares = [measured_stare(case, engine) for case in prepared if study.measure.along_stare]
     messages = collect_messages(expectations)
     messages += [one.drawn for one in stares if isinstance(one.drawn, str)]
+    messages += dict.fromkeys(line for case in prepared for line in _not_marginalised(case))
     return MeasureAnswer(study, flares, [*messages, *_faint(flares), *_wrong(flares)], stares)
 
 
@@ -321,7 +327,7 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
     expected = expected_measurements(case, amplitude, flare)
     models, unknown = [one.fitted for one in expected], expected[0].unknown
     skipped = study.measure.skipped_nm
-    weights = matched_filter(quiet, flare, unknown, skipped_nm=skipped)[0]
+    weights = matched_filter(quiet, flare, case.unknowns(), skipped_nm=skipped)[0]
 
     def fitted(start: int, count: int) -> Arrays:
         raw = engine.realise(flare, start=start, count=count, seed=study.run.seed, **case.draw_options)
@@ -336,7 +342,8 @@ def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine |
     parts: list[Arrays] = []
     for start in range(0, study.measure.fits, BATCH):
         count = min(BATCH, study.measure.fits - start)
-        depends_on = ("measure", quiet, flare, unknown, models, study.text(), start, count)
+        # The number changes with the arrays that a fit keeps.
+        depends_on = ("measure", 2, quiet, flare, unknown, models, study.text(), start, count)
         parts.append(kept(checkpoint, depends_on, partial(fitted, start, count)))
     selected = np.concatenate([arrays["detected"] for arrays in parts])
     measured = []
@@ -363,8 +370,24 @@ def _coverage(found: Measurement, truth: Float, level: int, which: NDArray[np.bo
 
 
 def _scatter(estimates: Float) -> Float:
+    """Return half of the central 68.27 % of the estimates, shape (n_derived,); undefined for a single one."""
+    if len(estimates) < 2:
+        return np.full(estimates.shape[1], np.nan)
     low, high = np.quantile(estimates, [0.15865, 0.84135], axis=0)
     return np.asarray((high - low) / 2)
+
+
+def _not_marginalised(case: Case) -> list[str]:
+    """Return a message on drawn factors over which fits do not marginalise."""
+    drawn = FactorDistributions.from_processes(case.processes, case.quiet)
+    unknown = case.unknowns_of_fits()
+    names = [name for name in (drawn.spreads if drawn else ()) if unknown is None or name not in unknown.names]
+    if not names:
+        return []
+    return [
+        f"NOT MARGINALISED: {join_names(names)}. Exposures are drawn with other levels than fits expect, so that "
+        f"intervals miss the truth; `nuisances.{names[0]}` marginalises over one."
+    ]
 
 
 def _faint(flares: Sequence[MeasuredFlare]) -> list[str]:

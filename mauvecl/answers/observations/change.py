@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
 
@@ -14,7 +14,7 @@ from mauvecl.answers.progress import reported
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.observations.changes.indices import INDICES, Change, IndexValue, covered_indices, flux_per_dn
 from mauvecl.observations.changes.periods import Recovery, recover_periods, visit_times_d
-from mauvecl.observations.changes.smallest import Smallest, error_of_change, error_of_index, smallest_change
+from mauvecl.observations.changes.smallest import Smallest, error_of_change, error_of_index, pixels_of, smallest_change
 from mauvecl.schema.calls import validated
 from mauvecl.schema.tables import Column, View, number, percent, table_of
 from mauvecl.study.cases import Case, cases
@@ -50,6 +50,23 @@ class ChangeRow(InCell):
     error_known: float
     smallest: Smallest  # in the unit of the change
     magnitude: float | None  # of the star
+    saturated: tuple[int, int]  # pixels near saturation, and all that the change concerns
+
+    @property
+    def hidden(self) -> bool:
+        """Whether what is unknown hides the change."""
+        return bool(np.isinf(self.error) and np.isfinite(self.error_known))
+
+    @property
+    def note(self) -> str:
+        """What limits the row, in a few words."""
+        lost, every = self.saturated
+        notes = [_lost_pixels(lost, every)] if lost else []
+        if not every:
+            notes.append("no light")
+        if self.hidden:
+            notes.append("hidden by what is unknown")
+        return "; ".join(notes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +78,13 @@ class IndexRow(InCell):
     error_known: float
     wavelength_nm: NDArray[np.float64]  # of the pixels
     flux: NDArray[np.float64]  # mean of the exposure, erg s-1 cm-2 nm-1
+    saturated: tuple[int, int]  # pixels near saturation, and all of the index
+
+    @property
+    def note(self) -> str:
+        """Why the index has no value; empty if it has one."""
+        lost, every = self.saturated
+        return _lost_pixels(lost, every) if lost else ""
 
     @property
     def snr(self) -> float:
@@ -81,8 +105,14 @@ class PeriodRow(InCell):
         return np.array([[getattr(one, which) for one in part] for part in self.recovery.recovered]).ravel()
 
 
+def _lost_pixels(lost: int, every: int) -> str:
+    return "every pixel saturates" if lost == every else f"{lost} of {every} pixels saturate"
+
+
 def _amount(value: float, unit: str) -> str:
-    if value != value or np.isinf(value):
+    if np.isnan(value):
+        return ""
+    if np.isinf(value):
         return "hidden"
     return f"{100 * value:.3g} %" if not unit else f"{value:.3g} {unit}"
 
@@ -91,7 +121,7 @@ def _amount(value: float, unit: str) -> str:
 COLUMNS = (
     Column("change", "change.name", "", "what changes", "change", kind=str),
     Column("unit", "change.unit", "", "unit of the change and its errors; empty if relative", kind=str),
-    Column("error", "error", "", "standard error of one visit, unknowns marginalised; inf: hidden by them",
+    Column("error", "error", "", "standard error of one visit, unknowns marginalised; inf: hidden by them; nan: none",
            "error of a visit", _amount, ("unit",)),
     Column("error_known", "error_known", "", "the same with everything known", "all known", _amount, ("unit",)),
     Column("smallest", "smallest.one", "", "smallest detected difference of one visit from the others",
@@ -99,23 +129,26 @@ COLUMNS = (
     Column("smallest_scatter", "smallest.scatter", "", "smallest detected standard deviation between visits",
            "smallest scatter", _amount, ("unit",)),
     Column("meaning", "change.meaning", "", "what a change of one unit is", "of", kind=str),
+    Column("note", "note", "", "what limits the row: saturated pixels or unknowns", "note", kind=str),
 )  # fmt: skip
 #: Columns of the table of indices.
 INDEX_COLUMNS = (
     Column("index", "value.index.name", "", "line or lines", "index", kind=str),
     Column("flux", "value.value", "erg / (s cm2)", "flux in the band above the continuum; absorption is negative",
-           "flux", ".3g"),
+           "flux", number(".3g")),
     Column("error", "error", "erg / (s cm2)", "standard deviation in one exposure with unknowns of finite spread; inf: "
-           "a free unknown changes it", "error", lambda value: f"{value:.2g}" if np.isfinite(value) else "free"),
-    Column("error_known", "error_known", "erg / (s cm2)", "the same with everything known", "all known", ".2g"),
-    Column("snr", "snr", "", "index over its error with everything known", "S/N, all known", ".3g"),
-    Column("equivalent_width", "value.equivalent_width_nm", "nm", "positive in emission", "EW (nm)", ".3g"),
+           "a free unknown changes it", "error", lambda value: "free" if np.isinf(value) else number(".2g")(value)),
+    Column("error_known", "error_known", "erg / (s cm2)", "the same with everything known", "all known",
+           number(".2g")),
+    Column("snr", "snr", "", "index over its error with everything known", "S/N, all known", number(".3g")),
+    Column("equivalent_width", "value.equivalent_width_nm", "nm", "positive in emission", "EW (nm)", number(".3g")),
     Column("captured", "value.captured", "", "share of a line's flux that the index holds at this resolution",
            "captured", percent(".0f")),
     Column("band_low", lambda row: row.value.index.band_nm[0], "nm", "lower end of the band"),
     Column("band_high", lambda row: row.value.index.band_nm[1], "nm", "upper end"),
     Column("published", "value.index.published", "", "usual definition at higher resolution, with its source",
            kind=str),
+    Column("note", "note", "", "saturated pixels of the index, which has no value then", "note", kind=str),
 )  # fmt: skip
 #: Columns of the changes against magnitude.
 MAGNITUDE_COLUMNS = (Column("magnitude", "magnitude", "mag", "of the star in its band"), *COLUMNS[:2], COLUMNS[4])
@@ -230,7 +263,7 @@ class ChangeAnswer(Answer):
     @property
     def messages(self) -> list[str]:
         lines = collect_messages(self.expectations)
-        hidden = dict.fromkeys(f"{one.title}: {one.change.name}" for one in self.changes if np.isinf(one.error))
+        hidden = dict.fromkeys(f"{one.title}: {one.change.name}" for one in self.changes if one.hidden)
         lines += [f"HIDDEN by what is unknown: {text}." for text in hidden]
         left = [name for name in INDICES if name not in {one.value.index.name for one in self.indices}]
         if left:
@@ -294,7 +327,8 @@ def change(
                 np.geomspace(*AMPLITUDES, asked.steps), fap=asked.period_fap, trials=asked.trials, seed=study.run.seed,
             )  # fmt: skip
             # The recovery depends on the amplitude in errors alone, so that one map serves all changes.
-            periods += [PeriodRow(one.label, one.at, one.change, one.error, recovery) for one in own]
+            periods += [PeriodRow(one.label, one.at, one.change, one.error, recovery)
+                        for one in own if not np.isnan(one.error)]  # fmt: skip
     return ChangeAnswer(study, rows, indices, along, periods, [case.quiet for case in prepared])
 
 
@@ -306,8 +340,9 @@ def _changes(case: Case, file: Source | None) -> list[ChangeRow]:
     for name in study.change.of:
         one = Change.named(name, case.source, quiet, case.instrument, study.observation.order, file, study.change.band)
         error, known = error_of_change(one.counts_dn, quiet, unknown), error_of_change(one.counts_dn, quiet, None)
-        smallest = Smallest(error * unit.one, error * unit.scatter)
-        rows.append(ChangeRow(case.label, case.at, one, error, known, smallest, case.star.magnitude))
+        smallest = Smallest(one.size(error * unit.one), one.size(error * unit.scatter))
+        lost, own = pixels_of(one.counts_dn, quiet), (one.size(error), one.size(known))
+        rows.append(ChangeRow(case.label, case.at, one, *own, smallest, case.star.magnitude, lost))
     return rows
 
 
@@ -317,8 +352,11 @@ def _indices(case: Case) -> list[IndexRow]:
     for index in covered_indices(quiet):
         value = IndexValue.of(index, quiet, case.instrument, case.study.observation.order)
         error, known = (error_of_index(value.weights, quiet, one) for one in (unknown, None))
+        lost = pixels_of(value.weights, quiet)
+        if lost[0]:
+            value = replace(value, value=np.nan, equivalent_width_nm=np.nan)
         flux = flux_per_dn(quiet, case.instrument) * quiet.signal_dn
-        rows.append(IndexRow(case.label, case.at, value, error, known, quiet.wavelength_nm, flux))
+        rows.append(IndexRow(case.label, case.at, value, error, known, quiet.wavelength_nm, flux, lost))
     return rows
 
 

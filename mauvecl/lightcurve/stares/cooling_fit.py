@@ -2,8 +2,8 @@
 
 Frames are reduced to weighted sums that are sufficient for spectra of all temperatures (`results.measurements`). The
 model of their means is one `Event` with `Cooling`. Their covariances depend on the fitted flare, so that each fit is
-repeated with the covariances of the previous one. Unknown levels that are constant over the stare are marginalised
-over.
+repeated with the covariances of the previous one. Unknown levels that are constant over the stare, and the unknown
+changes and jitters of the stare, are marginalised over. Those of all light change that of the flare as well.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from mauvecl.lightcurve.flares.events import Event
 from mauvecl.lightcurve.flares.shapes import Shape, shape_of
 from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.measured_bins import checked_frames, known_strengths, less_known
-from mauvecl.results.measurements.fit import LEVELS, Measurement
-from mauvecl.results.measurements.reduction import EVERY, Ranges, Reduction
+from mauvecl.results.measurements.fit import LEVELS, Measurement, clipped_pixels
+from mauvecl.results.measurements.reduction import EVERY, Exposures, Ranges, Reduction
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import Duration, Moment, Probability, Wavelength
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     from mauvecl.host.expectation import Expectation
     from mauvecl.lightcurve.stares.stare import Stare
+    from mauvecl.noise.unknowns import Changing
     from mauvecl.results.measurements.flare_model import FlareModel
     from mauvecl.statistics.nuisances import Nuisances
 
@@ -62,6 +63,24 @@ def _remembering(function: Callable[[Float], Pair]) -> Callable[[Float], Pair]:
 
 
 @dataclass(frozen=True, eq=False)
+class _Level:
+    """Unknown amplitude of known changes of the frames."""
+
+    sd: float  # of its prior
+    sums: Float  # change of the frames without a flare for unit amplitude, shape (n_frame, n_sum)
+    curve: Float  # change of the flare's light, shape (n_frame,); zero if it does not change
+    # Sums of a blackbody of amplitude 1 for a curve of 1, over log temperature.
+    flare: scipy.interpolate.CubicSpline
+
+    def around(self, flare: Pair | None) -> Float:
+        """Return the changes for unit amplitude next to a flare of known strengths, shape (n_frame, n_sum)."""
+        if flare is None or not self.curve.any():
+            return self.sums
+        rise, log_k = flare
+        return np.asarray(self.sums + (self.curve * rise)[:, None] * self.flare(log_k))
+
+
+@dataclass(frozen=True, eq=False)
 class _Data:
     """Sums of frames less their known means, and their covariances."""
 
@@ -69,8 +88,8 @@ class _Data:
     edges: Float  # starts and ends of frames, s, shape (n_frame, 2)
     light: Float  # known factors on the light of the flare, shape (n_frame,)
     quiet_covariance: Float  # shape (n_frame, n_sum, n_sum)
-    unknown: Float  # sums of unknown levels, shape (n_unknown, n_sum)
-    prior: Float  # their standard deviations
+    unknown: tuple[_Level, ...]  # levels of the stare
+    jitters: tuple[_Level, ...]  # levels that differ from frame to frame
     reduction: Reduction
     model: FlareModel
     gain: Float
@@ -129,18 +148,25 @@ class _Data:
         inside = (log_k > self.model.log_k[0]) & (log_k < self.model.log_k[-1])
         return of_rise, of_log_k * inside
 
-    def whitening(self, theta: Float | None) -> _Whitening:
-        """Return the whitening of residuals for the covariances of a flare, or of frames without one."""
-        covariance = self.quiet_covariance
+    def whitening(self, theta: Float | None, *, none: bool = False) -> _Whitening:
+        """Return the whitening of residuals for the covariances of a flare, or of frames without one.
+
+        With `none`, the unknown levels are those of frames without a flare, whose residuals are then compared.
+        """
+        covariance, flare = self.quiet_covariance, None
         if theta is not None:
-            rise, log_k = self.strengths(theta)
-            covariance = covariance + rise[:, None, None] * self.spread(log_k)
+            flare = self.strengths(theta)
+            covariance = covariance + flare[0][:, None, None] * self.spread(flare[1])
+        for one in self.jitters:
+            changes = one.sd * one.around(flare)
+            covariance = covariance + changes[:, :, None] * changes[:, None, :]
         inverse = np.linalg.inv(np.linalg.cholesky(covariance))
-        if not len(self.unknown):
+        if not self.unknown:
             return _Whitening(inverse, np.zeros((0, self.sums.size)), np.zeros(0))
-        spectra = np.einsum("tij,uj->tiu", inverse, self.unknown).reshape(self.sums.size, -1)
+        changes = np.array([one.around(None if none else flare) for one in self.unknown])
+        spectra = np.einsum("tij,utj->tiu", inverse, changes).reshape(self.sums.size, -1)
         # The prior acts as one more datum, which is not among the residuals because its mean is zero.
-        scale = np.linalg.cholesky(spectra.T @ spectra + np.diag(self.prior**-2.0))
+        scale = np.linalg.cholesky(spectra.T @ spectra + np.diag([one.sd**-2.0 for one in self.unknown]))
         basis = np.linalg.solve(scale, spectra.T)
         # I - B^T B = (I - B^T K B)^2, with K from the eigenvalues of B B^T.
         values, vectors = np.linalg.eigh(basis @ basis.T)
@@ -248,7 +274,7 @@ def fit_cooling(
     cooling : bool
         Whether the temperature falls after the peak, as in `Cooling`; constant otherwise.
     stare : Stare, optional
-        Times and known conditions of the frames; frames without gaps and changes by default.
+        Times, known conditions and unknown changes of the frames; frames without gaps and changes by default.
     levels : sequence of float
         Nominal coverage of the intervals, by profile likelihood.
     skipped_nm : sequence of tuple
@@ -264,7 +290,8 @@ def fit_cooling(
     Raises
     ------
     InputError
-        If the frames have another shape, the model has a jump or lines, or the stare contains no light of the flare.
+        If the frames have another shape, the model has a jump or lines, the stare contains no light of the flare, or
+        every pixel is near saturation in a frame.
     """
     if len(model.linear) > 1:
         raise InputError(f"a model of {', '.join(model.linear)}", "a blackbody alone", key="model", value=model.linear)
@@ -303,14 +330,15 @@ def fit_cooling(
                     step = sign * float(np.sqrt(spread[q, q])) / max(abs(scale[q]), 1e-300)
                     end = _end(data, whitening, theta, free, (low, high), one, step, limit)
                 ends[side, k, q] = end
-    dof = data.sums.size - free.size - int(np.isinf(data.prior).sum())
+    dof = data.sums.size - free.size - sum(np.isinf(one.sd) for one in data.unknown)
     empty = np.full(theta.shape, -np.inf)
-    none = float(np.sum(data.residuals(np.where(np.arange(theta.size) == 2, empty, theta), whitening) ** 2))
+    without = data.whitening(theta, none=True)
+    none = float(np.sum(data.residuals(np.where(np.arange(theta.size) == 2, empty, theta), without) ** 2))
     return Measurement(
         tuple(names), tuple(one.unit for one in quantities), (-np.inf,) + (0.0,) * (len(quantities) - 1),
         estimates[None], spread[None], tuple(levels), ends[0][:, None], ends[1][:, None], np.array([best]),
         np.array([float(scipy.stats.chi2.sf(best, dof))]), dof, np.array([np.sqrt(max(none - best, 0.0))]),
-        theta[3:4], np.exp(theta[2:3])[None],
+        theta[3:4], np.exp(theta[2:3])[None], np.ones(1),
     )  # fmt: skip
 
 
@@ -360,16 +388,56 @@ def _data(
     skipped_nm: Ranges,
 ) -> _Data:
     # The unknowns are parameters of the stare, so the weights of single frames do not remove them.
-    reduction = Reduction.of(model, quiet, skipped_nm=skipped_nm)
+    clipped = clipped_pixels(Exposures(raw, quiet.recorded_dn), quiet, np.arange(len(raw)))
+    reduction = Reduction.of(model, quiet, skipped_nm=skipped_nm, clipped=clipped)
     weights, strengths = reduction.weights, known_strengths(stare, quiet)
     sums = less_known(raw, quiet, strengths, weights)
     constant, each = Components(quiet, np.zeros((0, weights.shape[1])), weights).sum_cumulants(2)
     covariance = constant + np.tensordot(strengths, each, 1)
     edges = np.column_stack([stare.start_s, stare.start_s + stare.frame_s])
-    unknown = np.zeros((0, len(weights))) if nuisances is None else nuisances.spectra @ weights.T
-    prior = np.zeros(0) if nuisances is None else np.asarray(nuisances.sd, np.float64)
     gain = np.asarray(quiet.gain_dn_per_electron) * np.ones(weights.shape[1])
-    return _Data(sums, edges, strengths[:, 3], covariance, unknown, prior, reduction, model, gain, shape)
+    unknown, jitters = _levels_of_stare(quiet, reduction, stare, strengths)
+    light = strengths[:, 3]
+    if nuisances is not None:
+        unknown = (*_constant_levels(nuisances, model, weights, len(sums)), *unknown)
+        sums, light = sums - weights @ nuisances.mean_dn, nuisances.mean_factor * light
+    return _Data(sums, edges, light, covariance, unknown, jitters, reduction, model, gain, shape)
+
+
+def _constant_levels(nuisances: Nuisances, model: FlareModel, weights: Float, n_frames: int) -> tuple[_Level, ...]:
+    """Return unknown levels that are constant over a stare."""
+    found = []
+    for sd, spectrum, of_flare in zip(nuisances.sd, nuisances.spectra, nuisances.of_flare, strict=True):
+        sums = np.tile(weights @ spectrum, (n_frames, 1))
+        spline = scipy.interpolate.CubicSpline(model.log_k, (model.hot * of_flare) @ weights.T)
+        found.append(_Level(float(sd), sums, np.full(n_frames, float(of_flare.any())), spline))
+    return tuple(found)
+
+
+def _levels_of_stare(
+    quiet: Expectation, reduction: Reduction, stare: Stare, strengths: Float
+) -> tuple[tuple[_Level, ...], tuple[_Level, ...]]:
+    """Return the unknown changes of a stare, and its jitters."""
+    star, sky, dark, near = (
+        part[:, None] * (reduction.weights @ mean)
+        for part, mean in zip(
+            strengths.T, (quiet.net_source_dn, quiet.sky_dn, quiet.dark_dn, quiet.neighbour_dn), strict=True
+        )
+    )
+    slope = quiet.conditions["dark_slope_per_c"]
+    changes = {"star": star, "light": star + sky + near, "sky": sky, "temperature": slope * dark}
+
+    def level(of: Changing, sd: float, curve: Float) -> _Level:
+        of_flare = curve if of == "light" else np.zeros_like(curve)
+        return _Level(sd, curve[:, None] * changes[of], of_flare, reduction.spline)
+
+    ones, jitters = np.ones(len(strengths)), dict(stare.jitters)
+    if stare.pointing is not None:
+        jitters["light"] = float(np.hypot(jitters["light"], stare.pointing.depth))
+    return (
+        tuple(level(one.of, one.sd, one.curve) for one in stare.unknowns),
+        tuple(level(of, sd, ones) for of, sd in jitters.items() if sd > 0.0),
+    )
 
 
 def _start(data: _Data, whitening: _Whitening, peak_s: float, half_width_s: float, cooling: bool) -> Float:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.noise.unknowns import CHANGING, Changing
 from mauvecl.results.measurements.fit import LEVELS, Measurement, fit
 from mauvecl.results.measurements.reduction import Ranges, Reduction
 from mauvecl.schema.calls import validated
@@ -16,6 +17,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range
 from mauvecl.schema.physical import Probability, Wavelength
 from mauvecl.schema.tables import Column, table_of
+from mauvecl.statistics.nuisances import Nuisances, spectrum_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -24,7 +26,6 @@ if TYPE_CHECKING:
 
     from mauvecl.host.expectation import Expectation
     from mauvecl.results.measurements.flare_model import FlareModel
-    from mauvecl.statistics.nuisances import Nuisances
 
 Float = NDArray[np.float64]
 
@@ -137,8 +138,9 @@ def measure_along(
         Unknown amplitudes of known spectra, for one frame; each bin has its own constant amplitudes.
     snr_per_bin : float
     stare : Stare, optional
-        Times and known conditions of the frames; frames without gaps and changes by default. Bins do not extend
-        over gaps.
+        Times, known conditions and unknown changes of the frames; frames without gaps and changes by default. An
+        unknown change of the stare has its prior in each bin, unless `nuisances` has one of the same name. Bins do
+        not extend over gaps.
     levels : sequence of float
         Nominal coverage of the intervals.
     skipped_nm : sequence of tuple
@@ -196,22 +198,45 @@ def fit_bins(
     known, end = known_strengths(stare, quiet), first + count
     alike: dict[tuple[float, ...], list[int]] = {}
     for k, (a, b) in enumerate(zip(first, end, strict=True)):
-        mean = known[a:b].mean(axis=0).round(DIGITS)
-        alike.setdefault((float(b - a), *map(float, mean)), []).append(k)
+        mean = [*known[a:b].mean(axis=0), *spreads_of(stare, a, b).values()]
+        alike.setdefault((float(b - a), *np.round(mean, DIGITS).tolist()), []).append(k)
     parts = []
-    for (length, star, sky, dark, light), rows in alike.items():
+    for (length, star, sky, dark, light, *spreads), rows in alike.items():
         n = int(length)
         stacked = replace(
             quiet, n_frames=n, source_electrons=star * quiet.source_electrons,
             sky_electrons=sky * quiet.sky_electrons, dark_dn=dark * quiet.dark_dn,
             neighbour_electrons=light * quiet.neighbour_electrons,
         )  # fmt: skip
-        unknown = None if nuisances is None else replace(nuisances, spectra=n * nuisances.spectra)
+        unknown = Nuisances.of(stacked, {}) if nuisances is None else replace(nuisances, spectra=n * nuisances.spectra)
+        for of, sd in zip(CHANGING, spreads, strict=True):
+            unknown = _with_change(unknown, stacked, of, sd)
         added = np.array([raw[first[k] : end[k]].sum(axis=0) for k in rows])
-        parts.append(fit(added, stacked, model.stacked(n, light), unknown, levels=levels, skipped_nm=skipped_nm))
+        own = unknown if unknown.names else None
+        parts.append(fit(added, stacked, model.stacked(n, light), own, levels=levels, skipped_nm=skipped_nm))
     order = np.argsort(np.concatenate(list(alike.values())))
     found = Measurement.joined(parts).rows(order)
     return MeasuredBins(first, count, stare.start_s[first], stare.start_s[end - 1] + stare.frame_s, found)
+
+
+def spreads_of(stare: Stare, first: int, end: int) -> dict[Changing, float]:
+    """Return the standard deviations of the unknown changes of a stare, averaged over some frames."""
+    found = {of: sd**2 / (end - first) for of, sd in stare.jitters.items()} | {"star": 0.0}
+    for one in stare.unknowns:
+        found[one.of] += (one.sd * float(one.curve[first:end].mean())) ** 2
+    if stare.pointing is not None:
+        found["light"] += stare.pointing.depth**2
+    return {of: float(np.sqrt(found[of])) for of in CHANGING}
+
+
+def _with_change(unknown: Nuisances, quiet: Expectation, of: Changing, sd: float) -> Nuisances:
+    """Return nuisance parameters with an unknown change of a stare, unless they have one of the same kind."""
+    name = {"temperature": "dark"}.get(of, of)
+    if not sd > 0.0 or name in unknown.names:
+        return unknown
+    if name == "star":
+        return unknown.with_spectrum(name, quiet.net_source_dn, sd)
+    return unknown.joined(Nuisances.of(quiet, {name: sd})) if spectrum_of(name, quiet).any() else unknown
 
 
 def known_strengths(stare: Stare, quiet: Expectation) -> Float:

@@ -77,7 +77,11 @@ class Change:
     name: str
     unit: str  # unit of the change; empty if it is relative
     meaning: str  # meaning of a change of one unit
-    counts_dn: Float  # shape (n_pixel,); DN of the exposure that it adds
+    counts_dn: Float  # shape (n_pixel,); DN of the exposure that it adds, for a small change
+
+    def size(self, linear: float) -> float:
+        """Return the size of a change that brightens, in its unit, from its light over `counts_dn`."""
+        return float(np.log1p(LOG_PER_MAG * linear) / LOG_PER_MAG) if self.unit == "mag" else linear
 
     @classmethod
     def named(
@@ -110,13 +114,10 @@ class Change:
         own = np.interp(nm, star.wavelength_nm, star.flux_flam, left=0.0, right=0.0)
         words = name.strip().casefold()
         if words == "balmer jump":
-            flux, meaning = (
-                np.where(nm < BALMER_EDGE_NM, own, 0.0),
-                "relative change of the light below the Balmer edge",
-            )
+            flux, meaning = own * _below(BALMER_EDGE_NM), "relative change of the light below the Balmer edge"
         elif words == "colour":
-            flux, unit = np.where(nm < COLOUR_NM, LOG_PER_MAG * own, 0.0), "mag"
-            meaning = f"change of the light below {COLOUR_NM:g} nm against that above"
+            flux, unit = LOG_PER_MAG * own * _below(COLOUR_NM), "mag"
+            meaning = f"brightening of the light below {COLOUR_NM:g} nm against that above"
         elif words == "spectrum":
             if file is None:
                 raise InputError("the change 'spectrum' has no file", "`change.file`", key="change.file")
@@ -126,7 +127,7 @@ class Change:
             nm, flux = file.wavelength_nm, scale * file.flux_flam
             meaning = f"light of {file.name} over that of the star in {band}"
         elif (limits := _band(name)) is not None:
-            flux = np.where((nm >= limits[0]) & (nm <= limits[1]), own, 0.0)
+            flux = own * (_below(limits[1]) - _below(limits[0]))
             meaning = f"relative change of the light in {limits[0]:g}-{limits[1]:g} nm"
         else:
             line = _line(name)
@@ -134,6 +135,16 @@ class Change:
             flux, unit, meaning = line.profile(nm), "erg / (s cm2)", f"flux of {line.name}"
         rate = electrons_per_second(instrument, nm, flux, order)
         return cls(name.strip(), unit, meaning, rate * exposure_dn_per_electron(quiet, instrument))
+
+
+def _below(edge_nm: float) -> Float:
+    """Return factors at `GRID_NM` of light that ends at a wavelength.
+
+    Flux is linear between the wavelengths, and the factor of each is the share of its triangle below the edge, so that
+    the light and its mean wavelength are those of a sharp edge.
+    """
+    distance = np.clip((edge_nm - GRID_NM) / (GRID_NM[1] - GRID_NM[0]), -1.0, 1.0)
+    return np.asarray(np.where(distance < 0.0, (1.0 + distance) ** 2, 2.0 - (1.0 - distance) ** 2) / 2.0)
 
 
 def _band(name: str) -> tuple[float, float] | None:

@@ -28,6 +28,8 @@ Float = NDArray[np.float64]
 
 #: Share of the information on a change that must be left by what is unknown; less is rounding.
 LEAST_KEPT = 1e-10
+#: Share of the largest change of a pixel above which a change concerns a pixel.
+LEAST_LIGHT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -73,8 +75,16 @@ def smallest_change(
     return Smallest(float(error * np.sqrt(centre * visits / dof)), float(error * np.sqrt(cut / rest - 1.0)))
 
 
+def pixels_of(counts_dn: Float, quiet: Expectation) -> tuple[int, int]:
+    """Return how many of the pixels that a change of the light concerns are near saturation, and how many these are."""
+    concerned = np.abs(counts_dn) > LEAST_LIGHT * np.abs(counts_dn).max(initial=0.0)
+    return int((concerned & ~variance_of(quiet)[1]).sum()), int(concerned.sum())
+
+
 def error_of_change(counts_dn: Float, quiet: Expectation, unknown: Nuisances | None) -> float:
-    """Return the standard error of the amplitude of a change in one exposure; infinite if the unknowns hide it.
+    """Return the standard error of the amplitude of a change in one exposure, from pixels that do not saturate.
+
+    It is infinite if the unknowns hide the change, and NaN if no pixel is left.
 
     Parameters
     ----------
@@ -82,6 +92,9 @@ def error_of_change(counts_dn: Float, quiet: Expectation, unknown: Nuisances | N
         DN of the exposure for an amplitude of one.
     """
     variance, used = variance_of(quiet)
+    lost, concerned = pixels_of(counts_dn, quiet)
+    if lost == concerned:
+        return float("nan")
     delta = np.where(used, counts_dn, 0.0)
     weights = np.divide(delta, variance, out=np.zeros_like(delta), where=used)
     information = whole = float(weights @ delta)
@@ -91,12 +104,16 @@ def error_of_change(counts_dn: Float, quiet: Expectation, unknown: Nuisances | N
 
 
 def error_of_index(weights: Float, quiet: Expectation, unknown: Nuisances | None) -> float:
-    """Return the standard deviation of a weighted sum of an exposure; infinite if a free unknown changes it.
+    """Return the standard deviation of a weighted sum of an exposure.
+
+    It is infinite if a free unknown changes the sum, and NaN if a pixel with a weight is near saturation.
 
     Parameters
     ----------
     weights : ndarray, shape (n_pixel,)
     """
+    if (weights[~variance_of(quiet)[1]] != 0.0).any():
+        return float("nan")
     variance = float(np.sum(weights**2 * quiet.variance_dn2))
     if unknown:
         moved = unknown.spectra @ weights

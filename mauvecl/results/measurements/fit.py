@@ -11,9 +11,18 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.results.measurements.flare_model import FlareModel, derived_values
+from mauvecl.results.measurements.light_factor import undimmed
 from mauvecl.results.measurements.nonnegative import BoundedProfile, bounded_intervals, with_bounds
-from mauvecl.results.measurements.profile import Profile, covariance, covariance_of, intervals
-from mauvecl.results.measurements.reduction import Exposures, Reduction, check_distinct, usable_variance
+from mauvecl.results.measurements.profile import BestFit, Profile, covariance, covariance_of, intervals
+from mauvecl.results.measurements.reduction import (
+    NEAR_SIGMA,
+    Exposures,
+    Reduction,
+    check_distinct,
+    check_enough,
+    light_factor,
+    usable_variance,
+)
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import Probability, Temperature, Wavelength
@@ -37,6 +46,13 @@ REFITS = 2
 VARIANCE_STEP, VARIANCE_RANGES = 0.03, 12
 #: Frames that are fitted together, which bounds the memory.
 BATCH = 2048
+#: Fits more of exposures with pixels near saturation; the logarithmic step of the number of such pixels of those that
+#: share the others in the first fit, and the least share of their pixels that all must be able to use there.
+SATURATED_REFITS, SATURATED_STEP, LEAST_SHARED = 4, 0.05, 0.5
+#: Pixels on both sides of one near saturation that are not used.
+NEIGHBOURS = 4
+#: Factor by which the largest flare of a group may exceed the mean one.
+NEAR_GROUP = 1.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +83,10 @@ class Measurement:
     snr: Float
     #: Natural logarithm of the temperature, shape (n,), or (n, 2) of two temperatures.
     log_k: Float
-    #: Parameters of the model's `counts`, shape (n, n_linear).
+    #: Parameters of the model's `counts`, shape (n, n_linear), for the light before it is dimmed by `factor`.
     amplitudes: Float
+    #: Factor on all light, shape (n,); 1 if it is known.
+    factor: Float
 
     @property
     def errors(self) -> Float:
@@ -175,7 +193,8 @@ def fit(
         The exposure of the quiescent star.
     model : FlareModel
     nuisances : Nuisances, optional
-        Unknown amplitudes of known spectra, over which the fit marginalises.
+        Unknown amplitudes of known spectra, over which the fit marginalises. A factor on all light, such as ``light``
+        of `Nuisances.of`, dims the flare as it dims the star.
     levels : sequence of float
         Nominal coverage of the intervals.
     skipped_nm : sequence of tuple
@@ -184,7 +203,8 @@ def fit(
     Raises
     ------
     InputError
-        If frames have another shape, or the flare is degenerate with the unknowns.
+        If frames have another shape, the flare is degenerate with the unknowns, or fewer pixels than parameters are
+        neither saturated nor left out.
 
     Examples
     --------
@@ -198,23 +218,30 @@ def fit(
     >>> [round(float(x), 2) for x in found.estimates[0, :2]]
     [9000.0, 0.5]
     """
-    exposures = checked_exposures(frames, expectation, levels)
+    exposures = checked_exposures(frames, expectation, levels, nuisances)
 
-    def reduction_of(added_dn: Float | None) -> Reduction:
-        return Reduction.of(model, expectation, added_dn, nuisances, skipped_nm)
+    def reduction_of(added_dn: Float | None, **how: Any) -> Reduction:
+        return Reduction.of(model, expectation, added_dn, nuisances, skipped_nm, **how)
 
-    log_k, linear = _pilot(exposures, model, reduction_of(None))
+    log_k, linear, cut = _pilot(exposures, expectation, model, reduction_of)
+    every = np.arange(len(exposures.raw))
+    # Exposures with saturated pixels start far from the flare, which decides on the pixels that saturate.
+    saturated = [np.flatnonzero(cut)] * (SATURATED_REFITS if cut.any() else 0)
+    for rows in [*saturated, *[every] * (REFITS - 1)]:
+        some_of = replace(exposures, raw=exposures.raw[rows]) if cut.any() else None
+        groups = variance_groups(expectation, model, log_k[rows], linear[rows], reduction_of, nuisances, some_of)
+        for some, reduction in groups:
+            own = rows[some]
+            for start in range(0, own.size, BATCH):
+                batch = own[start : start + BATCH]
+                best = _estimated(exposures, batch, reduction)
+                log_k[batch], linear[batch] = best.log_k, best.linear
     parts: list[tuple[NDArray[np.intp], dict[str, Any]]] = []
-    for step in range(REFITS):
-        parts = []
-        for rows, reduction in variance_groups(expectation, model, log_k, linear, reduction_of):
-            for start in range(0, rows.size, BATCH):
-                some = rows[start : start + BATCH]
-                last = step == REFITS - 1
-                one = (_fitted if last else _estimated)(exposures, some, model, reduction, levels)
-                parts.append((some, one))
-        for some, one in parts:
-            log_k[some], linear[some] = one["log_k"], one["amplitudes"]
+    near = exposures if cut.any() else None
+    for some, reduction in variance_groups(expectation, model, log_k, linear, reduction_of, nuisances, near):
+        for start in range(0, some.size, BATCH):
+            batch = some[start : start + BATCH]
+            parts.append((batch, _fitted(exposures, batch, model, reduction, levels)))
     order = np.argsort(np.concatenate([rows for rows, _ in parts]))
     along = {"low": 1, "high": 1}
     joined = {
@@ -226,8 +253,10 @@ def fit(
     return Measurement(model.names, model.units, model.bounds, levels=tuple(levels), dof=int(dof.min()), **joined)
 
 
-def checked_exposures(frames: ArrayLike, expectation: Expectation, levels: Sequence[float]) -> Exposures:
-    """Return exposures; raises InputError as `fit` does."""
+def checked_exposures(
+    frames: ArrayLike, expectation: Expectation, levels: Sequence[float], nuisances: Nuisances | None
+) -> Exposures:
+    """Return exposures less their mean without a flare; raises InputError as `fit` does."""
     raw = np.atleast_2d(np.asarray(frames))
     if raw.ndim != 2 or not len(raw) or raw.shape[1] != expectation.wavelength_nm.size:
         raise InputError(
@@ -240,18 +269,64 @@ def checked_exposures(frames: ArrayLike, expectation: Expectation, levels: Seque
         raise InputError("frames hold undefined values", "finite numbers", key="frames")
     if not levels:
         raise InputError.of("levels", levels, "at least one probability")
-    return Exposures(raw, expectation.recorded_dn)
+    mean = expectation.recorded_dn if nuisances is None else expectation.recorded_dn + nuisances.mean_dn
+    return Exposures(raw, mean)
 
 
-def _pilot(exposures: Exposures, model: FlareModel, reduction: Reduction) -> tuple[Float, Float]:
-    """Fit all frames with the variance of the quiescent star."""
+def _pilot(
+    exposures: Exposures, quiet: Expectation, model: FlareModel, reduction_of: Callable[..., Reduction]
+) -> tuple[Float, Float, NDArray[np.bool_]]:
+    """Fit all frames with the variance of the quiescent star, and return which have saturated pixels as well.
+
+    Pixels that are near saturation in a frame are not used.
+    """
     n = len(exposures.raw)
-    log_k, linear = np.empty(n), np.empty((n, len(model.linear)))
+    log_k, linear, counts = np.empty(n), np.empty((n, len(model.linear))), np.zeros(n, np.intp)
+    usual = reduction_of(None)
+    used = usual.variance > 0.0
+    ceiling = _highest_usable(quiet)
     for start in range(0, n, BATCH):
-        some = np.arange(start, min(start + BATCH, n))
-        best = Profile(reduction, exposures.sums(reduction, some)).best()
-        log_k[some], linear[some] = best.log_k, best.linear
-    return log_k, linear
+        raw = exposures.raw[start : start + BATCH]
+        if (raw.max(axis=0) > ceiling)[used].any():
+            counts[start : start + BATCH] = (raw > ceiling)[:, used].sum(axis=1)
+
+    def best(rows: NDArray[np.intp], reduction: Reduction) -> None:
+        for start in range(0, rows.size, BATCH):
+            some = rows[start : start + BATCH]
+            found = Profile(reduction, exposures.sums(reduction, some)).best()
+            log_k[some], linear[some] = found.log_k, found.linear
+
+    best(np.flatnonzero(counts == 0), usual)
+    # Frames with about as many saturated pixels share the pixels that none of them saturates.
+    alike = np.rint(np.log(np.maximum(counts, 1)) / SATURATED_STEP).astype(np.intp)
+    for key in np.unique(alike[counts > 0]):
+        rows = np.flatnonzero((alike == key) & (counts > 0))
+        for start in range(0, rows.size, BATCH):
+            some = rows[start : start + BATCH]
+            shared = clipped_pixels(exposures, quiet, some)
+            if (~shared & used).sum() >= LEAST_SHARED * (used.sum() - counts[some].max()):
+                best(some, reduction_of(None, clipped=shared))
+                continue
+            for row in some:
+                best(np.array([row]), reduction_of(None, clipped=clipped_pixels(exposures, quiet, np.array([row]))))
+    return log_k, linear, counts > 0
+
+
+def clipped_pixels(exposures: Exposures, quiet: Expectation, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Return which pixels are near saturation in any of some exposures, and their neighbours, shape (n_pixel,).
+
+    Neighbours are left out so that the noise of single pixels does not select the pixels of a fit.
+    """
+    clipped = (exposures.raw[rows] > _highest_usable(quiet)).any(axis=0)
+    return np.convolve(clipped, np.ones(2 * NEIGHBOURS + 1), "same") > 0.5
+
+
+def _highest_usable(quiet: Expectation) -> Float:
+    """Return the raw DN of the exposure above which a pixel is near saturation, shape (n_pixel,)."""
+    constant = quiet.unsaturated_variance_dn2 - quiet.gain_dn_per_electron * quiet.light_dn
+    light = quiet.n_frames * np.maximum(quiet.ceiling_dn - quiet.dark_dn - quiet.bias_dn, 0.0)
+    sd = np.sqrt((constant + quiet.gain_dn_per_electron * light) / quiet.n_frames)
+    return np.asarray(quiet.n_frames * (quiet.ceiling_dn - NEAR_SIGMA * sd))
 
 
 def variance_groups(
@@ -259,12 +334,20 @@ def variance_groups(
     model: FlareModel,
     log_k: Float,
     linear: Float,
-    reduction_of: Callable[[Float], Reduction],
+    reduction_of: Callable[..., Reduction],
+    nuisances: Nuisances | None,
+    exposures: Exposures | None,
 ) -> Iterator[tuple[NDArray[np.intp], Reduction]]:
-    """Yield groups of frames whose fitted flares have nearly the same variance, with their reduction."""
+    """Yield groups of frames whose fitted flares have nearly the same variance, with their reduction.
+
+    The exposures are needed if pixels are near saturation in some of them.
+    """
     n_pixel = quiet.wavelength_nm.size
     edges = np.linspace(0, n_pixel, VARIANCE_RANGES + 1).astype(np.intp)[:-1]
-    relative = quiet.gain_dn_per_electron / quiet.unsaturated_variance_dn2
+    ceiling = _highest_usable(quiet)
+    # Pixels that saturate in every frame have no say.
+    seen = True if exposures is None else exposures.raw.min(axis=0) <= ceiling
+    relative = seen * quiet.gain_dn_per_electron / quiet.unsaturated_variance_dn2
     averaged = np.diff(np.append(edges, n_pixel))
     hot = np.add.reduceat(model.hot * relative, edges, axis=1) / averaged
     fixed = np.add.reduceat(model.fixed * relative, edges, axis=1) / averaged
@@ -273,27 +356,33 @@ def variance_groups(
     keys = np.rint(np.log1p(np.maximum(added, -0.9)) / VARIANCE_STEP).astype(np.int64)
     _, number, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
     order = np.argsort(number, kind="stable")
+    # Single frames may have all the light that an exposure loses on average.
+    undimmed = 1.0 / min(1.0, nuisances.mean_factor) if nuisances else 1.0
     for rows in np.split(order, np.cumsum(counts)[:-1]):
         middle = np.mean(log_k[rows])
         mean = linear[rows, 0].mean() * model.hot_spline(middle) + linear[rows, 1:].mean(axis=0) @ model.fixed
-        yield rows, reduction_of(mean)
+        highest = undimmed * mean
+        if (quiet.n_frames * quiet.mean_raw_dn + NEAR_GROUP * highest > ceiling).any():
+            each = (linear[k, 0] * model.hot_spline(log_k[k]) + linear[k, 1:] @ model.fixed for k in rows)
+            highest = undimmed * np.max(list(each), axis=0) if rows.size <= BATCH else NEAR_GROUP * highest
+        clipped = None
+        if exposures is not None and (exposures.raw[rows].max(axis=0) > ceiling).any():
+            clipped = clipped_pixels(exposures, quiet, rows)
+        yield rows, reduction_of(mean, highest_dn=highest, clipped=clipped)
 
 
-def _estimated(
-    exposures: Exposures, rows: NDArray[np.intp], model: FlareModel, reduction: Reduction, levels: Sequence[float]
-) -> dict[str, Any]:
-    """Return the parameters of `Measurement` for some frames of one variance."""
+def _estimated(exposures: Exposures, rows: NDArray[np.intp], reduction: Reduction) -> BestFit:
+    """Return the best fits of some frames of one variance."""
     profile = Profile(reduction, exposures.sums(reduction, rows))
-    best = with_bounds(reduction, profile.sums, profile.best())
-    return {"log_k": best.log_k, "amplitudes": best.linear}
+    return with_bounds(reduction, profile.sums, profile.best())
 
 
 def _fitted(
     exposures: Exposures, rows: NDArray[np.intp], model: FlareModel, reduction: Reduction, levels: Sequence[float]
 ) -> dict[str, Any]:
     """Return the attributes of `Measurement` for some frames of one variance."""
-    sums, rest = exposures.sums_and_rest(reduction, rows)
-    profile = Profile(reduction, sums)
+    sums, rest, light = exposures.sums_and_rest(reduction, rows)
+    profile = Profile(reduction, sums, light)
     at_nodes = profile.gain_at_nodes()
     best = profile.best(at_nodes)
     allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
@@ -303,7 +392,7 @@ def _fitted(
     reaches = (low <= np.array(model.bounds)) & np.isfinite(model.bounds)
     near = np.flatnonzero(reaches.any(axis=(0, 2)) | (best.linear < 0.0).any(axis=1))
     if near.size:
-        bounded = BoundedProfile(reduction, sums[near])
+        bounded = BoundedProfile(reduction, sums[near], None if light is None else light[near])
         nodes = bounded.gain_at_nodes()
         there = bounded.best(nodes)
         for k, one in enumerate(allowed):
@@ -311,10 +400,15 @@ def _fitted(
         best = best.replaced(near, there)
     left = np.einsum("nk,nk->n", sums, sums) - best.gain
     n_fitted = len(model.linear) + 1
+    factor = profile.factor(best.log_k, best.linear)
+    estimates = derived_values(model, best.log_k, best.linear)
+    which, _ = model.sums
+    estimates[:, which] = undimmed(estimates[:, which], factor)
     return {
         "log_k": best.log_k,
-        "amplitudes": best.linear,
-        "estimates": derived_values(model, best.log_k, best.linear),
+        "amplitudes": undimmed(best.linear, factor),
+        "factor": factor,
+        "estimates": estimates,
         "covariance": covariance(model, profile, best),
         "low": low,
         "high": high,
@@ -400,16 +494,22 @@ def forecast(
     InputError
         If the model cannot describe the flare, or the flare is degenerate with the unknowns.
     """
-    counts = model.counts(temperature_k, amplitudes)
-    log_k, linear = np.array([np.log(temperature_k)]), np.asarray(amplitudes, np.float64)[None]
-    variance, used = usable_variance(expectation, counts, skipped_nm)
+    factor = nuisances.mean_factor if nuisances else 1.0
+    # The flare as it is recorded.
+    counts = factor * model.counts(temperature_k, amplitudes)
+    log_k, linear = np.array([np.log(temperature_k)]), factor * np.asarray(amplitudes, np.float64)[None]
+    variance, used = usable_variance(expectation, counts, skipped_nm, nuisances, counts / min(1.0, factor))
+    check_enough(expectation, used, len(model.linear) + 1 + (nuisances.free if nuisances else 0))
     slope = linear[0, 0] * model.hot_spline(log_k[0], 1)
     rows = np.vstack([model.hot_spline(log_k[0]), model.fixed, slope, counts]) * used
     plain = np.divide(rows, variance, out=np.zeros_like(rows), where=used) @ rows.T
-    lost = nuisances.rows(variance, nuisances.spectra * used) @ rows.T if nuisances else np.zeros((0, len(rows)))
+    unknown = nuisances.around(counts) if nuisances else None
+    weights = unknown.rows(variance, unknown.spectra * used) if unknown else np.zeros((0, used.size))
+    lost = weights @ rows.T
     information = plain - lost.T @ lost
     check_distinct(np.diag(information)[:-2], np.diag(plain)[:-2], nuisances)
-    spread = covariance_of(model, log_k, linear, information[None, :-1, :-1])[0]
-    values = derived_values(model, log_k, linear)[0]
+    light = light_factor(model, unknown, weights)
+    spread = covariance_of(model, log_k, linear, information[None, :-1, :-1], light, factor)[0]
+    values = derived_values(model, log_k, linear / factor)[0]
     snr = float(np.sqrt(max(information[-1, -1], 0.0)))
     return Forecast(model.names, model.units, values, np.sqrt(np.diag(spread)), spread, snr)

@@ -177,7 +177,11 @@ class FlareModel:
         derived = _derived(
             kelvin, scale, names, parts, every, list(bands_nm), quiet.exposure_s, distance_pc, radius_rsun
         )
-        return cls(np.log(kelvin), counts[:NODES], counts[NODES:], names, derived)
+        log_k = np.log(kelvin)
+        while np.exp(log_k[-1]) > TEMPERATURES_K[1]:
+            # The exponential of the last node is a temperature that is accepted.
+            log_k[-1] = np.nextafter(log_k[-1], 0.0)
+        return cls(log_k, counts[:NODES], counts[NODES:], names, derived)
 
     def stacked(self, n: int, light: float = 1.0) -> Self:
         """Return the model of exposures that are n times as long, with a known factor on all light.

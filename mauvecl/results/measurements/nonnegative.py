@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.results.measurements.light_factor import Ratio
 from mauvecl.results.measurements.profile import BestFit, Profile, ends_of_quantities, extreme, temperature_samples
 
 if TYPE_CHECKING:
@@ -31,6 +32,9 @@ Float = NDArray[np.float64]
 REFINEMENTS, NARROWER = 3, 8.0
 #: The search for the best temperature starts from every `COARSE`-th node of the model.
 COARSE = 4
+#: Share of a refinement's step above which a best temperature still moves; distance in nodes at which the gain beside
+#: it is then tried, its least rise that counts, and the number of narrowing grids that follow it.
+SETTLED, BESIDE, LEAST_RISE, CLIMBS = 0.5, 0.05, 1e-3, 4
 #: Amplitudes below minus this many standard errors are negative; smaller deviations are due to rounding.
 ROUNDING = 1e-9
 
@@ -93,6 +97,16 @@ class Face:
         least, other_least = self.rounding
         positive = np.asarray((others >= other_least).all(axis=0))
         return positive if amplitude is None else positive & (amplitude >= least)
+
+    def value(self, factors: Float) -> Float:
+        """Return a sum of the best amplitudes, with factors (n_linear, n, ...)."""
+        found = np.sum(factors[1:][list(self.some)] * self.others, axis=0)
+        return np.asarray(found if self.amplitude is None else found + factors[0] * self.amplitude)
+
+    def product(self, factors: Float, change: tuple[Float | None, Float, Float]) -> Float:
+        """Return the covariance of a sum of amplitudes with the quantity of a `change`."""
+        found = np.sum(factors[1:][list(self.some)] * change[1], axis=0)
+        return np.asarray(found if change[0] is None else found + factors[0] * change[0])
 
     def change(self, factors: Float) -> tuple[Float | None, Float, Float]:
         """Return the changes of amplitudes per change of a linear quantity, and the quantity's variance.
@@ -182,8 +196,30 @@ class BoundedProfile(Profile):
             vertex = np.where(good, vertex, three)
             reached = self.gain(vertex)
             x = np.where(reached >= g.max(axis=1), vertex, three)
+            # A smooth maximum moves less and less; bounds may bend the gain sharply.
+            moving = np.abs(x - there[:, 1]) > SETTLED * step
             step /= NARROWER
-        return self.solution(x)
+        return self.solution(self._climbed(x, np.flatnonzero(moving)))
+
+    def _climbed(self, x: Float, moving: NDArray[np.intp]) -> Float:
+        """Return temperatures of which some, where gain rises beside them, are moved to the highest gain nearby."""
+        if not moving.size:
+            return x
+        low, high = self.nodes[0], self.nodes[-1]
+        step = float(self.nodes[1] - self.nodes[0])
+        beside = np.clip(x[moving, None] + BESIDE * step * np.array([-1.0, 0.0, 1.0]), low, high)
+        gain = BoundedProfile(self.reduction, self.sums[moving]).gain(beside)
+        rising = moving[gain.max(axis=1) > gain[:, 1] + LEAST_RISE]
+        if not rising.size:
+            return x
+        own, best = BoundedProfile(self.reduction, self.sums[rising]), x[rising]
+        for _ in range(CLIMBS):
+            there = np.clip(best[:, None] + step * np.linspace(-1.0, 1.0, 9), low, high)
+            best = there[np.arange(best.size), np.argmax(own.gain(there), axis=1)]
+            step /= 4.0
+        found = x.copy()
+        found[rising] = best
+        return found
 
     def solution(self, log_k: Float) -> BestFit:
         """Return the best fits at temperatures (n,)."""
@@ -208,12 +244,23 @@ def bounded_intervals(
     x = temperature_samples(profile, low, high)
     products, faces = profile.products(x), list(profile.solutions(x))
     least = best.gain[:, None] - allowed
+    light, of_light = profile.reduction.light, None
+    if light is not None and profile.light is not None:
+        without = profile.factor(x, np.zeros((*x.shape, len(model.linear))))
+        of_light = without, np.moveaxis(light.weights_of(x), -1, 0), light.scale**-2.0
 
     def ends(one: Derived, spline: CubicSpline | None) -> tuple[Float, Float]:
         if spline is None:
             return np.where(np.isnan(low), -np.inf, np.exp(low)), np.where(np.isnan(high), np.inf, np.exp(high))
         if one.ratio is None:
-            return _linear_ends(faces, np.moveaxis(spline(x), -1, 0), least)
+            factors = np.moveaxis(spline(x), -1, 0)
+            found = _linear_ends(faces, factors, least, of_light)
+            if light is None or not light.prior.size:
+                return found
+            factor = profile.factor(best.log_k, best.linear)
+            value = np.einsum("nl,nl->n", spline(best.log_k), best.linear) / factor
+            moved = light.change(value, factor, found[1] - found[0], allowed)
+            return _linear_ends(faces, factors, least - moved[:, None], of_light)
         lowest, highest = _ratio_ends(products, faces, spline(x), least)
         return one.offset + lowest, one.offset + highest
 
@@ -222,23 +269,49 @@ def bounded_intervals(
     return np.maximum(lows, model.bounds), highs
 
 
-def _linear_ends(faces: list[Face], factors: Float, least: Float) -> tuple[Float, Float]:
-    """Return the ends of a quantity that is linear in the amplitudes, with factors (n_linear, n, n_sample)."""
+def _linear_ends(
+    faces: list[Face],
+    factors: Float,
+    least: Float,
+    of_light: tuple[Float, Float, float] | None,
+) -> tuple[Float, Float]:
+    """Return the ends of a quantity that is linear in the amplitudes, with factors (n_linear, n, n_sample).
+
+    `of_light` is the best factor on all light without a flare, its decrease per unit of each amplitude, and its
+    variance, if it is unknown.
+    """
     lows, highs = np.full(factors.shape[1:], np.inf), np.full(factors.shape[1:], -np.inf)
     for face in faces:
         left = face.gain - least + 1e-9 * np.abs(least)
         inside = left >= 0.0
         if not inside.any():
             continue
-        step, steps, variance = face.change(factors)
-        middle = np.sum(factors[1:][list(face.some)] * face.others, axis=0)
-        if face.amplitude is not None:
-            middle = middle + factors[0] * face.amplitude
-        reach = np.sqrt(np.maximum(face.gain - least, 0.0) / np.where(variance > 0, variance, np.inf))
+        left = np.maximum(face.gain - least, 0.0)
+        middle = face.value(factors)
+        change = face.change(factors)
+        variance = change[2]
+        if of_light is not None and (face.some or face.amplitude is not None):
+            dims = face.change(of_light[1])
+            covariance = face.product(factors, dims)
+            ratio = Ratio(middle, of_light[0] - face.value(of_light[1]), variance, dims[2] + of_light[2], -covariance)
+        else:
+            dims, ratio = change, None
         for sign, found, which in ((-1.0, lows, np.minimum), (1.0, highs, np.maximum)):
-            moved = None if face.amplitude is None or step is None else face.amplitude + sign * reach * step
-            there = inside & face.positive(moved, face.others + sign * reach * steps)
-            which(found, middle + sign * reach * variance, out=found, where=there)
+            if ratio is None:
+                end = middle + sign * np.sqrt(left * variance)
+                reach = sign * np.sqrt(left / np.where(variance > 0, variance, np.inf))
+                step, steps = change[:2]
+            else:
+                end = ratio.end(left, sign)
+                at = np.where(np.isfinite(end), end, 0.0)
+                reach = (at * ratio.bottom - middle) / np.maximum(ratio.variance_at(at), 1e-300)
+                step = None if change[0] is None or dims[0] is None else change[0] + at * dims[0]
+                steps = change[1] + at * dims[1]
+                # An open end is reached with any amplitudes that the face allows.
+                reach = np.where(np.isfinite(end), reach, 0.0)
+            moved = None if face.amplitude is None or step is None else face.amplitude + reach * step
+            there = inside & face.positive(moved, face.others + reach * steps)
+            which(found, end, out=found, where=there)
     return extreme(lows, np.minimum), extreme(highs, np.maximum)
 
 
@@ -251,7 +324,8 @@ def _ratio_ends(products: Products, faces: list[Face], per: Float, least: Float)
             if 0 not in face.some:
                 np.copyto(lows, 0.0, where=allowed)
                 np.maximum(highs, 0.0, out=highs, where=allowed)
-            else:
+            if face.amplitude is None:
+                # Without a blackbody the light is recombination, or there is none, which every ratio allows.
                 np.copyto(highs, np.inf, where=allowed)
             continue
         lines = list(face.some[1:])

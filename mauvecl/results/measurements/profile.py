@@ -4,6 +4,7 @@ At a given temperature everything else is linear, so that the minimum of chi-squ
 form, and a function of one variable remains. It gives the profile likelihood of a quantity that is linear in the
 amplitudes: if chi-squared may rise by c, of which the temperature alone takes delta, the quantity may lie within
 sqrt(c - delta) standard deviations of its best value at that temperature. The interval is the hull over temperatures.
+With an unknown factor on all light, the quantity is a ratio at that temperature; see `light_factor`.
 """
 
 from __future__ import annotations
@@ -17,10 +18,14 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from mauvecl.results.measurements.flare_model import derived_values
+from mauvecl.results.measurements.light_factor import Ratio
+
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
     from mauvecl.results.measurements.flare_model import Derived, FlareModel
+    from mauvecl.results.measurements.light_factor import LightFactor
     from mauvecl.results.measurements.reduction import MeanSums
 
 Float = NDArray[np.float64]
@@ -62,8 +67,9 @@ class BestFit:
 class Profile:
     """Profile likelihood of the temperature for the sums of some frames."""
 
-    def __init__(self, reduction: MeanSums, sums: Float) -> None:
-        self.reduction, self.sums = reduction, sums
+    def __init__(self, reduction: MeanSums, sums: Float, light: Float | None = None) -> None:
+        """Take the sums of frames, (n, n_sum), and those of the factor on light, (n,), if it is unknown."""
+        self.reduction, self.sums, self.light = reduction, sums, light
         self._basis, self._inverse = reduction.basis
         self.along = sums @ self._basis.T
         self.rest = sums - self.along @ self._basis
@@ -100,6 +106,12 @@ class Profile:
         along = self.along.reshape(self.along.shape[:1] + (1,) * (log_k.ndim - 1) + self.along.shape[1:])
         others = (along - amplitude[..., None] * (hot @ self._basis.T)) @ self._inverse.T
         return np.concatenate([amplitude[..., None], others], axis=-1)
+
+    def factor(self, log_k: Float, linear: Float) -> Float:
+        """Return the best factor on all light, (n, ...), at temperatures and amplitudes; 1 if it is known."""
+        if self.reduction.light is None or self.light is None:
+            return np.ones(log_k.shape)
+        return self.reduction.light.estimate(self.light, log_k, linear)
 
     def best(self, at_nodes: Float | None = None) -> BestFit:
         """Return the best fit of each frame.
@@ -206,6 +218,9 @@ def ends_of_quantities(
     columns: list[tuple[Float, Float]] = []
     for one, spline, (first, times) in zip(model.derived, model.splines, model.multiples, strict=True):
         low, high = columns[first] if first < len(columns) else ends(one, spline)
+        # Light that contradicts every factor above zero limits nothing.
+        none = low > high
+        low, high = np.where(none, -np.inf, low), np.where(none, np.inf, high)
         columns.append((times * low, times * high))
     return np.column_stack([low for low, _ in columns]), np.column_stack([high for _, high in columns])
 
@@ -230,37 +245,90 @@ def _linear_interval(
     allowed: float,
     closed: NDArray[np.bool_],
 ) -> tuple[Float, Float]:
-    factors = spline(x)
-    value = np.einsum("nsl,nsl->ns", factors, linear)
-    basis, inverse = profile.reduction.basis
-    if len(basis):
-        others = factors[..., 1:] @ inverse
-        slope = factors[..., 0] - np.einsum("nsk,nsk->ns", others, hot @ basis.T)
-        spread = slope**2 * variance + np.einsum("nsk,nsk->ns", others, others)
-    else:
-        spread = factors[..., 0] ** 2 * variance
+    ratio = ratio_at(profile, spline, x, linear, variance, hot)
+    value, spread, known = ratio.top, ratio.top_variance, profile.reduction.light is None
+    # The ratio is straight where the recorded quantity less the ratio times the factor is.
+    middle = ratio.value[:, SAMPLES // 2, None]
+    estimate = value if known else value - middle * ratio.bottom
     outside = left < 0.0
     outside[:, [0, -1]] = False  # rounding decides at the ends themselves
-    ends = [_hull(value, spread, left, outside, sign)[0] for sign in (-1.0, 1.0)]
-    bend = np.abs(value[:, 0] + value[:, -1] - 2 * value[:, SAMPLES // 2])
+
+    def reached(room: Float, sign: float, rows: NDArray[np.intp] | slice = slice(None)) -> Float:
+        if known:
+            return np.asarray(value[rows] + sign * np.sqrt(np.maximum(room, 0.0) * spread[rows]))
+        return Ratio(*(one[rows] for one in vars(ratio).values())).end(room, sign)
+
+    ends = [_hull(reached(left, sign), outside, sign)[0] for sign in (-1.0, 1.0)]
+    light = profile.reduction.light
+    if light is not None and light.prior.size:
+        half = SAMPLES // 2
+        change = light.change(ratio.value[:, half], ratio.bottom[:, half], ends[1] - ends[0], allowed)
+        left = left + change[:, None]
+        outside |= left < 0.0
+        ends = [_hull(reached(left, sign), outside, sign)[0] for sign in (-1.0, 1.0)]
+    bend = np.abs(estimate[:, 0] + estimate[:, -1] - 2 * estimate[:, SAMPLES // 2])
     # Simulated fits need the error of the temperature, which its interval gives if it has both ends.
-    bent = np.flatnonzero(closed & (bend > CURVED * np.sqrt(allowed) * (ends[1] - ends[0])))
+    wide = (ends[1] - ends[0]) * (1.0 if known else ratio.bottom[:, SAMPLES // 2])
+    bent = np.flatnonzero(closed & np.isfinite(wide) & (bend > CURVED * np.sqrt(allowed) * wide))
     if bent.size:
+        if light is not None:
+            nodes = profile.nodes
+            factors = spline(nodes) + float(np.median(middle[bent])) * light.weights_of(nodes)
+            spline = scipy.interpolate.CubicSpline(nodes, factors)
         thresholds = _Thresholds(profile, spline)
         room, error = left[bent], (x[bent, -1] - x[bent, 0]) / np.sqrt(4 * allowed)
         for end, sign in zip(ends, (-1.0, 1.0), strict=True):
-            place = np.arange(bent.size), _hull(value[bent], spread[bent], room, room < 0.0, sign)[1]
-            moved = sign * np.sqrt(np.maximum(room[place], 0.0))
-            own = room + thresholds.at(bent, x[bent][place], moved, error, allowed)[:, None] - allowed
-            end[bent] = _hull(value[bent], spread[bent], own, own < 0.0, sign)[0]
+            which = _hull(reached(room, sign, bent), room < 0.0, sign)[1]
+            place = np.arange(bent.size), which
+            # Share of the variance that is not the factor's; the factor is straight.
+            share = np.ones(bent.size)
+            if light is not None:
+                at = middle[bent, 0]
+                total = ratio.variance_at(middle)[bent, which]
+                own = light.scale**-2.0 * at**2
+                share = np.clip(1.0 - own / total, 0.0, 1.0)
+            moved = sign * np.sqrt(np.maximum(room[place], 0.0) * share)
+            change = share * (thresholds.at(bent, x[bent, which], moved, error, allowed) - allowed)
+            changed = room + change[:, None]
+            end[bent] = _hull(reached(changed, sign, bent), changed < 0.0, sign)[0]
     return ends[0], ends[1]
 
 
-def _hull(
-    value: Float, spread: Float, left: Float, outside: NDArray[np.bool_], sign: float
-) -> tuple[Float, NDArray[np.intp]]:
-    """Return the lowest or highest value that samples (n, n_sample) allow, and the sample."""
-    reached = np.where(outside, sign * -np.inf, value + sign * np.sqrt(np.maximum(left, 0.0) * spread))
+def ratio_at(profile: Profile, spline: CubicSpline, log_k: Float, linear: Float, variance: Float, hot: Float) -> Ratio:
+    """Return a quantity that is linear in the amplitudes, at temperatures (n, n_sample), over the factor on all light.
+
+    Parameters
+    ----------
+    spline : CubicSpline
+        Factors of the amplitudes over log temperature.
+    linear, variance, hot
+        Best amplitudes at these temperatures; variance and sums of the blackbody, as of `Profile.parts`.
+    """
+    basis, inverse = profile.reduction.basis
+
+    def parts(factors: Float) -> tuple[Float, Float]:
+        """Return the independent parts of a sum of amplitudes: those of the blackbody and of the others."""
+        if not len(basis):
+            return factors[..., 0], factors[..., 1:]
+        others = factors[..., 1:] @ inverse
+        return factors[..., 0] - np.einsum("nsk,nsk->ns", others, hot @ basis.T), others
+
+    def covariance(one: tuple[Float, Float], other: tuple[Float, Float]) -> Float:
+        return np.asarray(one[0] * other[0] * variance + np.einsum("nsk,nsk->ns", one[1], other[1]))
+
+    factors = spline(log_k)
+    value, own = np.einsum("nsl,nsl->ns", factors, linear), parts(factors)
+    light = profile.reduction.light
+    if light is None:
+        return Ratio(value, np.ones_like(value), covariance(own, own), np.zeros_like(value), np.zeros_like(value))
+    dims = parts(light.weights_of(log_k))
+    bottom_variance = covariance(dims, dims) + light.scale**-2.0
+    return Ratio(value, profile.factor(log_k, linear), covariance(own, own), bottom_variance, -covariance(own, dims))
+
+
+def _hull(reached: Float, outside: NDArray[np.bool_], sign: float) -> tuple[Float, NDArray[np.intp]]:
+    """Return the lowest or highest value that samples (n, n_sample) reach inside, and the sample."""
+    reached = np.where(outside, sign * -np.inf, reached)
     which = np.maximum if sign > 0 else np.minimum
     return extreme(reached, which), np.argmax(sign * reached, axis=1)
 
@@ -447,14 +515,23 @@ def covariance(model: FlareModel, profile: Profile, best: BestFit) -> Float:
     jacobian = np.zeros((n, m + 1, hot.shape[1]))
     jacobian[:, 0], jacobian[:, 1:m] = hot, profile.reduction.fixed
     jacobian[:, m] = best.linear[:, :1] * slope
-    return covariance_of(model, best.log_k, best.linear, jacobian @ jacobian.transpose(0, 2, 1))
+    factor = profile.factor(best.log_k, best.linear)
+    information = jacobian @ jacobian.transpose(0, 2, 1)
+    return covariance_of(model, best.log_k, best.linear, information, profile.reduction.light, factor)
 
 
-def covariance_of(model: FlareModel, log_k: Float, linear: Float, information: Float) -> Float:
+def covariance_of(
+    model: FlareModel,
+    log_k: Float,
+    linear: Float,
+    information: Float,
+    light: LightFactor | None = None,
+    factor: Float | float = 1.0,
+) -> Float:
     """Return the covariance of quantities, (n, n_derived, n_derived), from the information on the parameters.
 
-    The parameters are the amplitudes and the log temperature. The result is NaN if a flare adds no light, or if its
-    temperature and amplitudes are degenerate.
+    The parameters are the amplitudes as they are recorded and the log temperature, and the factor on all light if it is
+    unknown. The result is NaN if a flare adds no light, or if its temperature and amplitudes are degenerate.
     """
     m = linear.shape[1]
     scale = np.sqrt(np.einsum("nii->ni", information))
@@ -465,8 +542,19 @@ def covariance_of(model: FlareModel, log_k: Float, linear: Float, information: F
     normal[~good] = np.eye(m + 1)
     inverse = np.linalg.inv(normal) / scale[:, :, None] / scale[:, None, :]
     inverse[~good] = np.nan
+    over = np.broadcast_to(np.asarray(factor, np.float64), log_k.shape)
     gradient = gradient_of(model, log_k, linear)
-    return np.asarray(gradient @ inverse @ gradient.transpose(0, 2, 1))
+    if light is None:
+        return np.asarray(gradient @ inverse @ gradient.transpose(0, 2, 1))
+    over = np.where(over > 0.0, over, np.nan)
+    which, _ = model.sums
+    gradient[:, which] /= over[:, None, None]
+    # The best factor follows the amplitudes and the temperature, and scatters about that.
+    by_factor = np.where(which, -derived_values(model, log_k, linear) / over[:, None] ** 2, 0.0)
+    follows = -np.column_stack([light.weights_of(log_k), linear[:, 0] * light.spline(log_k, 1) / light.scale])
+    gradient += by_factor[:, :, None] * follows[:, None, :]
+    own = by_factor[:, :, None] * by_factor[:, None, :] / light.scale**2
+    return np.asarray(gradient @ inverse @ gradient.transpose(0, 2, 1) + own)
 
 
 def gradient_of(model: FlareModel, log_k: Float, linear: Float) -> Float:

@@ -8,7 +8,7 @@ spectra (generalised least squares).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self
 
@@ -16,6 +16,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from mauvecl.results.measurements.light_factor import LightFactor
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.nuisances import Nuisances, join_names
@@ -46,6 +47,7 @@ class MeanSums:
     hot: Float  # shape (n_node, n_sum); mean sums for a blackbody of amplitude 1, at each of the model's temperatures
     fixed: Float  # shape (n_linear - 1, n_sum); mean sums of the other components for unit amplitude
     log_k: Float  # shape (n_node,); evenly spaced, to a few percent of a step
+    light: LightFactor | None = field(default=None, kw_only=True)  # factor on all light, if it is unknown
 
     @cached_property
     def basis(self) -> tuple[Float, Float]:
@@ -101,21 +103,35 @@ class Reduction(MeanSums):
         added_dn: Float | None = None,
         nuisances: Nuisances | None = None,
         skipped_nm: Ranges = (),
+        *,
+        highest_dn: Float | None = None,
+        clipped: NDArray[np.bool_] | None = None,
     ) -> Self:
         """Compute the reduction for exposures with the variance of a given flare.
 
-        Raises InputError if every pixel saturates, or the flare is degenerate with the unknowns.
+        Raises InputError if too few pixels can be used, or the flare is degenerate with the unknowns.
 
         Parameters
         ----------
         added_dn : ndarray, shape (n_pixel,), optional
-            Mean DN of the flare; none by default.
+            Mean DN of the flare as it is recorded; none by default.
         skipped_nm : sequence of tuple
             Wavelength ranges of pixels that are not used, in addition to saturated ones.
+        highest_dn : ndarray, shape (n_pixel,), optional
+            Largest mean DN of the flares of the exposures, which decides on saturation; `added_dn` by default.
+        clipped : ndarray of bool, shape (n_pixel,), optional
+            Other pixels that are not used.
         """
-        variance, used = usable_variance(quiet, added_dn, skipped_nm)
+        added = np.zeros(quiet.wavelength_nm.size) if added_dn is None else added_dn
+        variance, used = usable_variance(quiet, added, skipped_nm, nuisances, highest_dn)
+        if clipped is not None:
+            used = used & ~clipped
+            variance = np.where(used, variance, 0.0)
+        free = nuisances.free if nuisances else 0
+        check_enough(quiet, used, len(model.linear) + 1 + free)
         inverse = np.divide(1.0, variance, out=np.zeros_like(variance), where=used)
-        rows = nuisances.rows(variance, nuisances.spectra * used) if nuisances else np.zeros((0, variance.size))
+        unknown = nuisances.around(added) if nuisances else None
+        rows = unknown.rows(variance, unknown.spectra * used) if unknown else np.zeros((0, variance.size))
         spanning = np.vstack([model.hot[::EVERY], model.fixed]) * used
         plain = spanning * inverse
         optimal = plain - (spanning @ rows.T) @ rows
@@ -126,8 +142,9 @@ class Reduction(MeanSums):
         values, vectors = np.linalg.eigh(gram / np.outer(length, length))
         kept = values > LEAST * values[-1]
         weights = (vectors[:, kept] / length[:, None] / np.sqrt(values[kept])).T @ optimal
-        free = nuisances.free if nuisances else 0
-        return cls(model.hot @ weights.T, model.fixed @ weights.T, model.log_k, variance, weights, rows, free)
+        hot, fixed = model.hot @ weights.T, model.fixed @ weights.T
+        light = light_factor(model, unknown, rows)
+        return cls(hot, fixed, model.log_k, variance, weights, rows, free, light=light)
 
     def rest(self, excess_dn: Float, sums: Float) -> Float:
         """Return chi-squared of the residuals of frames less the quiescent mean, shape (n,)."""
@@ -148,6 +165,20 @@ class Reduction(MeanSums):
         return int((self.variance > 0.0).sum())
 
 
+def light_factor(model: FlareModel, unknown: Nuisances | None, rows: Float) -> LightFactor | None:
+    """Return the factor on all light if it is among the unknowns, from `Nuisances.around` and its `rows`."""
+    if unknown is None or not unknown.has_factor:
+        return None
+    # The last row of the Cholesky factor's inverse depends on the factor alone, given the other unknowns.
+    row, precision = rows[-1], float(unknown.sd[-1]) ** -2.0
+    own = float(row @ unknown.spectra[-1])
+    scale = (own + np.sqrt(own**2 + 4.0 * precision)) / 2.0
+    return LightFactor(
+        row, scale, 1.0 + float(unknown.mean[-1]), model.log_k, model.hot @ row, model.fixed @ row,
+        precision / scale**2, unknown.factor_prior,
+    )  # fmt: skip
+
+
 @dataclass(frozen=True, eq=False)
 class Exposures:
     """Raw frames, shape (n, n_pixel), and the quiescent mean; sums are taken block by block, without a copy of all."""
@@ -159,13 +190,15 @@ class Exposures:
         """Return the sums of some frames, shape (n, n_sum)."""
         return np.concatenate([excess @ reduction.weights.T for excess in self._excess(rows)])
 
-    def sums_and_rest(self, reduction: Reduction, rows: NDArray[np.intp]) -> tuple[Float, Float]:
-        """Return the sums of some frames, and chi-squared of the residuals, shape (n,)."""
-        parts = []
+    def sums_and_rest(self, reduction: Reduction, rows: NDArray[np.intp]) -> tuple[Float, Float, Float | None]:
+        """Return the sums of some frames, chi-squared of the residuals, and sums of the factor on light, (n,) each."""
+        parts, light = [], reduction.light
         for excess in self._excess(rows):
             sums = excess @ reduction.weights.T
-            parts.append((sums, reduction.rest(excess, sums)))
-        return np.concatenate([sums for sums, _ in parts]), np.concatenate([rest for _, rest in parts])
+            own = np.zeros(0) if light is None else excess @ light.weights
+            parts.append((sums, reduction.rest(excess, sums), own))
+        sums, rest, own = (np.concatenate(one) for one in zip(*parts, strict=True))
+        return sums, rest, None if light is None else own
 
     def _excess(self, rows: NDArray[np.intp]) -> Iterator[Float]:
         for start in range(0, rows.size, FRAMES_AT_ONCE):
@@ -177,27 +210,56 @@ def drawn_sums(values: NDArray[np.float32], reduction: Reduction) -> Float:
     return np.ascontiguousarray(values[-len(reduction.weights) :].T, np.float64)
 
 
-def variance_of(quiet: Expectation, added_dn: Float | None = None) -> tuple[Float, NDArray[np.bool_]]:
-    """Return the variance of an exposure with a flare, DN^2, zero in saturated pixels, and which pixels are used."""
+def variance_of(
+    quiet: Expectation, added_dn: Float | None = None, highest_dn: Float | None = None
+) -> tuple[Float, NDArray[np.bool_]]:
+    """Return the variance of an exposure with a flare, DN^2, zero in saturated pixels, and which pixels are used.
+
+    Pixels saturate with the light `highest_dn` of a flare, by default the mean `added_dn`.
+    """
     added = np.zeros(quiet.wavelength_nm.size) if added_dn is None else added_dn
-    light = np.maximum(quiet.light_dn + added, 0.0)
     constant = quiet.unsaturated_variance_dn2 - quiet.gain_dn_per_electron * quiet.light_dn
-    variance = constant + quiet.gain_dn_per_electron * light
+
+    def variance_with(added: Float) -> tuple[Float, Float]:
+        light = np.maximum(quiet.light_dn + added, 0.0)
+        return light, constant + quiet.gain_dn_per_electron * light
+
+    variance = variance_with(added)[1]
+    light, scatter = variance_with(added if highest_dn is None else highest_dn)
     # Frames of a pixel near saturation are occasionally clipped, so that the pixel is not reliable.
     raw = light / quiet.n_frames + quiet.dark_dn + quiet.bias_dn
-    used = raw + NEAR_SIGMA * np.sqrt(variance / quiet.n_frames) < quiet.ceiling_dn
+    used = raw + NEAR_SIGMA * np.sqrt(scatter / quiet.n_frames) < quiet.ceiling_dn
     return np.where(used, variance, 0.0), used
 
 
 def usable_variance(
-    quiet: Expectation, added_dn: Float | None = None, skipped_nm: Ranges = ()
+    quiet: Expectation,
+    added_dn: Float | None = None,
+    skipped_nm: Ranges = (),
+    nuisances: Nuisances | None = None,
+    highest_dn: Float | None = None,
 ) -> tuple[Float, NDArray[np.bool_]]:
-    """Return `variance_of` without skipped pixels; raises InputError if no pixel remains."""
-    variance, used = variance_of(quiet, added_dn)
+    """Return `variance_of` without skipped pixels, at the unknowns' means; raises InputError without a pixel."""
+    if nuisances and nuisances.mean_dn.any():
+        added_dn = np.zeros(quiet.wavelength_nm.size) if added_dn is None else added_dn
+        # A frame may have more light than the mean exposure, up to what the expectation has.
+        highest_dn = added_dn if highest_dn is None else highest_dn
+        added_dn = added_dn + nuisances.mean_dn
+    variance, used = variance_of(quiet, added_dn, highest_dn)
     used = used & ~skipped_pixels(quiet, skipped_nm)
-    if not used.any():
-        raise InputError(f"every pixel of {quiet.name} saturates or is left out", "some that count", key="skipped_nm")
+    check_enough(quiet, used, 0)
     return np.where(used, variance, 0.0), used
+
+
+def check_enough(quiet: Expectation, used: NDArray[np.bool_], parameters: int) -> None:
+    """Raise InputError unless more pixels are used than parameters are fitted."""
+    count = int(used.sum())
+    if count <= parameters:
+        fault = f"{count} of {used.size} pixels of {quiet.name} can be used, since others saturate or are left out"
+        expected = f"more than the {parameters} parameters of the fit"
+        if not count:
+            fault, expected = f"every pixel of {quiet.name} saturates or is left out", "some that count"
+        raise InputError(fault, expected, key="skipped_nm", value=count)
 
 
 def skipped_pixels(quiet: Expectation, skipped_nm: Ranges) -> NDArray[np.bool_]:
@@ -211,6 +273,12 @@ def skipped_pixels(quiet: Expectation, skipped_nm: Ranges) -> NDArray[np.bool_]:
 
 def check_distinct(kept: Float, whole: Float, nuisances: Nuisances | None) -> None:
     """Raise InputError if marginalisation over nuisances removes the S/N^2 of a component."""
+    if not (whole > 0.0).all():
+        raise InputError(
+            "a component of the flare has no light in the pixels that neither saturate nor are left out",
+            "a model whose components have light there",
+            key="model",
+        )
     if not (kept > LEAST_KEPT * whole).all():
         unknown = join_names(nuisances.names) if nuisances else "nothing"
         raise InputError(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
@@ -16,9 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.results.measurements.fit import LEVELS, Forecast, Measurement, checked_exposures, fit, variance_groups
 from mauvecl.results.measurements.flare_model import Derived, FlareModel, derived_values
+from mauvecl.results.measurements.light_factor import undimmed
 from mauvecl.results.measurements.nonnegative import BoundedProfile, bounded_intervals
 from mauvecl.results.measurements.profile import BestFit
-from mauvecl.results.measurements.reduction import Ranges, Reduction
+from mauvecl.results.measurements.reduction import Ranges, Reduction, check_enough
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import Probability, Wavelength
@@ -98,25 +99,28 @@ def fit_two_temperatures(
     if any(one.ratio is not None for one in model.derived):
         raise InputError("a model with a Balmer jump", "blackbodies, with lines or without", key="model")
     single = fit(frames, expectation, model, nuisances, levels=levels, skipped_nm=skipped_nm)
-    exposures = checked_exposures(frames, expectation, levels)
+    exposures = checked_exposures(frames, expectation, levels, nuisances)
 
-    def reduction_of(added_dn: Float | None) -> Reduction:
-        return Reduction.of(model, expectation, added_dn, nuisances, skipped_nm)
+    def reduction_of(added_dn: Float | None, **how: Any) -> Reduction:
+        return Reduction.of(model, expectation, added_dn, nuisances, skipped_nm, **how)
 
     allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
     parts, order, whole = [], [], TwoTemperatures(model)
-    for rows, reduction in variance_groups(expectation, model, single.log_k, single.amplitudes, reduction_of):
-        sums, rest = exposures.sums_and_rest(reduction, rows)
-        found = _Search(model, reduction, sums, allowed).measured()
-        best, low, high, second, estimates = found
+    recorded = single.amplitudes * single.factor[:, None]
+    groups = variance_groups(expectation, model, single.log_k, recorded, reduction_of, nuisances, exposures)
+    for rows, reduction in groups:
+        sums, rest, light = exposures.sums_and_rest(reduction, rows)
+        found = _Search(model, reduction, sums, allowed, light).measured()
+        best, low, high, second, estimates, factor = found
         chi2 = rest + np.einsum("nk,nk->n", sums, sums) - best.gain
         dof = reduction.n_used - reduction.n_free - len(model.linear) - 3
-        covariance = _covariance(model, reduction, best, second, estimates)
+        check_enough(expectation, reduction.variance > 0.0, len(model.linear) + 3 + reduction.n_free)
+        covariance = _covariance(model, reduction, best, second, estimates, factor)
         parts.append(
             Measurement(
                 whole.names, whole.units, whole.bounds, estimates, covariance, tuple(levels), low, high, chi2,
                 np.asarray(scipy.stats.chi2.sf(chi2, dof)), dof, np.sqrt(best.gain),
-                np.column_stack([best.log_k, second]), best.linear,
+                np.column_stack([best.log_k, second]), undimmed(best.linear, factor), factor,
             )
         )  # fmt: skip
         order.append(rows)
@@ -135,13 +139,15 @@ def forecast_two_temperatures(
 
     Undefined where one of the blackbodies adds no light.
     """
-    whole, log_k, linear = TwoTemperatures(model), np.log(temperatures_k), np.asarray(amplitudes, np.float64)[None]
-    reduction = Reduction.of(model, expectation, whole.counts(temperatures_k, linear[0]), nuisances, skipped_nm)
-    values = derived_values(with_second(model, float(log_k[1])), log_k[:1], linear)
+    factor = nuisances.mean_factor if nuisances else 1.0
+    whole, log_k, linear = TwoTemperatures(model), np.log(temperatures_k), factor * np.asarray(amplitudes)[None]
+    counts = whole.counts(temperatures_k, linear[0])
+    reduction = Reduction.of(model, expectation, counts, nuisances, skipped_nm, highest_dn=counts / min(1.0, factor))
+    values = derived_values(with_second(model, float(log_k[1])), log_k[:1], linear / factor)
     values = np.insert(values, -1, temperatures_k[1], axis=1)
     sums = linear[0] @ np.vstack([reduction.spline(log_k), reduction.fixed])
     best = BestFit(log_k[:1], linear, np.array([sums @ sums]))
-    spread = _covariance(model, reduction, best, log_k[1:], values)[0]
+    spread = _covariance(model, reduction, best, log_k[1:], values, np.array([factor]))[0]
     errors = np.sqrt(np.diag(spread))
     return Forecast(whole.names, whole.units, values[0], errors, spread, float(np.linalg.norm(sums)))
 
@@ -178,8 +184,11 @@ def _lower(nodes: Float, log_k: float) -> int:
 class _Search:
     """Fit of exposures with a common variance over second temperatures."""
 
-    def __init__(self, model: FlareModel, reduction: Reduction, sums: Float, allowed: list[float]) -> None:
+    def __init__(
+        self, model: FlareModel, reduction: Reduction, sums: Float, allowed: list[float], light: Float | None
+    ) -> None:
         self._model, self._reduction, self._sums, self._allowed = model, reduction, sums, allowed
+        self._light = light
         first, last = model.log_k[2 * APART], model.log_k[-1]
         #: Second log temperatures that may be tried.
         self._grid = np.linspace(first, last, PER_NODE * (model.log_k.size - 1 - 2 * APART) + 1)
@@ -187,8 +196,11 @@ class _Search:
 
     def _profile(self, node: int, rows: NDArray[np.intp]) -> BoundedProfile:
         r, end = self._reduction, _lower(self._reduction.log_k, self._grid[node])
-        own = replace(r, hot=r.hot[:end], fixed=np.vstack([r.spline(self._grid[node]), r.fixed]), log_k=r.log_k[:end])
-        return BoundedProfile(own, self._sums[rows])
+        second = float(self._grid[node])
+        fixed = np.vstack([r.spline(second), r.fixed])
+        factor = None if r.light is None else r.light.with_second(second, end)
+        own = replace(r, hot=r.hot[:end], fixed=fixed, log_k=r.log_k[:end], light=factor)
+        return BoundedProfile(own, self._sums[rows], None if self._light is None else self._light[rows])
 
     def _evaluate(self, wanted: NDArray[np.bool_]) -> None:
         """Compute the largest gain at second temperatures, (n, n_node)."""
@@ -197,8 +209,8 @@ class _Search:
             if rows.size:
                 self._gain[rows, node] = self._profile(int(node), rows).best().gain
 
-    def measured(self) -> tuple[BestFit, Float, Float, Float, Float]:
-        """Return best fits, intervals (n_level, n, n_derived), second log temperatures, and estimates."""
+    def measured(self) -> tuple[BestFit, Float, Float, Float, Float, Float]:
+        """Return best fits, intervals (n_level, n, n_derived), second log temperatures, estimates, and factors."""
         n, nodes = self._gain.shape
         coarse = np.zeros((n, nodes), np.bool_)
         coarse[:, ::COARSE] = True
@@ -217,7 +229,7 @@ class _Search:
         q = len(self._model.derived) + 2
         lows, highs = np.full((len(self._allowed), n, q), np.inf), np.full((len(self._allowed), n, q), -np.inf)
         log_k, linear = np.empty(n), np.empty((n, len(self._model.linear) + 1))
-        estimates = np.empty((n, q))
+        estimates, factor = np.empty((n, q)), np.ones(n)
         for node in np.flatnonzero((self._gain >= gain[:, None] - max(self._allowed)).any(axis=0)):
             rows = np.flatnonzero(self._gain[:, node] >= gain - max(self._allowed))
             profile, model = self._profile(int(node), rows), with_second(self._model, float(self._grid[node]))
@@ -226,6 +238,8 @@ class _Search:
             here = np.flatnonzero(best_node[rows] == node)
             log_k[rows[here]], linear[rows[here]] = own.log_k[here], own.linear[here]
             values = derived_values(model, own.log_k[here], own.linear[here])
+            factor[rows[here]] = profile.factor(own.log_k, own.linear)[here]
+            values[:, model.sums[0]] = undimmed(values[:, model.sums[0]], factor[rows[here]])
             estimates[rows[here]] = np.insert(values, q - 2, np.exp(self._grid[node]), axis=1)
             for k, one in enumerate(self._allowed):
                 there = np.flatnonzero(own.gain >= gain[rows] - one)
@@ -240,7 +254,7 @@ class _Search:
         for k, one in enumerate(self._allowed):
             lows[k, :, q - 2], highs[k, :, q - 2] = self._second_ends(gain, one)
         best = BestFit(log_k, linear, gain)
-        return best, lows, highs, self._grid[best_node], estimates
+        return best, lows, highs, self._grid[best_node], estimates, factor
 
     def _second_ends(self, gain: Float, allowed: float) -> tuple[Float, Float]:
         """Return the ends of the second temperature's interval, interpolated between the tried nodes."""
@@ -258,7 +272,9 @@ class _Search:
         return low, high
 
 
-def _covariance(model: FlareModel, reduction: Reduction, best: BestFit, second: Float, estimates: Float) -> Float:
+def _covariance(
+    model: FlareModel, reduction: Reduction, best: BestFit, second: Float, estimates: Float, factor: Float
+) -> Float:
     """Return the covariance of quantities, (n, n_derived + 2, n_derived + 2), from the Fisher information."""
     n, m = best.linear.shape
     a, b = best.linear[:, 0], best.linear[:, 1]
@@ -266,7 +282,8 @@ def _covariance(model: FlareModel, reduction: Reduction, best: BestFit, second: 
     columns += [np.tile(row, (n, 1)) for row in reduction.fixed]
     columns += [a[:, None] * reduction.spline(best.log_k, 1), b[:, None] * reduction.spline(second, 1)]
     jacobian = np.stack(columns, axis=1)
-    gradient = np.zeros((n, len(model.derived) + 2, m + 2))
+    over = np.where(factor > 0.0, factor, np.nan)
+    gradient, by_factor = np.zeros((n, len(model.derived) + 2, m + 2)), np.zeros((n, len(model.derived) + 2))
     for q, (one, spline) in enumerate(zip(model.derived, model.splines, strict=True)):
         if spline is None or one.factors is None:
             gradient[:, q, m] = np.exp(best.log_k)
@@ -275,6 +292,8 @@ def _covariance(model: FlareModel, reduction: Reduction, best: BestFit, second: 
         gradient[:, q, 0], gradient[:, q, 1], gradient[:, q, 2:m] = here[:, 0], there[:, 0], here[:, 1:]
         gradient[:, q, m] = spline(best.log_k, 1)[:, 0] * a
         gradient[:, q, m + 1] = spline(second, 1)[:, 0] * b
+        gradient[:, q] /= over[:, None]
+        by_factor[:, q] = -estimates[:, q] / over
     gradient[:, -2, m + 1] = np.exp(second)
     with np.errstate(divide="ignore", invalid="ignore"):
         areas = estimates[:, -1]
@@ -283,9 +302,17 @@ def _covariance(model: FlareModel, reduction: Reduction, best: BestFit, second: 
         slopes = [4.0 - bolometric(x, 1)[:, 0] / bolometric(x)[:, 0] for x in (best.log_k, second)]
         gradient[:, -1, 0], gradient[:, -1, 1] = -areas / a, areas / b
         gradient[:, -1, m], gradient[:, -1, m + 1] = areas * slopes[0], -areas * slopes[1]
+    own = np.zeros((n, by_factor.shape[1], by_factor.shape[1]))
+    if reduction.light is not None:
+        light = reduction.light
+        weights = [light.spline(best.log_k), light.spline(second), *(np.full(n, one) for one in light.fixed)]
+        weights += [a * light.spline(best.log_k, 1), b * light.spline(second, 1)]
+        gradient -= by_factor[:, :, None] * np.stack(weights, axis=1)[:, None, :] / light.scale
+        own = by_factor[:, :, None] * by_factor[:, None, :] / light.scale**2
     information = np.einsum("nik,njk->nij", jacobian, jacobian)
     good = (best.linear > 0).all(axis=1)
     information[~good] = np.eye(m + 2)
     inverse = np.linalg.pinv(information, rcond=1e-14, hermitian=True)
     inverse[~good] = np.nan
-    return np.asarray(np.einsum("nqi,nij,nrj->nqr", np.nan_to_num(gradient), inverse, np.nan_to_num(gradient)))
+    spread = np.einsum("nqi,nij,nrj->nqr", np.nan_to_num(gradient), inverse, np.nan_to_num(gradient))
+    return np.asarray(spread + np.nan_to_num(own))

@@ -1,0 +1,219 @@
+"""Fits of flares in exposures whose light is multiplied by an unknown factor, with that of the flare.
+
+Draws are normal, with seeds fixed beforehand. They multiply star, flare and sky by a factor, as the kernels do.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy
+
+from mauvecl import BalmerFlare, Expectation, Instrument, Nuisances, Source, TwoBlackbodies, expect
+from mauvecl.results.measurements.fit import fit, forecast
+from mauvecl.results.measurements.flare_model import FlareModel
+from mauvecl.results.measurements.light_factor import Ratio
+from mauvecl.results.measurements.two_temperatures import fit_two_temperatures
+
+MAUVE = Instrument.load("mauve")
+FREE, SKY_SD, DARK_C = np.inf, 0.1, 0.5
+
+
+@cache
+def star(library: str, magnitude: float) -> Source:
+    return Source.from_library(library).at_magnitude(magnitude)
+
+
+@cache
+def quiet(library: str = "M3V", magnitude: float = 7.0, exposure: float = 50.0) -> Expectation:
+    return expect(star(library, magnitude), MAUVE, exposure=exposure)
+
+
+def drawn(lit: Expectation, factor: np.ndarray, rng: np.random.Generator, *, unknown: bool = True) -> np.ndarray:
+    """Draw exposures of a flaring star, whose light has these factors, with unknown levels of dark and sky."""
+    n = factor.size
+    dark = DARK_C * rng.standard_normal(n) if unknown else np.zeros(n)
+    sky = 1.0 + SKY_SD * rng.standard_normal(n) if unknown else np.ones(n)
+    light = factor[:, None] * (lit.light_dn + (sky[:, None] - 1.0) * lit.sky_dn)
+    level = lit.n_frames * lit.dark_dn * np.exp(lit.conditions["dark_slope_per_c"] * dark)[:, None]
+    variance = lit.unsaturated_variance_dn2 + lit.gain_dn_per_electron * (light - lit.light_dn)
+    mean = light + level + lit.n_frames * lit.bias_dn
+    return mean + rng.standard_normal(mean.shape) * np.sqrt(variance)
+
+
+def covered(found: Any, truth: np.ndarray, least: float, most: float, false: float = 1e-6) -> None:
+    """Check the counts of covered truths at 95 % against coverages, left with a probability of `false` on each side."""
+    n = len(found.estimates)
+    inside = ((found.low[-1] <= truth) & (truth <= found.high[-1])).sum(axis=0)
+    low, high = scipy.stats.binom.ppf(false, n, least), scipy.stats.binom.isf(false, n, most)
+    assert ((low <= inside) & (inside <= high)).all(), dict(zip(found.names, inside / n, strict=True))
+
+
+@pytest.mark.parametrize("light", ["free", "prior"])
+@pytest.mark.parametrize(
+    ("library", "magnitude", "amplitude", "kelvin", "jump"),
+    [("M3V", 7.0, 0.5, 10_000.0, 1.0), ("G2V", 4.0, 0.5, 10_000.0, 1.0), ("M3V", 9.0, 0.5, 9500.0, 2.0),
+     ("M5V", 10.5, 8.0, 14_000.0, 1.0)],
+    ids=lambda value: f"{value}",
+)  # fmt: skip
+def test_intervals_cover_where_light_is_lost(
+    library: str, magnitude: float, amplitude: float, kelvin: float, jump: float, light: str
+) -> None:
+    """Fit 600 draws with losses of 2 +- 1 %: coverages of 93.5 to 96.5 %, each quantity fails in 2e-6 of seeds."""
+    x = quiet(library, magnitude)
+    m = FlareModel.of(star(library, magnitude), MAUVE, x, jump=jump > 1)
+    lit = expect(star(library, magnitude).flaring(amplitude, spectrum=BalmerFlare(kelvin, jump)), MAUVE, exposure=50.0)
+    unknown = Nuisances.of(x, {"light": FREE, "dark": FREE, "sky": SKY_SD})
+    if light == "prior":
+        unknown = unknown.with_prior("light", -0.02, 0.01)
+    rng = np.random.default_rng(4201)
+    raw = drawn(lit, 0.98 + 0.01 * rng.standard_normal(600), rng)
+    found = fit(raw, x, m, unknown, levels=(0.95,))
+    truth = np.array(list(m.values(kelvin, m.amplitudes(kelvin, amplitude, jump=jump)).values()))
+    covered(found, truth, 0.935, 0.965)
+    # Errors in advance are those of the fits, to 5 standard errors of a standard deviation of 600.
+    scatter = np.subtract(*np.quantile(found.estimates, [0.84135, 0.15865], axis=0)) / 2
+    ahead = forecast(x, m, kelvin, m.amplitudes(kelvin, amplitude, jump=jump), unknown).errors
+    np.testing.assert_allclose(scatter, ahead, rtol=5 * 1.3 / np.sqrt(1200) + 0.03)
+
+
+def test_light_that_the_star_alone_loses_was_not_enough() -> None:
+    """Check that a nuisance of the star's light alone misses the amplitude by the loss: the cases above tell."""
+    x = quiet()
+    m = FlareModel.of(star("M3V", 7.0), MAUVE, x)
+    lit = expect(star("M3V", 7.0).flaring(0.5, 10_000.0), MAUVE, exposure=50.0)
+    alone = Nuisances.of(x, {"star": FREE, "dark": FREE, "sky": SKY_SD}, own={"star": x.light_dn})
+    rng = np.random.default_rng(4202)
+    found = fit(drawn(lit, np.full(200, 0.975), rng), x, m, alone, levels=(0.95,))
+    inside = (found.low[0, :, 1] <= 0.5) & (found.high[0, :, 1] >= 0.5)
+    assert inside.mean() < 0.3
+
+
+@pytest.mark.parametrize("sd", [FREE, 0.02], ids=["free", "prior"])
+@pytest.mark.parametrize("amplitude", [0.5, 2.0])
+def test_intervals_agree_with_brute_force(amplitude: float, sd: float) -> None:
+    """Compare with chi-squared minimised over temperature, factor and dark level, with a quantity held."""
+    x = quiet("M3V", 9.0)
+    m = FlareModel.of(star("M3V", 9.0), MAUVE, x)
+    counts = m.counts(11_000.0, [amplitude])
+    variance = x.variance_dn2 + x.gain_dn_per_electron * counts
+    rng = np.random.default_rng(4203)
+    raw = x.recorded_dn - 0.04 * x.light_dn + 0.96 * counts + rng.standard_normal(counts.size) * np.sqrt(variance)
+    unknown = Nuisances.of(x, {"light": sd, "dark": FREE})
+    found = fit(raw, x, m, unknown, levels=(0.95,))
+    assert np.isfinite(found.high[0, 0]).all()
+    held = x.variance_dn2 + x.gain_dn_per_electron * m.counts(
+        float(np.exp(found.log_k[0])), found.factor[0] * found.amplitudes[0]
+    )
+    excess, root = raw - x.recorded_dn, np.sqrt(held)
+    dark = unknown.spectra[1] / root
+
+    def least(log_k: float, amplitude: float) -> float:
+        """Return chi-squared with the best factor and dark level, both linear."""
+        flare = amplitude * m.hot_spline(log_k)
+        rows = np.array([(x.recorded_light_dn + flare) / root, dark])
+        left = (excess - flare) / root
+        gram = rows @ rows.T + np.diag([0.0 if np.isinf(sd) else sd**-2.0, 0.0])
+        along = rows @ left
+        return float(left @ left - along @ np.linalg.solve(gram, along))
+
+    def profile(amplitude: float) -> float:
+        nodes = np.linspace(np.log(5000.0), np.log(60_000.0), 120)
+        start = nodes[int(np.argmin([least(k, amplitude) for k in nodes]))]
+        found = scipy.optimize.minimize_scalar(
+            lambda k: least(k, amplitude), bounds=(start - 0.05, start + 0.05), method="bounded",
+            options={"xatol": 1e-7},
+        )  # fmt: skip
+        return float(found.fun)
+
+    value, error = found.estimates[0, 1], found.errors[0, 1]
+    bottom = profile(float(value))
+    for end in (found.low[0, 0, 1], found.high[0, 0, 1]):
+        # Within 1.5 % of a standard error, of which chi-squared at the end tells.
+        slope = abs(profile(float(end + 0.01 * error)) - profile(float(end - 0.01 * error))) / 0.02
+        assert abs(profile(float(end)) - bottom - scipy.stats.chi2.isf(0.05, 1)) < 0.015 * slope + 0.01
+
+
+@pytest.mark.parametrize("bottom", [5.0, 1.5, 0.4])
+@pytest.mark.parametrize("top", [3.0, 0.5, -2.0])
+def test_ends_of_ratios_agree_with_a_scan(top: float, bottom: float) -> None:
+    """Compare with the ratios of all pairs of a fine grid that chi-squared allows, with a positive bottom."""
+    covariance = np.array([[1.0, 0.3], [0.3, 0.8]])
+    angle = np.linspace(-np.pi, np.pi, 200_001)
+    root = np.linalg.cholesky(covariance)
+    for left in (0.5, 3.84):
+        edge = np.array([[top], [bottom]]) + np.sqrt(left) * root @ [np.cos(angle), np.sin(angle)]
+        inside = edge[:, edge[1] > 0.0]
+        ratio = Ratio(*(np.array([one]) for one in (top, bottom, 1.0, 0.8, 0.3)))
+        low, high = (float(ratio.end(np.array([left]), sign)[0]) for sign in (-1.0, 1.0))
+        ratio_ends = inside[0] / inside[1]
+        reaches_zero = edge[1].min() <= 0.0
+        for end, other, side in ((low, ratio_ends.min(), -1.0), (high, ratio_ends.max(), 1.0)):
+            if np.isinf(end):
+                assert reaches_zero
+                assert np.sign(end) == side
+                assert abs(other) > 1e3
+            else:
+                assert end == pytest.approx(other, rel=1e-6, abs=1e-8)
+
+
+def test_single_frames_have_uniform_losses() -> None:
+    """Fit 1500 single frames that lose 0-5 %, and know the star's level by nothing else: 93.5 to 96.5 % (2e-6)."""
+    source = star("M3V", 9.0)
+    x = quiet("M3V", 9.0, 5.0)
+    m, lit = FlareModel.of(source, MAUVE, x), expect(source.flaring(20.0, 10_000.0), MAUVE, exposure=5.0)
+    unknown = Nuisances.of(x, {"light": FREE, "dark": FREE, "sky": SKY_SD})
+    unknown = unknown.with_prior("light", -0.025, 0.05 / 12**0.5).with_spectrum("star", x.net_source_dn, FREE)
+    nodes = np.linspace(-(3.0**0.5), 3.0**0.5, 401)
+    uniform = Nuisances(unknown.names, unknown.spectra, unknown.sd, unknown.of_flare, unknown.mean,
+                        np.array([nodes, np.full(nodes.size, 1.0 / nodes.size)]))  # fmt: skip
+    rng = np.random.default_rng(4204)
+    raw = drawn(lit, 1.0 - 0.05 * rng.random(1500), rng)
+    truth = np.array(list(m.values(10_000.0, [20.0]).values()))
+    covered(fit(raw, x, m, uniform, levels=(0.95,)), truth, 0.935, 0.965)
+    # A normal prior of the same moments covers nearly all.
+    wide = fit(raw, x, m, unknown, levels=(0.95,))
+    assert ((wide.low[0, :, 1] <= 20.0) & (wide.high[0, :, 1] >= 20.0)).mean() > 0.98
+
+
+def test_two_temperatures_are_dimmed_alike() -> None:
+    """Recover both temperatures and all fluxes of a dimmed exposure without noise, to 3 % of their errors."""
+    source, x = star("M3V", 6.0), quiet("M3V", 6.0)
+    m = FlareModel.of(source, MAUVE, x)
+    lit = expect(source.flaring(2.0, spectrum=TwoBlackbodies(8000.0, 30_000.0, 0.05)), MAUVE, exposure=50.0)
+    unknown = Nuisances.of(x, {"light": FREE})
+    raw = [lit.recorded_dn + (f - 1.0) * lit.light_dn for f in (1.0, 0.9)]
+    found = fit_two_temperatures(np.array(raw), x, m, unknown)
+    # Second temperatures lie on a grid, that of both exposures.
+    assert found.factor[1] / found.factor[0] == pytest.approx(0.9, rel=1e-4)
+    away = (found.estimates[1] - found.estimates[0]) / found.errors[0]
+    assert (np.abs(away[np.isfinite(away)]) < 0.03).all(), away
+    assert found.estimates[1, [0, -2]] == pytest.approx([8000.0, 30_000.0], rel=0.02)
+
+
+def test_light_that_may_be_lost_altogether_leaves_fluxes_without_limit() -> None:
+    """Check a star too faint to tell the factor: no upper limit of the flux, and a temperature as before."""
+    source, x = star("M3V", 15.0), quiet("M3V", 15.0)
+    m = FlareModel.of(source, MAUVE, x)
+    lit = expect(source.flaring(500.0, 10_000.0), MAUVE, exposure=50.0)
+    found = fit(lit.recorded_dn, x, m, Nuisances.of(x, {"light": FREE, "dark": FREE}), levels=(0.95,))
+    place = found.column("flux bolometric")
+    assert np.isposinf(found.high[0, 0, place])
+    assert 0.0 < found.low[0, 0, place] < found.estimates[0, place]
+    assert found.low[0, 0, 0] < 10_000.0 < found.high[0, 0, 0] < np.inf
+
+
+def test_tilt_of_the_response_tilts_the_flare() -> None:
+    """Fit an exposure without noise whose response is tilted by 2 %, star and flare: the temperature stays."""
+    source, x = star("M3V", 7.0), quiet()
+    m = FlareModel.of(source, MAUVE, x)
+    lit = expect(source.flaring(2.0, 10_000.0), MAUVE, exposure=50.0)
+    tilted = lit.recorded_dn + 0.02 * lit.light_dn * (x.wavelength_nm - 450.0) / 250.0
+    found = fit(tilted, x, m, Nuisances.of(x, {"tilt": FREE, "dark": FREE}))
+    assert abs(found.estimates[0, 0] - 10_000.0) < 0.1 * found.errors[0, 0]
+    plain = Nuisances.of(x, {"own": FREE, "dark": FREE}, own={"own": Nuisances.of(x, {"tilt": 1.0}).spectra[0]})
+    other = fit(tilted, x, m, plain)
+    assert abs(other.estimates[0, 0] - 10_000.0) > 2 * found.errors[0, 0]
