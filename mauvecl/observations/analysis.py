@@ -62,7 +62,10 @@ class Analysis:
     events: list[ObservedEvent]  # events above the threshold of candidates, in order of time
     completeness: Completeness  # share of flares that the search detects in these frames
     scatter: list[Scatter]
-    likeness: Likeness  # of the residuals and the noise of the process
+    # Shape (n_quiet, n_sum); residuals of quiescent frames given those before them, in standard deviations.
+    residual: Float
+    quiet: NDArray[np.bool_]  # shape (n_searched,); frames of the residuals
+    likeness: Likeness  # of the residuals and independent noise
     spectra: SpectralAnalysis | None = None  # of spectra that are searched with weights for flares
 
     @cached_property
@@ -204,7 +207,7 @@ def analyse_frames(
     return Analysis(
         frames, flux, error, level, survey, wanted, modelled, measured, threshold, candidates, dip, events,
         inject(survey, ~taken, threshold, seed, temperature_k),
-        binned_scatter(numbers, residual @ middle), likeness(numbers, residual), spectra,
+        binned_scatter(numbers, residual @ middle), residual, quiet, likeness(numbers, residual), spectra,
     )  # fmt: skip
 
 

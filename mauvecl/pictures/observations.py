@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.special import ndtri
 
 from mauvecl.pictures.light_curves import show_spectra, time_unit
 from mauvecl.pictures.registry import picture_of
@@ -24,7 +25,7 @@ BRIGHT = 30.0
 @picture_of("AnalyseAnswer", "light-curve")
 @styled_picture
 def observed_light_curve(plt: Any, answer: AnalyseAnswer) -> Any:
-    """Plot the observed light curve with its level, events, and frames that are not searched.
+    """Plot the observed light curve with its level and the level's band of 95 %, events, and frames not searched.
 
     If there are bright events, a second panel shows the part near the level.
     """
@@ -32,11 +33,13 @@ def observed_light_curve(plt: Any, answer: AnalyseAnswer) -> Any:
     time = (one.frames.time_s - one.frames.time_s[0]) / 60.0
     used = one.level.used
     finite = np.isfinite(one.flux)
-    bright = bool((one.survey.flux > BRIGHT).any())
+    bright = bool((((one.flux - one.level.level) / one.level.error)[used] > BRIGHT).any())
     figure, axes = plt.subplots(1 + bright, 1, figsize=(7.2, 2.9 + 1.8 * bright), sharex=True, squeeze=False)
     for axis in axes[:, 0]:
         axis.plot(time[used], one.flux[used], ".", markersize=3, color="black", alpha=0.7)
-        axis.plot(time, one.level.level, color=NULL, linewidth=0.8)
+        level, error = one.level.level, one.level.level_error
+        axis.plot(time, level, color=COLOURS[2], linewidth=0.8)
+        axis.fill_between(time, level - 2 * error, level + 2 * error, color=COLOURS[2], alpha=0.3, linewidth=0)
         left_out = ~used & finite
         axis.plot(time[left_out], one.flux[left_out], "x", markersize=5, color=COLOURS[1])
         for event in one.events:
@@ -99,6 +102,33 @@ def observed_pixel_noise(plt: Any, answer: AnalyseAnswer) -> Any:
     axis.set_xlabel("wavelength (nm)")
     axis.set_ylabel("measured over stated noise")
     headline(figure, f"{answer.analysis.frames.name}: quiescent frames; grey: 95 % of normal noise; red: departs")
+    return figure
+
+
+@picture_of("AnalyseAnswer", "residuals")
+@styled_picture
+def observed_residuals(plt: Any, answer: AnalyseAnswer) -> Any:
+    """Plot the residuals of the fitted process against time, their autocorrelation, and their quantiles."""
+    one = answer.analysis
+    residual = one.residual[:, 0]
+    figure, axes = plt.subplots(1, 3, figsize=(9.6, 2.9), width_ratios=(2, 1, 1))
+    time = (one.survey.time_s - one.frames.time_s[0]) / 60.0
+    axes[0].plot(time[one.quiet], residual, ".", markersize=2, color="black", alpha=0.7)
+    axes[0].set_xlabel("time (min)")
+    axes[0].set_ylabel("residual (standard deviations)")
+    lags = np.arange(1, one.likeness.correlations.size + 1)
+    axes[1].axhspan(-2 * one.likeness.error, 2 * one.likeness.error, color=NULL, alpha=0.4, linewidth=0)
+    axes[1].plot(lags, one.likeness.correlations, "o-", color=COLOURS[0], markersize=3)
+    axes[1].set_xlabel("lag (frames)")
+    axes[1].set_ylabel("autocorrelation")
+    normal = ndtri((np.arange(residual.size) + 0.5) / residual.size)
+    axes[2].plot(normal[[0, -1]], normal[[0, -1]], color=NULL)
+    axes[2].plot(normal, np.sort(residual), ".", color=COLOURS[0], markersize=2)
+    axes[2].set_xlabel("normal quantile")
+    axes[2].set_ylabel("quantile of the residuals")
+    headline(
+        figure, f"{one.frames.name}: residuals of {one.level.process.name}; grey: 95 % of independent, normal noise"
+    )
     return figure
 
 

@@ -338,6 +338,13 @@ LIMITS = (
            "s", "equivalent duration of flares that are detected with a probability of 90 %; nan: above the largest "
            "injected", "ED detected at 90 % (s)", number(".4g", "not reached")),
 )  # fmt: skip
+#: Columns of the models of the quiescent light, one row per combination of terms.
+PROCESS = (
+    Column("terms", lambda row: row[0], "", "terms of the process, and independent noise",
+           "model of the quiescent light", kind=str),
+    Column("bic", lambda row: row[1], "", "Bayesian information criterion less the smallest; the smallest is used",
+           "BIC above the least", number(".3g"), kind=float),
+)  # fmt: skip
 #: Columns of the noise, one row per number of frames.
 NOISE = (
     Column("frames", "frames", "", "frames in a mean", "frames in a mean", kind=int),
@@ -423,6 +430,12 @@ class AnalyseAnswer(Answer):
         return table_of(NOISE, self.analysis.scatter)
 
     @property
+    def process(self) -> QTable:
+        """One row per combination of terms that was tried for the quiescent light, with its criterion."""
+        tried: list[tuple[str, float]] = sorted(self.analysis.level.process.bic, key=lambda row: row[1])
+        return table_of(PROCESS, tried)
+
+    @property
     def measured(self) -> QTable:
         """One row per event and measured quantity, with intervals."""
         rows = [
@@ -448,9 +461,9 @@ class AnalyseAnswer(Answer):
 
     @property
     def tables(self) -> dict[str, Table]:
-        """Events, frames, completeness, limits, noise; for spectra, measured quantities, pixels and throughput."""
+        """Events, frames, completeness, limits, noise, process; of spectra, also quantities, pixels and throughput."""
         tables = {"events": self.events, "frames": self.frames, "completeness": self.completeness,
-                  "limits": self.limits, "noise": self.noise}  # fmt: skip
+                  "limits": self.limits, "noise": self.noise, "process": self.process}  # fmt: skip
         of_spectra = {"measured": self.measured, "noise-per-pixel": self.pixels, "throughput": self.throughput}
         blends = {"neighbour-flares": self.neighbour_flares} if self.study.has_neighbours else {}
         return tables | (of_spectra if self.analysis.spectra is not None else {}) | blends
@@ -477,7 +490,8 @@ class AnalyseAnswer(Answer):
             *([View("Measured in the summed spectra of each event", MEASURED, measured)] if len(measured) else []),
             *self._blends,
             View("Smallest flares that would have been detected, by injecting into these frames", LIMITS, self.limits),
-            View("Noise of quiescent frames", NOISE, self.noise),
+            View("Noise of quiescent frames, less the fitted process", NOISE, self.noise),
+            View("What was tried for the quiescent light", PROCESS, self.process),
         ]
 
     @property
