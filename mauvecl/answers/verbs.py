@@ -107,13 +107,13 @@ def _budgets_or_star(given: dict[str, Any]) -> Study:
 
 def _formula_grid(given: dict[str, Any]) -> Study:
     """Return a study that sweeps what no flag states: magnitudes, exposures, or both, as `gaussian` does."""
-    from mauvecl.answers.detection.gaussian import grid
+    from mauvecl.study.questions import formula_grid
     from mauvecl.study.study import Study
 
     magnitudes, exposure = given["magnitude"], given["exposure"]
     if not magnitudes and exposure is None:
         return Study()
-    return Study().model_copy(update={"sweep": grid(magnitude=not magnitudes, exposure_s=exposure)})
+    return Study().model_copy(update={"sweep": formula_grid(magnitude=not magnitudes, exposure_s=exposure)})
 
 
 #: By name, in the order of `mauvecl --help`: one star, flares, hours and campaigns.

@@ -163,7 +163,14 @@ class Nuisances(ContentEquality):
 
     def with_spectrum(self, name: str, spectrum: Float, sd: float) -> Nuisances:
         """Return the parameters with another one that leaves the light of a flare as it is."""
+        self._check_pixels("spectrum", spectrum)
         return self.joined(Nuisances((name,), spectrum[None], np.array([sd])))
+
+    def _check_pixels(self, key: str, values: Float) -> None:
+        """Raise InputError unless there is a value for each pixel."""
+        expected = (self.spectra.shape[1],)
+        if values.shape != expected:
+            raise InputError.of(key, values.shape, f"the shape {expected}, one value for each pixel")
 
     def joined(self, other: Nuisances) -> Nuisances:
         """Return these parameters and others."""
@@ -192,6 +199,7 @@ class Nuisances(ContentEquality):
         The factor on all light is the last one, and its spectrum is that without a flare: fits find the flare as it is
         recorded. The spectra of the others include the flare.
         """
+        self._check_pixels("flare_dn", flare_dn)
         order, factors = np.arange(len(self.names)), np.flatnonzero((self.of_flare == 1.0).all(axis=1))
         if factors.size:
             order = np.append(np.delete(order, factors[0]), factors[0])

@@ -15,6 +15,9 @@ from mauvecl.schema.physical import Positive, Probability, Wavelength
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Section
 
+#: Magnitudes and exposures of the default sweep of `gaussian`.
+MAGNITUDES, EXPOSURES_S = (4.0, 6.0, 8.0, 10.0, 12.0), (5.0, 50.0, 600.0)
+
 if TYPE_CHECKING:
     QuantityName = str
 else:
@@ -259,3 +262,10 @@ class Sweep(Section):
         values = [axis.points() for axis in self.axes]
         together = zip(*values, strict=True) if self.how == "list" and values else itertools.product(*values)
         return [{a.quantity: v for a, v in zip(self.axes, cell, strict=True)} for cell in together]
+
+
+def formula_grid(*, magnitude: bool = True, exposure_s: float | None = None) -> Sweep:
+    """Return the default sweep of `gaussian`, over magnitudes and over exposures, or at a given exposure."""
+    axes = [Axis(quantity="magnitude", values=MAGNITUDES)] if magnitude else []
+    exposures = EXPOSURES_S if exposure_s is None else (exposure_s,)
+    return Sweep(axes=(*axes, Axis(quantity="exposure", values=exposures)))

@@ -24,7 +24,7 @@ from mauvecl.results.snr import steps_of
 from mauvecl.schema.calls import validated
 from mauvecl.schema.tables import Column, View, number, table_of
 from mauvecl.study.labels import place_columns
-from mauvecl.study.questions import Axis, Sweep
+from mauvecl.study.questions import formula_grid
 from mauvecl.study.sections import Observation
 from mauvecl.study.study import PAPER_STARS, Study
 
@@ -78,15 +78,6 @@ WORST_COLUMNS = (
            description="largest significant difference of a detection probability from the closed form",
            heading="detection off by", format="+.4f"),
 )  # fmt: skip
-#: Magnitudes and exposures of the default sweep.
-MAGNITUDES, EXPOSURES_S = (4.0, 6.0, 8.0, 10.0, 12.0), (5.0, 50.0, 600.0)
-
-
-def grid(*, magnitude: bool = True, exposure_s: float | None = None) -> Sweep:
-    """Return the default sweep over magnitudes, or without them, and over exposures, or at a given one."""
-    axes = [Axis(quantity="magnitude", values=MAGNITUDES)] if magnitude else []
-    exposures = EXPOSURES_S if exposure_s is None else (exposure_s,)
-    return Sweep(axes=(*axes, Axis(quantity="exposure", values=exposures)))
 
 
 def coverage(result: SnrResult) -> NDArray[np.float64]:
@@ -278,7 +269,7 @@ def gaussian(
     if not study.sweep.axes and not stated:
         own = study.observation.exposure_s
         usual = own == Observation().exposure_s
-        study = study.model_copy(update={"sweep": grid(exposure_s=None if usual else own)})
+        study = study.model_copy(update={"sweep": formula_grid(exposure_s=None if usual else own)})
 
     def progress_of(part: int) -> Callable[[int, int], None]:
         def report(done: int, total: int) -> None:
