@@ -7,14 +7,14 @@ searched with a wrong process would be too long or too short.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.observations.energies import flares_of
 from mauvecl.observations.process import Binned, Process, fit_process, level_fit
-from mauvecl.observations.search import SeriesSurvey
+from mauvecl.observations.search import Detection, SeriesSurvey
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -46,29 +46,6 @@ NEAR_WIDTHS, NEAR_SCALES = 20.0, 2.0
 #: Mean of consecutive frames at the end of an event, in standard deviations of a frame, and their number, with which
 #: it goes on.
 STILL_BRIGHT, END_FRAMES = 1.0, 4
-
-
-@dataclass(frozen=True)
-class Detection:
-    """Event above the threshold of the search, before it is measured.
-
-    Attributes
-    ----------
-    value, half_width_s, peak_s, direction : float, float, float, int
-        Statistic, half-width, time of the peak in the stare, and row of the bank's directions, of the best template.
-    amplitude : float
-        Of the template, in the unit of the sums along the direction.
-    first, last : int
-        First and last frame of the event.
-    """
-
-    value: float
-    half_width_s: float
-    peak_s: float
-    direction: int
-    amplitude: float
-    first: int
-    last: int
 
 
 def fit_processes(survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None = None) -> SeriesSurvey:

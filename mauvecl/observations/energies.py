@@ -26,9 +26,8 @@ from numpy.typing import NDArray
 from mauvecl.lightcurve.flares.shapes import SHAPES, Shape
 
 if TYPE_CHECKING:
-    from mauvecl.observations.detection import Detection
     from mauvecl.observations.process import Process
-    from mauvecl.observations.search import SeriesSurvey
+    from mauvecl.observations.search import Detection, SeriesSurvey
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

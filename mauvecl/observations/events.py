@@ -9,9 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.observations.detection import Detection
 from mauvecl.observations.energies import Energy, measure_energy
-from mauvecl.observations.search import SeriesSurvey
+from mauvecl.observations.search import Detection, SeriesSurvey
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

@@ -38,6 +38,29 @@ NO_COLOUR_K = 10_000.0
 WHITE = Process((), 1.0)
 
 
+@dataclass(frozen=True)
+class Detection:
+    """Event above the threshold of the search, before it is measured.
+
+    Attributes
+    ----------
+    value, half_width_s, peak_s, direction : float, float, float, int
+        Statistic, half-width, time of the peak in the stare, and row of the bank's directions, of the best template.
+    amplitude : float
+        Of the template, in the unit of the sums along the direction.
+    first, last : int
+        First and last frame of the event.
+    """
+
+    value: float
+    half_width_s: float
+    peak_s: float
+    direction: int
+    amplitude: float
+    first: int
+    last: int
+
+
 @dataclass(frozen=True, eq=False)
 class SeriesSurvey:
     """Observed frames that are searched: sums in units of the quiescent noise."""

@@ -232,14 +232,15 @@ EVENTS = (
            number(".2g")),
     Column("ed_rec_limit", "event.is_limit", "", "whether it is a lower limit, because a gap or an end cuts the flare",
            kind=bool),
-    Column("ed_fit", lambda row: sum(one.equivalent_duration_s for one in row.event.energy.flares), "s", "equivalent "
-           "duration of the flares of the best shape"),
+    Column("ed_fit", lambda row: row.fitted_s[0], "s", "the same as ed, by its older name"),
+    Column("ed_fit_low", lambda row: row.fitted_s[1], "s", "the same as ed_low"),
+    Column("ed_fit_high", lambda row: row.fitted_s[2], "s", "the same as ed_high"),
     Column("shape", "event.energy.shape", "", "shape of the flares that fits best", kind=str),
     Column("half_width", "half_width_s", "s", "t_1/2 of the largest flare fitted to it; nan: none", "half-width (s)",
            number(".3g")),
     Column("components", lambda row: len(row.event.energy.flares), "", "flares fitted together", kind=int),
     Column("value", "event.value", "", "statistic of the search: S/N of the best template", "S/N", number(".4g")),
-    Column("rate_modelled", lambda row: row.rates[0], "1 / d", "false alarms per star-day above this statistic in "
+    Column("rate_normal", lambda row: row.rates[0], "1 / d", "false alarms per star-day above this statistic in "
            "light curves of the fitted process"),
     Column("rate_measured", lambda row: row.rates[1], "1 / d", "the same with residuals resampled from quiescent "
            "frames"),
