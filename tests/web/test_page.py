@@ -1087,6 +1087,8 @@ def test_three_targets_are_planned_by_keyboard(page: Page) -> None:
     while not days.evaluate("e => e === document.activeElement"):
         press(page, "Tab")
     page.keyboard.type("20")
+    # The button can be reached when the answer to the new number is there.
+    until(page, lambda: page.locator("#simulate").is_enabled())
     tab_to(page, "Plan")
     press(page, "Enter")
     page.locator("#panel-plan").get_by_text("Done: 3 of 3 targets").wait_for()
