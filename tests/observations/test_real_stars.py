@@ -183,10 +183,10 @@ def test_few_counts_have_their_mean_and_pulls() -> None:
 def test_recommended_energies_are_in_their_intervals() -> None:
     """Flares of S/N 25 to 3000 of two shapes in windows of 2 to 15 half-widths; each range fails once in a thousand.
 
-    Fainter ones in such windows are now and then taken for variability of the star.
+    Some slow ones in such windows are taken for variability of the star, at most a tenth.
     """
     rng = np.random.default_rng(407)
-    inside, number = np.zeros(2), 60
+    inside, number, missed = np.zeros(2), 60, 0
     for k in range(number):
         shape = list(SHAPES.values())[k % 2]
         width = rng.uniform(30, 120)
@@ -196,9 +196,13 @@ def test_recommended_energies_are_in_their_intervals() -> None:
         size = np.exp(rng.uniform(np.log(25), np.log(3000))) / np.sqrt(float(light @ light))
         flux = 1e4 + size * light + rng.standard_normal(time.size)
         analysis = analyse_frames(Frames.of(time, flux, np.ones(time.size)), per="day")
+        if not analysis.events:
+            missed += 1
+            continue
         energy = max(analysis.events, key=lambda one: one.value).energy
         truth = size / 1e4 * width * shape.equivalent_duration
         inside += [low <= truth <= high for low, high in zip(energy.low_s, energy.high_s, strict=True)]
+    assert missed <= number / 10
     for count, share in zip(inside, (0.6827, 0.95), strict=True):
-        low, high = stats.binom.ppf([0.0005, 0.9995], number, share)
+        low, high = stats.binom.ppf([0.0005, 0.9995], number - missed, share)
         assert low <= count <= high, inside
