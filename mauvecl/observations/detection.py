@@ -69,7 +69,8 @@ def fit_processes(survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None 
         for k, column in enumerate(survey.sums.T)
     )
     flux = processes[0]
-    if survey.flux is not survey.sums[:, 0] and not np.shares_memory(survey.flux, survey.sums):
+    # The flux of a light curve is its only sum.
+    if not np.shares_memory(survey.flux, survey.sums):
         flux = fitted(survey.flux, survey.flux_variance, None if start is None else start.flux_process)
     return replace(survey, processes=processes, flux_process=flux)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K
 from mauvecl.noise.unknowns import NUISANCES, Amplitude
-from mauvecl.observations.events import MIN_BASELINE
+from mauvecl.observations.energies import MIN_BASELINE
 from mauvecl.observations.light_changes import CLEARLY, chi2_of_one
 from mauvecl.observations.search import Detection, SeriesSurvey
 from mauvecl.observations.spectra import SpectralSeries

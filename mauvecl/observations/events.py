@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.observations.energies import Energy, measure_energy
+from mauvecl.observations.energies import MIN_BASELINE, Energy, measure_energy
 from mauvecl.observations.search import Detection, SeriesSurvey
 
 Float = NDArray[np.float64]
@@ -20,8 +20,6 @@ Kind = Literal["flare", "step", "throughput", "dark current", "sky", "cosmic ray
 GAP_FRAMES = 3
 #: Share of a flare's light outside the frames of its event from which their sum is a lower limit.
 UNSEEN = 0.05
-#: Smallest number of frames for a baseline.
-MIN_BASELINE = 10
 
 
 @dataclass(frozen=True, eq=False)

@@ -82,7 +82,7 @@ class SimulatedRate:
         return min(normal, (threshold - anchor) / float(beyond.mean())) if beyond.size else normal
 
     def threshold(self, rate: float) -> float:
-        """Return the threshold above which there are at most so many events per star-day."""
+        """Return the threshold above which the rate of events per star-day is at most `rate`."""
         from scipy.optimize import brentq
 
         low = float(self.largest[0])

@@ -81,12 +81,12 @@ def survey_light_curve(frames: Frames, shape: Shape, seed: int) -> tuple[SeriesS
     below = finite & (reasons != 0) & (np.where(finite, flux, 0.0) - level < -FAR * sd)
     reasons = np.where(below, reasons | Reason.BELOW, reasons)
     used = reasons == 0
-    survey = survey.frames(used[_used_before(survey, frames)])
+    survey = survey.frames(used[searched_among(survey, frames)])
     return survey, quiescent_light(frames, flux, error, survey, used, used & ~guessed, reasons, seed), frames
 
 
-def _used_before(survey: SeriesSurvey, frames: Frames) -> NDArray[np.intp]:
-    """Return the frames of a survey among all frames."""
+def searched_among(survey: SeriesSurvey, frames: Frames) -> NDArray[np.intp]:
+    """Return the numbers of a survey's frames among all frames, shape (n_searched,)."""
     return np.searchsorted(frames.time_s, survey.time_s)
 
 

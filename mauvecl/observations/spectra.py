@@ -20,7 +20,7 @@ from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Reason
 from mauvecl.observations.level import PER_MAD, QuiescentLevel, guess_flares, single_frames
 from mauvecl.observations.light_changes import LightChange, light_changes
-from mauvecl.observations.light_curve import check_usable, quiescent_light
+from mauvecl.observations.light_curve import check_usable, quiescent_light, searched_among
 from mauvecl.observations.search import WHITE, SeriesSurvey, bank_of, stare_of
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.nuisances import Nuisances
@@ -268,16 +268,11 @@ def survey_spectra(
             break
         reasons = np.where(single, reasons | Reason.SPIKE, reasons)
         used = reasons == 0
-    kept = reasons[_searched(frames, survey)] == 0
+    kept = reasons[searched_among(survey, frames)] == 0
     survey = survey.frames(kept)
     series = replace(series, excess=series.excess[used])
     level = quiescent_light(frames, flux, frames.error, survey, used, used & ~events, reasons, seed)
     return survey, series, level
-
-
-def _searched(frames: Frames, survey: SeriesSurvey) -> NDArray[np.intp]:
-    """Return the frames of a survey among all frames."""
-    return np.searchsorted(frames.time_s, survey.time_s)
 
 
 def _weighted_sums(

@@ -227,7 +227,7 @@ class DaskWorkers:
                 self._again(attempt)
 
     def _again(self, attempt: _Attempt, *, tried: int = 0) -> None:
-        """Send a shard again, after so many more failures that count."""
+        """Send a shard again, and add failures to its count."""
         with self._lock:
             self.retries += 1
         attempt.tried += tried
