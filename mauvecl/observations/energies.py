@@ -55,6 +55,8 @@ REACH = (5.0, 80.0)
 FURTHER_EPSILON, FURTHER_GAIN, MAX_FLARES = 0.2, 36.0, 6
 #: Fall of chi-squared by which a step must fit better than a flare.
 STEP_GAIN = 9.0
+#: Light of the fitted flares that the frames of an event may lack, in standard errors and as a share.
+LACKING_ERRORS, LACKING_SHARE = 5.0, 0.5
 #: Levels of the intervals.
 LEVELS = (0.6826894921370859, 0.95)
 #: Rounds in which the photon noise and the departures follow the fit.
@@ -79,6 +81,7 @@ class Energy:
 
     summed_s: float  # sum of the light above the level over the frames of the event
     summed_error_s: float
+    within_s: float  # light of the fitted flares in the same frames
     fitted_s: float  # of the whole flares; median of the posterior
     low_s: tuple[float, float]  # lower ends of the intervals of `LEVELS`
     high_s: tuple[float, float]
@@ -90,6 +93,13 @@ class Energy:
     step: bool  # a step of the level fits better than a flare
     peak_observed: bool  # the peak lies in or next to an observed frame
     level: float  # of the star at the peak, in units of the survey's level
+
+    @property
+    def dips(self) -> bool:
+        """Whether the frames of the event lack the light of its flares: the level falls in them, as by an eclipse."""
+        error = np.hypot(self.summed_error_s, (self.high_s[0] - self.low_s[0]) / 2)
+        lacking = self.within_s - self.summed_s
+        return bool(lacking > LACKING_ERRORS * error and lacking > LACKING_SHARE * self.within_s)
 
     @property
     def p_value(self) -> float:
@@ -344,12 +354,15 @@ def measure_energy(survey: SeriesSurvey, taken: Bool, one: Detection) -> Energy:
     model = sum((f.amplitude * window.model(shape, np.array([f.peak_s]), np.array([f.half_width_s]))[0]
                  for f in flares), np.zeros(window.values.size))  # fmt: skip
     summed, error = _summed(survey, taken, one)
-    ends = [[mixture.quantile(0.5 + sign * width / 2) / level for width in LEVELS] for sign in (-1, 1)]
     frame_s = survey.stare.frame_s
+    start = survey.stare.start_s[one.first : one.last + 1]
+    edges = np.column_stack([start, start + frame_s])
+    within = sum(float(f.amplitude * shape.mean_over(edges, f.peak_s, f.half_width_s).sum()) * frame_s for f in flares)
+    ends = [[mixture.quantile(0.5 + sign * width / 2) / level for width in LEVELS] for sign in (-1, 1)]
     peak = flares[0].peak_s
     observed = bool((np.abs(survey.stare.middle_s[one.first : one.last + 1] - peak) <= 1.5 * frame_s).any())
     return Energy(
-        summed / level, error / level, mixture.quantile(0.5) / level, (ends[0][0], ends[0][1]),
+        summed / level, error / level, within / level, mixture.quantile(0.5) / level, (ends[0][0], ends[0][1]),
         (ends[1][0], ends[1][1]),
         tuple(replace(f, amplitude=f.amplitude / level, equivalent_duration_s=f.equivalent_duration_s / level)
               for f in flares), shape.name, float(plain.chi2(model)), window.values.size - 1 - 3 * len(flares),

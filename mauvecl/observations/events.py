@@ -14,7 +14,7 @@ from mauvecl.observations.search import Detection, SeriesSurvey
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
-Kind = Literal["flare", "step", "throughput", "dark current", "sky", "cosmic ray"]
+Kind = Literal["flare", "step", "dip", "throughput", "dark current", "sky", "cosmic ray"]
 
 #: Number of missing frames next to an event from which it may have begun before or gone on after them.
 GAP_FRAMES = 3
@@ -35,8 +35,8 @@ class ObservedEvent:
     amplitude: float  # largest flux above the level, relative to the level
     missing: int  # number of frames missing inside the event
     cut: bool  # true if the event reaches the first or last frame of the light curve or of the part before a longer gap
-    # A flare, or what resembles one: a step of the level or, in spectra, a change of the throughput, the dark current
-    # or the sky, or a cosmic ray.
+    # A flare, or what resembles one: a step of the level, the edge of a dip or, in spectra, a change of the throughput,
+    # the dark current or the sky, or a cosmic ray.
     kind: Kind
     energy: Energy
 
@@ -56,15 +56,16 @@ def measure_events(
 ) -> list[ObservedEvent]:
     """Measure detected events in order of time; `taken` are their frames, and `causes` follow from their spectra.
 
-    Weaker events next to a step belong to it.
+    Weaker events next to a step or a dip belong to it.
     """
     known: Sequence[Kind] = causes or ["flare"] * len(found)
     events = [measure_event(survey, taken, *one) for one in zip(found, known, strict=True)]
     for k, event in enumerate(events):
         ends = (event.first - 1, event.last + 1)
         sides = [each for each in events[max(0, k - 1) : k + 2] if each.last == ends[0] or each.first == ends[1]]
-        if event.kind == "flare" and any(each.kind == "step" and each.value > event.value for each in sides):
-            events[k] = replace(event, kind="step")
+        larger = [each for each in sides if each.kind in ("step", "dip") and each.value > event.value]
+        if event.kind == "flare" and larger:
+            events[k] = replace(event, kind=larger[0].kind)
     return events
 
 
@@ -81,7 +82,9 @@ def measure_event(survey: SeriesSurvey, taken: Bool, found: Detection, cause: Ki
     ends = (first == 0, last == survey.stare.n_frames - 1)
     gaps = np.diff(numbers) > GAP_FRAMES
     cut = any(ends) or bool(gaps[first - 1]) or bool(gaps[last])
-    kind: Kind = "step" if cause == "flare" and energy.step else cause
+    kind = cause
+    if cause == "flare":
+        kind = "dip" if energy.dips else "step" if energy.step else cause
     return ObservedEvent(
         found.value, first, last, first + int(np.argmax(flux)), found.half_width_s,
         float(flux.max()) / survey.level / energy.level, int(numbers[last] - numbers[first] + 1 - flux.size), cut, kind,

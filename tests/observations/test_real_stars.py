@@ -136,6 +136,41 @@ def test_files_of_rotating_stars_have_no_flare(name: str) -> None:
     assert analysis.level.used.mean() > 0.95
 
 
+def two_exponentials(time_s: Float, frame_s: float, peak_s: float, half_width_s: float) -> Float:
+    """Return a flare of a linear rise and two exponentials, which no template has, as the mean of 60 points a frame."""
+    tau = (time_s[:, None] + (np.arange(60) - 29.5) / 60 * frame_s - peak_s) / half_width_s
+    decay = np.maximum(tau, 0.0)
+    shape = np.where(tau > 0, 0.7 * np.exp(-1.6 * decay) + 0.3 * np.exp(-0.28 * decay), np.maximum(1 + tau, 0.0))
+    return np.asarray(shape.mean(axis=1))
+
+
+@pytest.mark.long
+def test_edges_of_a_transit_are_no_flares_and_flares_of_its_star_are() -> None:
+    """A growing spot, a transit of 1.2 %, gaps, a spike and three flares; their 95 % intervals, at one seed."""
+    rng = np.random.default_rng(20261125)
+    time = np.arange(4320) * 60.0
+    phase = 2 * np.pi * time / 38_880.0
+    star = 5400 * (1 + 0.03 * np.sin(phase) * (1 + 0.15 * time / time[-1]) + 0.011 * np.sin(2 * phase + 0.7))
+    flares = ((0.05, 61_234.0, 300.0), (0.012, 150_000.0, 420.0), (0.4, 211_111.0, 150.0))
+    flux = star * np.where(np.abs(time - 110_000) < 3600, 0.988, 1.0)
+    for size, peak, width in flares:
+        flux += 5400 * size * two_exponentials(time, 60.0, peak, width)
+    flux += 8 * rng.standard_normal(time.size)
+    flux[700] += 300
+    flux[2500:2520] = np.nan
+    kept = np.ones(time.size, np.bool_)
+    kept[3000:3090] = False
+    frames = Frames.of(time[kept], flux[kept], np.full(int(kept.sum()), 8.0))
+    analysis = analyse_frames(frames, false_alarms=1.0, per="month")
+    found = detected(analysis)
+    assert len(found) == len(flares)
+    for one, (size, peak, width) in zip(found, flares, strict=True):
+        assert abs(analysis.survey.time_s[one.brightest] - peak) < 400
+        light = float(two_exponentials(time, 60.0, peak, width).sum()) * 60.0
+        truth = size * light * 5400 / float(np.interp(peak, time, star))
+        assert one.energy.low_s[1] < truth < one.energy.high_s[1]
+
+
 def test_files_that_once_failed_have_an_answer() -> None:
     folder = CASES / "analyse-fault"
     assert analyse_frames(read_frames(folder / "flaring-rotator-1.fits")).events

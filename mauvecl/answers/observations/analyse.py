@@ -163,7 +163,9 @@ class EventRow:
     def note(self) -> str:
         """Statements about the event that a reader must know."""
         event = self.event
-        notes = ["a step of the level fits better than a flare"] if event.kind == "step" else []
+        reasons = {"step": "a step of the level fits better than a flare",
+                   "dip": "its frames lack the light of a flare: the star becomes fainter in them"}  # fmt: skip
+        notes = [reasons[event.kind]] if event.kind in reasons else []
         notes += [self.spectrum.reason] if self.spectrum is not None and self.spectrum.reason else []
         if event.is_limit:
             notes.append("a gap or an end of the frames cuts it: the summed ED is a lower limit")
@@ -266,8 +268,8 @@ EVENTS = (
     Column("unmeasured", "unmeasured", "", "why temperature or energy are not measured", kind=str),
     Column("snr_flare", lambda row: float("nan") if row.spectrum is None else row.spectrum.snr, "", "S/N of a flare in "
            "the event's spectrum if star, dark current and sky changed by any amount", kind=float),
-    Column("kind", "event.kind", "", "flare, or what resembles one: step of the level, change of throughput, dark "
-           "current or sky, cosmic ray", "kind", kind=str),
+    Column("kind", "event.kind", "", "flare, or what resembles one: step of the level, edge of a dip, change of "
+           "throughput, dark current or sky, cosmic ray", "kind", kind=str),
     Column("note", "note", "", "what is special", kind=str),
 )  # fmt: skip
 #: Columns of the table of frames, one row for all frames of an analysis.
