@@ -10,7 +10,7 @@ from astropy.table import QTable
 from scipy import stats
 
 from mauvecl import Engine, Study, measure
-from mauvecl.answers.detection.gaussian import EXPOSURES_S, MAGNITUDES
+from mauvecl.study.questions import EXPOSURES_S, MAGNITUDES
 from mauvecl.study.cases import Case
 from tests.commands import run
 from tests.refusals import refused
