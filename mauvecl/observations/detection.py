@@ -70,7 +70,7 @@ def fit_processes(survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None 
     )
     flux = processes[0]
     # The flux of a light curve is its only sum.
-    if not np.shares_memory(survey.flux, survey.sums):
+    if survey.weighted:
         flux = fitted(survey.flux, survey.flux_variance, None if start is None else start.flux_process)
     return replace(survey, processes=processes, flux_process=flux)
 

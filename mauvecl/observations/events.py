@@ -84,7 +84,8 @@ def measure_event(survey: SeriesSurvey, taken: Bool, found: Detection, cause: Ki
     cut = any(ends) or bool(gaps[first - 1]) or bool(gaps[last])
     kind = cause
     if cause == "flare":
-        kind = "dip" if energy.dips else "step" if energy.step else cause
+        # The sum over wavelength of spectra may fall during a flare, by a loss of light that their weights leave out.
+        kind = "dip" if energy.dips and not survey.weighted else "step" if energy.step else cause
     return ObservedEvent(
         found.value, first, last, first + int(np.argmax(flux)), found.half_width_s,
         float(flux.max()) / survey.level / energy.level, int(numbers[last] - numbers[first] + 1 - flux.size), cut, kind,

@@ -82,6 +82,7 @@ class SeriesSurvey:
     photon: float  # rise of the variance with the flux, in the unit of the flux
     time_s: Float  # shape (n_frame,); times of the frames as observed, against those of the stare's regular grid
     counts: float = 0.0  # counts in a unit of the flux, if frames hold few; else zero
+    weighted: bool = False  # whether the sums are weighted ones of spectra, and not the flux itself
 
     @classmethod
     def of(

@@ -254,7 +254,7 @@ def survey_spectra(
         survey = SeriesSurvey(
             stare, bank_of(stare, directions, shape), templates, sums[used], variance, (WHITE,) * sums.shape[1],
             flux[used] / scale, variance, WHITE, scale, abs(float(np.median(flux[used & ~events]))), photon,
-            frames.time_s[used],
+            frames.time_s[used], weighted=True,
         )  # fmt: skip
         survey, taken = fit_quiet_light(survey, events[used])
         now = np.zeros(flux.size, np.bool_)
