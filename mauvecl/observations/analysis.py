@@ -18,7 +18,7 @@ from mauvecl.observations.event_spectrum import EventSpectrum, event_spectrum, m
 from mauvecl.observations.events import ObservedEvent, measure_events
 from mauvecl.observations.false_alarms import CHANCE_DIP, SimulatedRate, innovations, largest_dip, simulated_rates
 from mauvecl.observations.frame_model import FrameModel
-from mauvecl.observations.frames import Frames
+from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import QuiescentLevel
 from mauvecl.observations.light_curve import survey_light_curve
 from mauvecl.observations.noise import Likeness, Scatter, binned_scatter, likeness
@@ -109,6 +109,9 @@ class Analysis:
         if (reasons != 0).any():
             lines.append(f"{np.count_nonzero(reasons)} of {reasons.size} frames are not searched; the table of frames "
                          "states the reason of each.")  # fmt: skip
+        if lost := np.count_nonzero(reasons & Reason.LOSS):
+            lines.append(f"The light is suddenly lost in {lost} of {reasons.size} frames, as by pointing losses or "
+                         "eclipses; these frames are not searched.")  # fmt: skip
         if self.level.excess > 1.2:
             lines.append(f"The scatter of quiescent frames is {self.level.excess:.2f} times the stated errors; the "
                          "measured scatter is used.")  # fmt: skip

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mauvecl.observations.energies import flares_of
 from mauvecl.observations.process import Binned, Process, fit_process, level_fit
+from mauvecl.observations.process_search import ProcessSearch
 from mauvecl.observations.search import Detection, SeriesSurvey
 
 Float = NDArray[np.float64]
@@ -193,11 +194,15 @@ def detect_events(survey: SeriesSurvey, threshold: float) -> tuple[list[Detectio
     n = survey.stare.n_frames
     taken, found = np.zeros(n, np.bool_), list[Detection]()
     light = np.zeros_like(survey.sums)
+    search = survey.search
     for _ in range(MAX_PASSES):
         left = ~taken
         if left.sum() < MIN_QUIET or len(found) >= MAX_EVENTS:
             break
-        new = _search_once(survey, left, light, threshold)
+        part = survey.frames(left)
+        if taken.any():
+            search = ProcessSearch(part.bank, part.stare, part.processes, part.variance, search)
+        new = _search_once(part, search, light[left], threshold)
         if not new:
             break
         for one in new:
@@ -238,12 +243,11 @@ def _template_light(survey: SeriesSurvey, one: Detection) -> Float:
     return light
 
 
-def _search_once(survey: SeriesSurvey, left: Bool, light: Float, threshold: float) -> list[Detection]:
+def _search_once(part: SeriesSurvey, search: ProcessSearch, light: Float, threshold: float) -> list[Detection]:
     """Return the largest events among the frames that are left, at most one near another."""
-    part = survey.frames(left)
-    both = np.stack([part.sums, UNCERTAIN * light[left]]) if light.any() else part.sums[None]
+    both = np.stack([part.sums, UNCERTAIN * light]) if light.any() else part.sums[None]
     values, places = [], []
-    for row, rho in part.search.values(both):
+    for row, rho in search.values(both):
         excess = rho[0] - np.abs(np.where(np.isfinite(rho[1]), rho[1], 0.0)) if len(rho) > 1 else rho[0]
         direction = excess.argmax(axis=0)
         best = excess[direction, np.arange(excess.shape[1])]
@@ -253,7 +257,7 @@ def _search_once(survey: SeriesSurvey, left: Bool, light: Float, threshold: floa
             along = int(direction[onset])
             value = float(rho[0, along, onset])
             amplitude = value / float(row.per_amplitude[along, onset])
-            peak = float(part.search.peak_s(row, np.array([onset]))[0])
+            peak = float(search.peak_s(row, np.array([onset]))[0])
             places.append(Detection(value, row.template.half_width_s, peak, along, amplitude, 0, 0))
             values.append(float(best[onset]))
     accepted: list[Detection] = []

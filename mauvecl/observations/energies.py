@@ -23,7 +23,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.flares.shapes import SHAPES, Shape
+from mauvecl.lightcurve.flares.shapes import SHAPES, Shape, between, sides
+from mauvecl.observations.search import MIN_BASELINE
 
 if TYPE_CHECKING:
     from mauvecl.observations.process import Process
@@ -61,8 +62,8 @@ LACKING_ERRORS, LACKING_SHARE = 5.0, 0.5
 LEVELS = (0.6826894921370859, 0.95)
 #: Rounds in which the photon noise and the departures follow the fit.
 ROUNDS = 3
-#: Smallest number of quiescent frames for a level.
-MIN_BASELINE = 10
+#: Number of frames on each side of an event from which the error of its level follows.
+NEARBY = 10_000
 
 
 @dataclass(frozen=True)
@@ -153,8 +154,8 @@ class Window:
         first = np.flatnonzero(np.diff(bins, prepend=-1))
         count = np.diff(np.append(first, at.size))
         is_inside = inside[at][first]
-        start = survey.stare.start_s[at[first]]
-        stop = survey.stare.start_s[at[first + count - 1]] + frame_s
+        # As the start of the next frame, to the bit.
+        start, stop = numbers[at[first]] * frame_s, (numbers[at[first + count - 1]] + 1) * frame_s
         mean = np.add.reduceat(along[at], first) / count
         noise = np.add.reduceat(survey.variance[at] * excess, first) / count**2
         # The nearest bins on each side are kept.
@@ -183,8 +184,17 @@ class Window:
 
     def model(self, shape: Shape, peak_s: Float, half_width_s: Float) -> Float:
         """Return the mean of shapes in the bins, in the unit of the values, (n_shape, n)."""
+        times, place = self._times
         peak, width = (np.atleast_1d(one)[:, None] for one in (peak_s, half_width_s))
-        return self.scale * shape.mean_over(self.edges, peak, width)
+        both = sides(shape, (times - peak) / width)
+        integral = between(both[..., place[0]], both[..., place[1]])
+        return np.asarray(self.scale * integral * width / np.diff(self.edges)[:, 0])
+
+    @cached_property
+    def _times(self) -> tuple[Float, NDArray[np.intp]]:
+        """Edges of bins, of which neighbours share one, and the places of each bin's start and end, shape (2, n)."""
+        times, place = np.unique(self.edges.T.ravel(), return_inverse=True)
+        return times, place.reshape(2, -1)
 
 
 def _bins(numbers: NDArray[np.int64], size: Float, inside: Bool) -> NDArray[np.int64]:
@@ -254,6 +264,16 @@ class Likelihood:
         log_factor = -float(np.log(np.diag(factor[0])).sum()) - 0.5 * float(np.log(total))
         return cls(window, inverse, log_factor, shared, variance, level, level_variance)
 
+    def matched(self, models: Float, values: Float) -> tuple[Float, Float]:
+        """Return the products of models and values, and of models with themselves, shape (n_model,).
+
+        The first is zero for models that are constant but for rounding errors, as bright in all bins as the level.
+        """
+        information = np.einsum("ki,ki->k", models @ self.inverse, models)
+        least = np.maximum(1e-9 * models**2 @ np.diag(self.inverse), 1e-300)
+        slope = np.where(information > least, models @ (self.inverse @ values), 0.0)
+        return slope, np.maximum(information, least)
+
     def chi2(self, model: Float) -> Float:
         """Return chi-squared of the values with models, of shape (n,) or (k, n), added to the level."""
         left = self.window.values - model
@@ -317,19 +337,23 @@ def _joined(parts: Sequence[Mixture], log_weights: Sequence[float]) -> Mixture:
     )
 
 
-def measure_energy(survey: SeriesSurvey, taken: Bool, one: Detection) -> Energy:
+def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: Detection) -> Energy:
     """Measure the equivalent duration of an event.
 
     Parameters
     ----------
     taken : ndarray of bool, shape (n_frame,)
         Frames of all events.
+    flux_level : ndarray, shape (n_frame,)
+        Quiescent level of the flux, in units of the survey's scale.
     one : Detection
     """
     shapes = [survey.bank.shape, *(SHAPES[name] for name in AVERAGED if SHAPES[name] is not survey.bank.shape)]
     shapes = list({shape.name: shape for shape in shapes}.values())
     window = Window.of(survey, taken, one)
-    level = _level_at(survey, taken, one)
+    peak = int(np.clip(np.searchsorted(survey.stare.middle_s, one.peak_s), 0, survey.stare.n_frames - 1))
+    level = float(flux_level[peak]) * survey.scale / survey.level
+    level = level if level > 0 else 1.0
     directions = _directions(survey, taken, one)
     parts, weights, fits = [], [], []
     for shape in shapes:
@@ -353,14 +377,14 @@ def measure_energy(survey: SeriesSurvey, taken: Bool, one: Detection) -> Energy:
     plain = Likelihood.of(window, flares, shape, 0.0)
     model = sum((f.amplitude * window.model(shape, np.array([f.peak_s]), np.array([f.half_width_s]))[0]
                  for f in flares), np.zeros(window.values.size))  # fmt: skip
-    summed, error = _summed(survey, taken, one)
+    summed, error = _summed(survey, taken, flux_level, one)
     frame_s = survey.stare.frame_s
     start = survey.stare.start_s[one.first : one.last + 1]
     edges = np.column_stack([start, start + frame_s])
     within = sum(float(f.amplitude * shape.mean_over(edges, f.peak_s, f.half_width_s).sum()) * frame_s for f in flares)
     ends = [[mixture.quantile(0.5 + sign * width / 2) / level for width in LEVELS] for sign in (-1, 1)]
-    peak = flares[0].peak_s
-    observed = bool((np.abs(survey.stare.middle_s[one.first : one.last + 1] - peak) <= 1.5 * frame_s).any())
+    apart_s = np.abs(survey.stare.middle_s[one.first : one.last + 1] - flares[0].peak_s)
+    observed = bool((apart_s <= 1.5 * frame_s).any())
     return Energy(
         summed / level, error / level, within / level, mixture.quantile(0.5) / level, (ends[0][0], ends[0][1]),
         (ends[1][0], ends[1][1]),
@@ -390,16 +414,6 @@ def flares_of(survey: SeriesSurvey, taken: Bool, one: Detection) -> tuple[list[F
 def _log_prior(n_flares: int) -> float:
     """Return the logarithm of the prior weight of a number of flares."""
     return -float(n_flares - 1)
-
-
-def _level_at(survey: SeriesSurvey, taken: Bool, one: Detection) -> float:
-    """Return the level of the star at the peak of an event, in units of the survey's level."""
-    quiet = ~taken
-    if quiet.sum() < MIN_BASELINE:
-        return 1.0
-    at = int(np.clip(np.searchsorted(survey.stare.middle_s, one.peak_s), 0, survey.stare.n_frames - 1))
-    level = float(survey.flux_level(quiet)[at]) * survey.scale / survey.level
-    return level if level > 0 else 1.0
 
 
 def _directions(survey: SeriesSurvey, taken: Bool, one: Detection) -> list[tuple[float, float]]:
@@ -456,13 +470,11 @@ class Grid:
             First and largest range of the peak and of the logarithm of the half-width.
         """
         window = likelihood.window
-        data = likelihood.inverse @ window.values
         for _ in range(REFINEMENTS):
             axes = [np.linspace(low, high, NODES) for low, high in box]
             p, w = (each.ravel() for each in np.meshgrid(axes[0], axes[1], indexing="ij"))
             model = window.model(shape, p, np.exp(w))
-            information = np.maximum(np.einsum("ki,ki->k", model @ likelihood.inverse, model), 1e-300)
-            slope = model @ data
+            slope, information = likelihood.matched(model, window.values)
             step = (box[:, 1] - box[:, 0]) / (NODES - 1)
             # A flat prior on the equivalent duration and on the logarithm of the half-width.
             log = np.where(slope > 0, 0.5 * slope**2 / information, -1e300) - 0.5 * np.log(information) - w
@@ -523,8 +535,7 @@ def _further(window: Window, shape: Shape, flares: list[FittedFlare]) -> list[Fi
     while len(flares) < MAX_FLARES:
         likelihood = Likelihood.of(window, flares, shape, FURTHER_EPSILON)
         light = _light(window, shape, flares)
-        slope = every @ (likelihood.inverse @ (window.values - light))
-        information = np.maximum(np.einsum("ki,ki->k", every @ likelihood.inverse, every), 1e-300)
+        slope, information = likelihood.matched(every, window.values - light)
         gain = np.where(slope > 0, slope**2 / information, 0.0)
         k = int(np.argmax(gain))
         if gain[k] < FURTHER_GAIN:
@@ -645,16 +656,12 @@ def _linearised(
     return Mixture(np.array([log]), np.array([mean]), np.array([np.sqrt(variance)])), flares
 
 
-def _summed(survey: SeriesSurvey, taken: Bool, one: Detection) -> tuple[float, float]:
+def _summed(survey: SeriesSurvey, taken: Bool, level: Float, one: Detection) -> tuple[float, float]:
     """Return the sum of the light above the level over the frames of an event, amplitude x s, and its error.
 
     Missing frames are interpolated. The error includes that of the level given the quiescent frames.
     """
     rows = slice(one.first, one.last + 1)
-    quiet = ~taken
-    level = (
-        survey.flux_level(quiet) if quiet.sum() >= MIN_BASELINE else np.full(taken.size, survey.level / survey.scale)
-    )
     flux, numbers = (survey.flux - level)[rows], survey.stare.numbers[rows]
     every = np.arange(numbers[0], numbers[-1] + 1)
     factor = survey.stare.frame_s * survey.scale / survey.level
@@ -666,6 +673,8 @@ def _summed(survey: SeriesSurvey, taken: Bool, one: Detection) -> tuple[float, f
     noise = survey.flux_variance * process.excess**2
     photon = survey.photon / survey.scale * np.maximum(flux, 0.0)
     variance = float(counts**2 @ (noise[rows] + photon))
+    part = slice(max(0, one.first - NEARBY), one.last + 1 + NEARBY)
+    quiet = ~taken[part]
     if quiet.sum() >= MIN_BASELINE:
         # Variance of the sum of the level given quiescent frames: w^T K w less what they say of it.
         near = np.zeros(taken.size)
@@ -673,7 +682,7 @@ def _summed(survey: SeriesSurvey, taken: Bool, one: Detection) -> tuple[float, f
         # Durations are relative to the level at the peak.
         peak = int(np.clip(np.searchsorted(survey.stare.middle_s, one.peak_s), one.first, one.last))
         near[peak] += total / factor / max(float(level[peak]), 1e-12)
-        variance += _level_variance(process, time, noise, quiet, near)
+        variance += _level_variance(process, time[part], noise[part], quiet, near[part])
     return total, float(np.sqrt(max(variance, 0.0))) * factor
 
 

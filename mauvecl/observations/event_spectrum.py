@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K
 from mauvecl.noise.unknowns import NUISANCES, Amplitude
-from mauvecl.observations.energies import MIN_BASELINE
 from mauvecl.observations.light_changes import CLEARLY, chi2_of_one
-from mauvecl.observations.search import Detection, SeriesSurvey
+from mauvecl.observations.search import MIN_BASELINE, Detection, SeriesSurvey
 from mauvecl.observations.spectra import SpectralSeries
 from mauvecl.results.measurements.fit import Measurement, fit
 from mauvecl.schema.errors import InputError

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.observations.energies import MIN_BASELINE, Energy, measure_energy
+from mauvecl.observations.energies import Energy, measure_energy
 from mauvecl.observations.search import Detection, SeriesSurvey
 
 Float = NDArray[np.float64]
@@ -59,7 +59,8 @@ def measure_events(
     Weaker events next to a step or a dip belong to it.
     """
     known: Sequence[Kind] = causes or ["flare"] * len(found)
-    events = [measure_event(survey, taken, *one) for one in zip(found, known, strict=True)]
+    level = survey.flux_level(~taken)
+    events = [measure_event(survey, taken, level, *one) for one in zip(found, known, strict=True)]
     for k, event in enumerate(events):
         ends = (event.first - 1, event.last + 1)
         sides = [each for each in events[max(0, k - 1) : k + 2] if each.last == ends[0] or each.first == ends[1]]
@@ -69,15 +70,24 @@ def measure_events(
     return events
 
 
-def measure_event(survey: SeriesSurvey, taken: Bool, found: Detection, cause: Kind = "flare") -> ObservedEvent:
-    """Measure a detected event; `taken` are the frames of all events, and `cause` follows from its spectrum."""
+def measure_event(
+    survey: SeriesSurvey, taken: Bool, level: Float, found: Detection, cause: Kind = "flare"
+) -> ObservedEvent:
+    """Measure a detected event.
+
+    Parameters
+    ----------
+    taken : ndarray of bool, shape (n_frame,)
+        Frames of all events.
+    level : ndarray, shape (n_frame,)
+        Quiescent level of the flux, in units of the survey's scale.
+    found : Detection
+    cause : str
+        Follows from the spectrum of the event.
+    """
     first, last = found.first, found.last
     rows = slice(first, last + 1)
-    energy = measure_energy(survey, taken, found)
-    quiet = ~taken
-    level = survey.flux_level(quiet) if quiet.sum() >= MIN_BASELINE else np.full(
-        survey.stare.n_frames, survey.level / survey.scale
-    )  # fmt: skip
+    energy = measure_energy(survey, taken, level, found)
     flux, numbers = (survey.flux - level)[rows] * survey.scale, survey.stare.numbers
     ends = (first == 0, last == survey.stare.n_frames - 1)
     gaps = np.diff(numbers) > GAP_FRAMES

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -142,12 +142,8 @@ def largest_dip(survey: SeriesSurvey, quiet: Bool) -> float:
     Quiescent frames are searched upside down, in both directions of time. Noise that is as likely to rise as to fall
     has dips as large as its false alarms; losses of light have larger ones, and end as suddenly as flares begin.
     """
-    part = survey.frames(quiet)
-    largest = [part.search.largest(-part.sums[None]).maximum[0]]
-    stare = part.stare
-    start = (stare.start_s[-1] + stare.start_s[0]) - stare.start_s[::-1]
-    back = replace(part, stare=replace(stare, start_s=start), sums=part.sums[::-1], variance=part.variance[::-1])
-    largest.append(back.search.largest(-back.sums[None]).maximum[0])
+    down = survey.frames(quiet).inverted()
+    largest = [one.search.largest(one.sums[None]).maximum[0] for one in (down, down.backwards())]
     return float(max(largest))
 
 

@@ -38,6 +38,7 @@ class Reason(IntFlag):
     BELOW = 4  #: far below the quiescent level, where no flare can be
     SPIKE = 8  #: a single frame far above both of its neighbours, such as a cosmic ray
     SATURATED = 16  #: a pixel reaches saturation
+    LOSS = 32  #: light is suddenly lost for some frames, as by pointing losses and eclipses
 
     @classmethod
     def words(cls, value: int) -> str:

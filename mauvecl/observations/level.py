@@ -40,8 +40,9 @@ NO_WEIGHT = 1e4
 MOST_BELOW = 0.03
 #: Smallest variance of the noise of a frame relative to the typical one.
 LEAST_VARIANCE = 0.1
-#: Simulated light curves from which the standard error of the level is estimated, to 1 / sqrt(2 times as many).
-LEVEL_DRAWS = 32
+#: Smallest and largest number of simulated light curves from which the standard error of the level is estimated, to
+#: 1 / sqrt(2 times as many), and number of values in all of them, which bounds the time.
+LEVEL_DRAWS, LEVEL_VALUES = (8, 32), 2**22
 #: Second half of the generator's key, which makes the draws independent of others.
 LEVEL_KEY = 0x6C65766C
 
@@ -180,11 +181,12 @@ def level_error(process: Process, time_s: Float, variance: Float, quiet: Bool, s
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, LEVEL_KEY]))
     tiny = np.full(time_s.size, 1e-9 * (process.sd**2 + float(np.median(noise))))
     total = np.zeros(time_s.size)
-    for _ in range(LEVEL_DRAWS):
+    draws = int(np.clip(LEVEL_VALUES // time_s.size, *LEVEL_DRAWS))
+    for _ in range(draws):
         truth = process.covariance(time_s, tiny).coloured(rng.standard_normal(time_s.size))
         seen = truth + np.sqrt(noise) * rng.standard_normal(time_s.size)
         total += (process_level(process, time_s, seen, variance, quiet) - truth) ** 2
-    return np.sqrt(total / LEVEL_DRAWS)
+    return np.sqrt(total / draws)
 
 
 def single_frames(numbers: NDArray[np.int64], sigmas: Float, fine: Bool) -> Bool:

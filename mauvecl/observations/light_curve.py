@@ -22,6 +22,7 @@ from mauvecl.observations.level import (
     single_frames,
     spikes,
 )
+from mauvecl.observations.losses import sudden_losses
 from mauvecl.observations.search import SeriesSurvey
 from mauvecl.schema.errors import InputError
 
@@ -61,13 +62,19 @@ def survey_light_curve(frames: Frames, shape: Shape, seed: int) -> tuple[SeriesS
     guessed[used] = guess_flares(frames.numbers[used], flux[used])
     level = np.full(flux.size, _mean(flux[used & ~guessed]))
     survey: SeriesSurvey | None = None
-    for _ in range(ROUNDS):
+    for number in range(ROUNDS):
         used = reasons == 0
         quiet = used & ~guessed
         variance, photon = _noise(frames, flux, error, level, quiet, counts)
         typical = float(np.median(level[quiet]))
         new = SeriesSurvey.of(frames, flux, variance, used, typical, photon, shape, counts or 0.0)
         survey, taken = fit_quiet_light(new, guessed[used], survey)
+        if number == 0 and counts is None and (lost := sudden_losses(new, survey, taken)).any():
+            reasons[used] |= np.where(lost, Reason.LOSS, 0)
+            used = reasons == 0
+            guessed[used] = guess_flares(frames.numbers[used], flux[used])
+            level, survey = np.full(flux.size, _mean(flux[used & ~guessed])), None
+            continue
         level = level_of(frames, flux, used, survey, ~taken)
         sd = np.sqrt(variance) * survey.flux_process.excess
         guessed = np.zeros(flux.size, np.bool_)

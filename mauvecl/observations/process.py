@@ -202,7 +202,10 @@ class Covariance:
 
     def _solved_lower(self, values: Float) -> Float:
         out = np.array(values.reshape(len(values), -1), np.float64, order="C")
-        return np.asarray(self._driver.solve_lower(self._time, self._rates, self._u, self._w, out, out))
+        rows = slice(self._d.size - len(values), None)
+        return np.asarray(
+            self._driver.solve_lower(self._time[rows], self._rates, self._u[rows], self._w[rows], out, out)
+        )
 
     def solve(self, values: Float) -> Float:
         """Return the inverse times values, shape (n,) or (n, k)."""
@@ -211,8 +214,12 @@ class Covariance:
         return np.asarray(solved).reshape(np.shape(values))
 
     def whitened(self, values: Float) -> Float:
-        """Return the innovations of values, which are independent and of unit variance, shape (n,) or (n, k)."""
-        return np.asarray(self._solved_lower(values) / np.sqrt(self._d)[:, None]).reshape(np.shape(values))
+        """Return the innovations of values, which are independent and of unit variance, shape (n,) or (n, k).
+
+        Fewer values than times are the last ones; those before them are zero.
+        """
+        sd = np.sqrt(self._d[self._d.size - len(values) :])
+        return np.asarray(self._solved_lower(values) / sd[:, None]).reshape(np.shape(values))
 
     def coloured(self, white: Float) -> Float:
         """Return values of this covariance from innovations, shape (n,) or (n, k)."""

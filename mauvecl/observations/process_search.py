@@ -14,7 +14,7 @@ the noise and exactly for single missing frames.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -35,13 +35,13 @@ Bool = NDArray[np.bool_]
 NEGLECTED = 1e-4
 #: Frames around a template from which its denominator is computed: a multiple of its length, and the smallest and
 #: largest number.
-MARGIN, LEAST_MARGIN, MOST_MARGIN = 4, 512, 4096
+MARGIN, LEAST_MARGIN, MOST_MARGIN = 4, 1024, 4096
 #: Share of a denominator in frames next to gaps or with other noise from which it is solved exactly.
 IRREGULAR = 1e-3
 #: Relative change of the variance of a frame that is treated exactly.
 OTHER_NOISE = 0.5
-#: Largest number of frames and of templates in one solution.
-CHUNK_FRAMES, CHUNK_TEMPLATES = 4096, 512
+#: Number of frames, unless a template is longer, and largest number of templates in one solution.
+CHUNK_FRAMES, CHUNK_TEMPLATES = 256, 512
 #: Approximate number of values in an array of a batch of light curves.
 BATCH = 2**21
 
@@ -59,6 +59,17 @@ class FilterRow:
     per_amplitude: Float
 
 
+@dataclass(frozen=True, eq=False)
+class SolvedNorms:
+    """Values of s^T C^-1 s of a template at all onsets."""
+
+    norm: Float  # shape (n_onset,)
+    unit: float  # without gaps and with constant noise
+    squares: Float  # squared solution C^-1 s without gaps, from `margin` frames before the template to as many after it
+    margin: int
+    frames: NDArray[np.int64]  # shape (n_onset,); frame of the peak, counted from the start of the stare
+
+
 class ProcessSearch:
     """Search of light curves for flares.
 
@@ -72,12 +83,20 @@ class ProcessSearch:
         One for each sum of a frame; the sums are independent of each other.
     variance : ndarray, shape (n_frame,)
         Variance of the noise of each frame's sums.
+    before : ProcessSearch, optional
+        Search of the same frames and further ones, with the same bank, processes and variances. Denominators are solved
+        anew only where the further frames contribute to them.
     """
 
-    def __init__(self, bank: Bank, stare: Stare, processes: tuple[Process, ...], variance: Float) -> None:
+    def __init__(
+        self, bank: Bank, stare: Stare, processes: tuple[Process, ...], variance: Float,
+        before: ProcessSearch | None = None,
+    ) -> None:  # fmt: skip
         self.bank, self.stare, self.processes, self.variance = bank, stare, processes, variance
         self.at = stare.numbers - stare.numbers[0]
         self.n_grid = int(self.at[-1]) + 1
+        self._before = before
+        self._norms_of: dict[tuple[float, int, int], SolvedNorms] = {}
 
     @cached_property
     def covariances(self) -> tuple[Covariance, ...]:
@@ -94,7 +113,11 @@ class ProcessSearch:
     @cached_property
     def rows(self) -> list[FilterRow]:
         """Templates with everything that does not depend on data."""
-        return [self._row(template, phase) for template in self.bank.templates for phase in range(len(template.phases))]
+        if self._before is not None:
+            _ = self._before.rows
+        rows = [self._row(template, phase) for template in self.bank.templates for phase in range(len(template.phases))]
+        self._before = None
+        return rows
 
     @property
     def n_filters(self) -> int:
@@ -166,13 +189,15 @@ class ProcessSearch:
         peaks = np.arange(-int(self.stare.numbers[0]) % template.stride, self.n_grid, template.stride)
         norms, full = np.zeros((2, len(self.processes), peaks.size))
         for k in range(len(self.processes)):
-            norms[k], full[k] = self._norms(k, shape, first, peaks)
+            norms[k], full[k] = self._norms(k, template, phase, shape, first, peaks)
         weights = self.bank.directions**2
         norm, known = weights @ norms, weights @ full
         tried = norm >= LEAST_SHARE * known
         return FilterRow(template, phase, shape, first, peaks, np.sqrt(np.where(tried, norm, 0.0)))
 
-    def _norms(self, k: int, shape: Float, first: int, peaks: NDArray[np.int64]) -> tuple[Float, Float]:
+    def _norms(
+        self, k: int, template: Template, phase: int, shape: Float, first: int, peaks: NDArray[np.int64]
+    ) -> tuple[Float, Float]:
         """Return the squared denominators of rho at peaks, and those without gaps, shape (n_onset,)."""
         variance = self.variance * self.processes[k].excess ** 2
         process, level = self.processes[k], self._levels[k]
@@ -184,14 +209,19 @@ class ProcessSearch:
             norm = _correlated(held, shape**2, first)[peaks]
             full = np.full(peaks.size, float((shape**2).sum() / np.median(variance)))
         else:
-            norm, unit = self._process_norms(process, variance, shape, first, peaks)
-            full = np.full(peaks.size, unit)
+            key = (template.half_width_s, phase, k)
+            earlier = None if self._before is None else self._before._norms_of[key]
+            one = self._solved(process, variance, shape, first, peaks) if earlier is None else self._updated(
+                earlier, process, variance, shape, first, peaks
+            )  # fmt: skip
+            self._norms_of[key] = one
+            norm, full = one.norm, np.full(peaks.size, one.unit)
         return np.maximum(norm - shared**2 / level.sum(), 0.0), full
 
-    def _process_norms(
+    def _solved(
         self, process: Process, variance: Float, shape: Float, first: int, peaks: NDArray[np.int64]
-    ) -> tuple[Float, float]:
-        """Return s^T C^-1 s at peaks, shape (n_onset,), and that without gaps and with constant noise."""
+    ) -> SolvedNorms:
+        """Compute s^T C^-1 s at peaks."""
         margin = int(np.clip(MARGIN * shape.size, LEAST_MARGIN, MOST_MARGIN))
         typical, frame_s = float(np.median(variance)), self.bank.frame_s
         size = shape.size + 2 * margin
@@ -212,29 +242,61 @@ class ProcessSearch:
         bad[self.at[np.abs(change) > OTHER_NOISE]] = True
         moved = np.zeros(self.n_grid)
         moved[self.at] = np.where(np.abs(change) > OTHER_NOISE, 0.0, change * typical)
-        at, start = peaks, first - margin
+        start = first - margin
         share = _correlated(np.pad(bad, size, constant_values=True).astype(np.float64), squares, start)
-        irregular = share[size + at] > IRREGULAR * float(squares.sum())
-        missing = _correlated(single.astype(np.float64), squares, start)[at] / centre
+        missing = _correlated(single.astype(np.float64), squares, start)[peaks] / centre
         norm = np.maximum(unit - missing, 0.0)
-        norm = norm / np.maximum(1.0 + _correlated(moved, squares, start)[at] / unit, 0.1)
-        chosen = np.flatnonzero(irregular)
-        while chosen.size:
-            near = (peaks[chosen] - peaks[chosen[0]] <= CHUNK_FRAMES) & (np.arange(chosen.size) < CHUNK_TEMPLATES)
-            part, chosen = chosen[near], chosen[~near]
-            norm[part] = self._exact(process, variance, shape, peaks[part] + first, margin)
-        return norm, unit
+        norm = norm / np.maximum(1.0 + _correlated(moved, squares, start)[peaks] / unit, 0.1)
+        one = SolvedNorms(norm, unit, squares, margin, int(self.stare.numbers[0]) + peaks)
+        self._solve(one, share[size + peaks] > IRREGULAR * float(squares.sum()), process, variance, shape, first, peaks)
+        return one
+
+    def _updated(
+        self, earlier: SolvedNorms, process: Process, variance: Float, shape: Float, first: int,
+        peaks: NDArray[np.int64],
+    ) -> SolvedNorms:  # fmt: skip
+        """Return earlier norms at peaks, solved anew where frames that are missing now contribute to them."""
+        assert self._before is not None
+        before = self._before
+        gone = np.zeros(before.n_grid)
+        gone[before.at] = 1.0
+        origin = int(self.stare.numbers[0] - before.stare.numbers[0])
+        gone[origin + self.at] = 0.0
+        part = np.searchsorted(earlier.frames, self.stare.numbers[0] + peaks)
+        one = replace(earlier, norm=earlier.norm[part], frames=earlier.frames[part])
+        share = _correlated(gone, earlier.squares, first - earlier.margin)[origin + peaks]
+        # Correlations by Fourier transforms are not exactly zero where no frame contributes.
+        changed = share > IRREGULAR * float(earlier.squares.sum())
+        self._solve(one, changed, process, variance, shape, first, peaks)
+        return one
+
+    def _solve(
+        self, one: SolvedNorms, chosen: Bool, process: Process, variance: Float, shape: Float, first: int,
+        peaks: NDArray[np.int64],
+    ) -> None:  # fmt: skip
+        """Replace norms by exact ones at chosen onsets."""
+        left = np.flatnonzero(chosen)
+        while left.size:
+            near = peaks[left] - peaks[left[0]] <= max(CHUNK_FRAMES, shape.size)
+            near &= np.arange(left.size) < CHUNK_TEMPLATES
+            part, left = left[near], left[~near]
+            one.norm[part] = self._exact(process, variance, shape, peaks[part] + first, one.margin)
 
     def _exact(self, process: Process, variance: Float, shape: Float, starts: NDArray[np.int64], margin: int) -> Float:
         """Return s^T C^-1 s of a shape that starts at some frames of the grid, shape (n_start,)."""
-        low, high = np.searchsorted(self.at, [starts[0] - margin, starts[-1] + shape.size + margin])
-        if high <= low:
+        low, high = np.searchsorted(self.at, [starts[0] - MOST_MARGIN, starts[-1] + shape.size + margin])
+        # The innovations of a template are zero before its first frame.
+        begin = int(np.searchsorted(self.at, starts[0]))
+        if high <= begin:
             return np.zeros(starts.size)
-        place = self.at[low:high, None] - starts
-        inside = (place >= 0) & (place < shape.size)
-        columns = np.where(inside, shape[np.clip(place, 0, shape.size - 1)], 0.0)
-        covariance = process.covariance(self.stare.start_s[low:high], variance[low:high])
-        return np.asarray(np.einsum("to,to->o", columns, covariance.solve(columns)))
+        at = self.at[begin:high]
+        columns = np.zeros((at.size, starts.size))
+        for column, start, (first, last) in zip(
+            columns.T, starts, np.searchsorted(at, np.stack([starts, starts + shape.size], axis=1)), strict=True
+        ):
+            column[first:last] = shape[at[first:last] - start]
+        white = process.covariance(self.stare.start_s[low:high], variance[low:high]).whitened(columns)
+        return np.asarray(np.einsum("to,to->o", white, white))
 
 
 def _correlated(values: Float, kernel: Float, first: int) -> Float:

@@ -32,6 +32,8 @@ MAX_GAP = 2**15
 NARROWEST, WIDEST, WIDEST_S = 1.5, 0.15, 7200.0
 #: Smallest window around an event, in cadences and seconds.
 WINDOW_FRAMES, WINDOW_S = 120, 1800.0
+#: Smallest number of quiescent frames from which the level of the star follows.
+MIN_BASELINE = 10
 #: Temperature assumed for flares in a light curve without colour, K.
 NO_COLOUR_K = 10_000.0
 #: Process of independent frames whose noise is as stated.
@@ -132,8 +134,26 @@ class SeriesSurvey:
         return np.asarray((self.sums - self.levels(quiet)) @ unit / np.sqrt(self.variance * (unit**2 @ excess**2)))
 
     def flux_level(self, quiet: Bool) -> Float:
-        """Return the quiescent level of the flux given quiescent frames, in units of `scale`, shape (n_frame,)."""
+        """Return the quiescent level of the flux given quiescent frames, in units of `scale`, shape (n_frame,).
+
+        With fewer than `MIN_BASELINE` of these, it is the typical level.
+        """
+        if quiet.sum() < MIN_BASELINE:
+            return np.full(quiet.size, self.level / self.scale)
         return process_level(self.flux_process, self.stare.start_s, self.flux, self.flux_variance, quiet)
+
+    def inverted(self) -> SeriesSurvey:
+        """Return the survey upside down: losses of light become flares."""
+        return replace(self, sums=-self.sums, flux=-self.flux)
+
+    def backwards(self) -> SeriesSurvey:
+        """Return the survey in the other direction of time."""
+        start = self.stare.start_s
+        names = ("sums", "variance", "flux", "flux_variance", "time_s")
+        return replace(
+            self, stare=replace(self.stare, start_s=start[-1] + start[0] - start[::-1]),
+            **{name: getattr(self, name)[::-1] for name in names},
+        )  # fmt: skip
 
     def frames(self, kept: Bool) -> SeriesSurvey:
         """Return the survey of some of the frames."""

@@ -10,8 +10,8 @@ from astropy.table import QTable
 from scipy import stats
 
 from mauvecl import Engine, Study, measure
-from mauvecl.study.questions import EXPOSURES_S, MAGNITUDES
 from mauvecl.study.cases import Case
+from mauvecl.study.questions import EXPOSURES_S, MAGNITUDES
 from tests.commands import run
 from tests.refusals import refused
 

@@ -67,7 +67,7 @@ def test_intervals_of_the_fitted_equivalent_duration_cover(threshold: float) -> 
         survey = survey_of(light_curve(rng, LEVEL * (1 + amplitude * flare(peak, width))))
         found, taken = detect_events(survey, threshold)
         nearest = max(found, key=lambda one: one.value)
-        energy = measure_event(survey, taken, nearest).energy
+        energy = measure_event(survey, taken, survey.flux_level(~taken), nearest).energy
         low, high = energy.low_s[0], energy.high_s[0]
         inside += low <= amplitude * width * SHAPE.equivalent_duration <= high
     assert stats.binom.ppf(0.0005, number, 0.6827) <= inside <= stats.binom.ppf(0.9995, number, 0.6827)
@@ -80,7 +80,7 @@ def test_long_flares_are_fitted_in_bins_with_the_same_result(threshold: float, m
     fits = []
     for bins in (400, 150):
         monkeypatch.setattr("mauvecl.observations.energies.MAX_INSIDE", bins)
-        fits.append(measure_event(survey, taken, best).energy)
+        fits.append(measure_event(survey, taken, survey.flux_level(~taken), best).energy)
     whole, binned = fits
     assert whole.dof > 1.3 * binned.dof
     # Bins tell shapes apart less well: both fits differ by a part of the standard error.
@@ -93,7 +93,7 @@ def test_a_flare_is_found_at_its_time_and_a_step_is_a_step(threshold: float) -> 
     rng = np.random.default_rng(292)
     survey = survey_of(light_curve(rng, LEVEL * (1 + 0.1 * flare(15_000, 400))))
     found, taken = detect_events(survey, 5.0)
-    (event,) = (measure_event(survey, taken, one) for one in found)
+    (event,) = (measure_event(survey, taken, survey.flux_level(~taken), one) for one in found)
     assert event.kind == "flare"
     assert abs(survey.time_s[event.brightest] - 15_000) < 300
     stepped = survey_of(light_curve(rng, LEVEL + np.where(TIME > 24_000, 40.0, 0.0)))
