@@ -104,10 +104,11 @@ def fit_quiet_light(
     return (other, others) if second < first else (fitted, taken)
 
 
-def criterion(survey: SeriesSurvey, taken: Bool) -> float:
+def criterion(survey: SeriesSurvey, taken: Bool, shapeless: bool = False) -> float:
     """Return the Bayesian information criterion of a process and the flares of the events above `PROVISIONAL`.
 
     A process of minutes that is seen once, and no more, costs `SEEN_ONCE`: stars and instruments repeat what they do.
+    In independent noise, or if `shapeless`, the light of an event may have any smooth shape.
     """
     found, _ = detect_events(survey, PROVISIONAL)
     start, size = survey.stare.start_s, float(np.log(survey.stare.n_frames))
@@ -134,8 +135,8 @@ def criterion(survey: SeriesSurvey, taken: Bool) -> float:
 
     every = np.ones(start.size, np.bool_)
     total = min(cost(epsilon, fits, every) for epsilon in DEPARTURES)
-    if fits and not any(process.terms for process in survey.processes) and survey.sums.shape[1] == 1:
-        # The light of an event may have any smooth shape.
+    shapeless = shapeless or not any(process.terms for process in survey.processes)
+    if fits and shapeless and survey.sums.shape[1] == 1:
         free = cost(0.0, [], ~taken)
         for one, *_ in fits:
             rows = slice(one.first, one.last + 1)

@@ -480,7 +480,7 @@ class Grid:
             log = np.where(slope > 0, 0.5 * slope**2 / information, -1e300) - 0.5 * np.log(information) - w
             log += float(np.log(step).sum())
             found = cls(p, np.exp(w), log, slope / information, information, box)
-            near = log > log.max() - NEGLIGIBLE
+            near = log >= log.max() - NEGLIGIBLE
             ends = np.array([[p[near].min(), p[near].max()], [w[near].min(), w[near].max()]])
             low, high = ends[:, 0] - step, ends[:, 1] + step
             # Where the posterior reaches an end, the grid is widened.

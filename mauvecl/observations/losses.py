@@ -18,9 +18,12 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-#: Share of the frames in events of a star whose light is constant, of one that rotates, and noise relative to the stated
-#: one, above which losses are tried (assumed).
+#: Share of the frames in events of a star whose light is constant, and of one that rotates, and noise relative to the
+#: stated one, above which losses are tried (assumed).
 MOST_FLARING, MOST_ACTIVE, MOST_EXCESS = 0.1, 0.3, 1.5
+#: Standard deviations of a frame above the median of a constant light from which frames belong to flares; their number
+#: before and, relative to the length, after the bright frames; the largest share of such frames (assumed).
+BRIGHT, BEFORE, DECAY, MOST_BRIGHT = 4.0, 2, 3, 0.3
 
 
 class Loss(Shape):
@@ -65,9 +68,21 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool) -> Bo
     many = taken.mean() > (MOST_ACTIVE if rotates else MOST_FLARING)
     if survey.weighted or not (many or process.excess > MOST_EXCESS or fast):
         return none
+    dark = ~_bright(survey)
+    survey, fitted, taken = survey.frames(dark), fitted.frames(dark), taken[dark]
     down = replace(survey.inverted(), bank=bank_of(survey.stare, survey.bank.directions, Loss()))
     # Losses in independent noise are the first guess: a process that is fitted to losses would hide them.
     other, losses = alternate(down, detect_events(down, PROVISIONAL)[1])
-    if losses.any() and criterion(other, losses) < criterion(fitted, taken):
-        return losses
+    if losses.any() and criterion(other, losses, shapeless=True) < criterion(fitted, taken):
+        none[dark] = losses
     return none
+
+
+def _bright(survey: SeriesSurvey) -> Bool:
+    """Return frames far above the level that most frames have, and those after them, as long as flares decay."""
+    sigmas = (survey.flux - np.median(survey.flux)) / np.sqrt(survey.flux_variance)
+    edges = np.diff((sigmas > BRIGHT).astype(np.int8), prepend=0, append=0)
+    bright = np.zeros(sigmas.size, np.bool_)
+    for first, stop in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
+        bright[max(0, first - BEFORE) : stop + DECAY * (stop - first)] = True
+    return bright if bright.mean() < MOST_BRIGHT else np.zeros_like(bright)
