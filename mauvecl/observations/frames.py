@@ -140,9 +140,9 @@ class Frames:
             raise _bad(name, "shape", (time.shape, light.shape), "times of shape (n,), flux of (n,) or (n, n_pixel)")
         if not MIN_FRAMES <= n <= MAX_FRAMES:
             raise _bad(name, "frames", n, f"{MIN_FRAMES} to {MAX_FRAMES} frames")
-        largest = np.max(np.abs(light), initial=0.0, where=np.isfinite(light))
-        if largest > MAX_FLUX:
-            raise _bad(name, "flux", f"{largest:g}", f"values between -{MAX_FLUX:g} and {MAX_FLUX:g}")
+        finite = light[np.isfinite(light)]
+        if (beyond := finite[np.abs(finite) > MAX_FLUX]).size:
+            raise _bad(name, "flux", f"{beyond[0]:g}", f"values between -{MAX_FLUX:g} and {MAX_FLUX:g}")
         if not np.isfinite(time).all():
             raise _bad(name, "time", f"{time[~np.isfinite(time)][0]} in row {int(np.argmin(np.isfinite(time)))}",
                        "finite times")  # fmt: skip
