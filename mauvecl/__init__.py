@@ -3,23 +3,23 @@
 The public names are loaded when first used: importing mauvecl loads neither OpenCL nor synphot.
 """
 
-from __future__ import annotations
-
 import os
 import sys
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
+# Before any other import, since Ctrl-C while modules are imported must not print a traceback. Python has loaded os and
+# sys itself; what it does before this line cannot be helped.
 if sys.argv[:1] == ["-m"] or (sys.argv and os.path.basename(sys.argv[0]) == __name__):
-    # Started as a command: Ctrl-C while modules are imported must not print a traceback.
 
-    def _without_traceback(kind: Any, error: Any, trace: Any, otherwise: Any = sys.excepthook) -> None:
+    def _without_traceback(kind, error, trace, otherwise=sys.excepthook):  # type: ignore[no-untyped-def]
         if issubclass(kind, KeyboardInterrupt):
             print(f"{__name__}: interrupted", file=sys.stderr)
         else:
             otherwise(kind, error, trace)
 
     sys.excepthook = _without_traceback
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.verbs import HOMES
 from mauvecl.host.version import VERSION

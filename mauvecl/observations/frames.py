@@ -24,6 +24,8 @@ MIN_FRAMES = 20
 MAX_FRAMES = 2**22
 #: Largest time from the first to the last frame in median steps, of which searches make a grid: 42 years of 20 s.
 MAX_SPAN = 2**26
+#: Largest flux, whose square and sums of squares are finite numbers.
+MAX_FLUX = 1e100
 #: Share of frames in which a pixel must be finite; others are left out of every frame.
 LIVE_SHARE = 0.5
 #: Shortest time between frames as a share of the cadence; frames that are closer overlap.
@@ -139,6 +141,9 @@ class Frames:
             raise _bad(name, "shape", (time.shape, light.shape), "times of shape (n,), flux of (n,) or (n, n_pixel)")
         if not MIN_FRAMES <= n <= MAX_FRAMES:
             raise _bad(name, "frames", n, f"{MIN_FRAMES} to {MAX_FRAMES} frames")
+        finite = light[np.isfinite(light)]
+        if (beyond := finite[np.abs(finite) > MAX_FLUX]).size:
+            raise _bad(name, "flux", f"{beyond[0]:g}", f"values between -{MAX_FLUX:g} and {MAX_FLUX:g}")
         if not np.isfinite(time).all():
             raise _bad(name, "time", f"{time[~np.isfinite(time)][0]} in row {int(np.argmin(np.isfinite(time)))}",
                        "finite times")  # fmt: skip

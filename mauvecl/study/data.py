@@ -46,6 +46,14 @@ class DataChoice(Section):
             default="lightkurve's default for Kepler and K2, for TESS without ImpulsiveOutlier, else all",
         ),
         Flag("--quality-bits"),
+        Widget(
+            label="Quality bits",
+            hint="Bits of the quality flag that exclude a frame: numbers and names as in Desat,128, or all, or none. "
+            "Without them lightkurve's default applies to Kepler and K2, its default without ImpulsiveOutlier to TESS, "
+            "and all bits to other files.",
+            group="Frames",
+            place=2,
+        ),
     ] = None
     ignore_checksum: Annotated[
         bool, Help("Read FITS files although their CHECKSUM or DATASUM differs"), Flag("--ignore-checksum")

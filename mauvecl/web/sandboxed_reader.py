@@ -73,7 +73,9 @@ def read_limited(content: bytes, kind: type[Spectrum], options: Mapping[str, Any
     return kind(**_read(KINDS[kind], {"upload": content}, options or {}))
 
 
-def read_frames_limited(files: Mapping[str, bytes], mapping: str | None = None) -> Frames:
+def read_frames_limited(
+    files: Mapping[str, bytes], mapping: str | None = None, quality_bits: str | None = None
+) -> Frames:
     """Read frames like `read_frames`, in a process with limited memory and time.
 
     Parameters
@@ -82,8 +84,10 @@ def read_frames_limited(files: Mapping[str, bytes], mapping: str | None = None) 
         Contents by name: the file of frames first, and files that the mapping or the frames need.
     mapping : str, optional
         Name of the file that is the mapping.
+    quality_bits : str, optional
+        Bits of the quality that exclude a frame.
     """
-    return Frames(**_read("frames", files, {"mapping": mapping}))
+    return Frames(**_read("frames", files, {"mapping": mapping, "quality_bits": quality_bits}))
 
 
 def _read(reader: str, files: Mapping[str, bytes], options: Mapping[str, Any]) -> dict[str, Any]:

@@ -213,8 +213,10 @@ UPLOADS: Mapping[str, Upload] = {
 }
 
 
-def read_frames_of(file: VisitorFile, mapping: VisitorFile | None, key: str) -> Frames:
-    """Read the frames of a visitor's file, through a mapping if there is one.
+def read_frames_of(
+    file: VisitorFile, mapping: VisitorFile | None, key: str, *, quality_bits: str | None = None
+) -> Frames:
+    """Read the frames of a visitor's file, through a mapping if there is one, without those of the quality bits.
 
     Raises InputError with the name of the field if it holds no frames.
     """
@@ -224,7 +226,7 @@ def read_frames_of(file: VisitorFile, mapping: VisitorFile | None, key: str) -> 
         how = mapping.name if mapping.name != file.name else f"mapping-{mapping.name}"
         files[how] = mapping.content
     with reported_for(key, file.name):
-        return read_frames_limited(files, how)
+        return read_frames_limited(files, how, quality_bits)
 
 
 @contextmanager

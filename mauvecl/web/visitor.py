@@ -26,6 +26,7 @@ from mauvecl.schema.text import shortened
 from mauvecl.web.card import card, without_headline
 from mauvecl.web.closed_forms import ClosedForms
 from mauvecl.web.downloads import as_file, asked_study, commands_and_programs
+from mauvecl.web.fields import FIELDS
 from mauvecl.web.folders import visitor_folder
 from mauvecl.web.headline import other_payloads, solved
 from mauvecl.web.known_stars import known
@@ -54,6 +55,9 @@ MOST_TASKS = 8
 OWN_FAULT = "the page has made a mistake of its own, and there is no answer: please report what was entered"
 #: Why a connection was ended, for the page.
 UNUSED = 4000
+
+#: Fields of the section `data`, which say how files of frames are read.
+DATA = {name for name, field in FIELDS.items() if field.path[:1] == ("data",)}
 
 
 class Visitor(WebSocketHandler):
@@ -192,7 +196,7 @@ class Visitor(WebSocketHandler):
 
     def given(self, state: State, tab: Tab) -> dict[str, Any]:
         """Return the content of the files that a tab reads; the last ones are cached."""
-        key = tab.name, self._key(state, tab.reads & UPLOADS.keys())
+        key = tab.name, self._key(state, tab.reads & (UPLOADS.keys() | DATA))
         held = self._given
         if held is None or held[0] != key:
             held = self._given = key, tab.given(state.question(tab.reads))

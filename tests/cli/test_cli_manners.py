@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -203,17 +205,20 @@ def test_mistakes_load_no_heavy_package(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "started", [["-m", "mauvecl"], ["-c", "import sys; sys.argv[0] = 'mauvecl'; import mauvecl.cli.app"]]
 )
-@pytest.mark.parametrize("module", ["mauvecl.answers.verbs", "mauvecl.schema", "mauvecl.cli.boundary", "typer"])
+@pytest.mark.parametrize(
+    "module",
+    ["importlib", "typing", "__future__", "mauvecl.answers.verbs", "mauvecl.schema", "mauvecl.cli.boundary", "typer"],
+)
 def test_interrupt_during_imports_prints_one_line(started: list[str], module: str, tmp_path: Path) -> None:
     """Interrupt a command while a module is imported."""
     (tmp_path / "sitecustomize.py").write_text(
         "import builtins, os, signal\n"
         "real = builtins.__import__\n"
-        "def imported(name, *given, **how):\n"
-        f"    if name == {module!r}:\n"
+        "def imported(name, within=None, *given, **how):\n"
+        f"    if name == {module!r} and (within or {{}}).get('__name__', '').startswith('mauvecl'):\n"
         "        builtins.__import__ = real\n"
         "        os.kill(os.getpid(), signal.SIGINT)\n"
-        "    return real(name, *given, **how)\n"
+        "    return real(name, within, *given, **how)\n"
         "builtins.__import__ = imported\n"
     )
     path = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])])
@@ -222,3 +227,24 @@ def test_interrupt_during_imports_prints_one_line(started: list[str], module: st
     )
     assert done.stderr == "mauvecl: interrupted\n"
     assert done.returncode in (-2, 130)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("script", [True, False])
+def test_interrupt_after_any_delay_shows_no_traceback_of_mauvecl(script: bool, tmp_path: Path) -> None:
+    """Interrupt a command 0 to 300 ms after its start; before it is imported, Python's own start can be interrupted."""
+    home = str(Path(__file__).parents[2])
+    (tmp_path / "mauvecl").write_text("import sys\nfrom mauvecl.cli.app import main\nsys.exit(main())\n")
+    command = [sys.executable, *([str(tmp_path / "mauvecl")] if script else ["-m", "mauvecl"]), "schema"]
+    said = set()
+    for delay_ms in (*range(0, 60, 2), *range(60, 301, 20)):
+        process = subprocess.Popen(
+            command, env=os.environ | {"PYTHONPATH": home}, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        )
+        time.sleep(delay_ms / 1000)
+        process.send_signal(signal.SIGINT)
+        _, text = process.communicate()
+        assert process.returncode in (-signal.SIGINT, 130, 1, 0), text
+        assert text == "mauvecl: interrupted\n" or not re.search(r"mauvecl/(__init__|cli|answers|schema)", text), text
+        said.add(text)
+    assert "mauvecl: interrupted\n" in said

@@ -57,6 +57,7 @@ def visits(exposure_s: float) -> object:
 CALLS: dict[str, tuple[Callable[[], object], str]] = {
     "few frames": (lambda: of_arrays(time_s=TIME[:5], flux=FLUX[:5]), "frames"),
     "fewer times than frames": (lambda: of_arrays(time_s=TIME[:50]), "shape"),
+    "a flux whose square is infinite": (lambda: of_arrays(flux=np.where(TIME == 40, -1e308, FLUX)), "flux"),
     "a time that is nan": (lambda: of_arrays(time_s=np.where(TIME == 40, np.nan, TIME)), "time"),
     "a time twice": (lambda: of_arrays(time_s=np.where(TIME == 40, 20.0, TIME)), "time"),
     "fewer errors than frames": (lambda: of_arrays(error=ERROR[:5]), "error"),

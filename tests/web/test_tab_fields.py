@@ -73,6 +73,7 @@ OTHER = {
     "shortest_d": "2", "longest_d": "20", "distance_pc": "7", "false_alarms": "2",
     "per": "day", "neighbours": NEAR, "neighbours_of": "0 0", "neighbour_share": "0.5", "pointing_rate": "2",
     "pointing_duration": "100", "pointing_depth": "10", "frames": UPLOADED_FILE, "mapping": UPLOADED_FILE,
+    "quality_bits": "none",
     "change_file": UPLOADED_FILE, "change_band": "B", "flare_file": UPLOADED_FILE, "flare_quiescent": UPLOADED_FILE,
     "as_observed": "yes",
     "observations": UPLOADED_FILE, "knots": "50", "light_error": "1", "spectrum_error": "2",

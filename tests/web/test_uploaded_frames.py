@@ -21,10 +21,11 @@ from mauvecl.study.study import Study
 from mauvecl.web.closed_forms import ClosedForms
 from mauvecl.web.downloads import as_file, commands_and_programs, study_file
 from mauvecl.web.fields import UPLOADED_FILE
+from mauvecl.web.shelf import RESULTS
 from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS
 from mauvecl.web.upload import MOST_KEPT_BYTES, VisitorFile
-from mauvecl.web.visitor import shown
+from mauvecl.web.visitor import Visitor, shown
 
 TAB = TABS["analyse"]
 MAPPING = b'time = "minute"\ntime_unit = "min"\nflux = "rate"\nerror = "sd"\n'
@@ -94,6 +95,41 @@ def test_exports_name_the_file(tmp_path: Path) -> None:
     study = Study.read(tmp_path / "taken" / "study.toml")
     assert study.data.file == tmp_path / "taken" / "my_curve.csv"
     assert [row.verdict for row in analyse(study).rows] == ["detected"]
+
+
+@pytest.mark.parametrize(("bits", "left_out"), [("", 3), ("all", 3), ("none", 0), ("4", 1), ("1,2", 2)])
+def test_quality_bits_are_chosen_as_on_the_command_line(bits: str, left_out: int, tmp_path: Path) -> None:
+    """Three frames with the flags 1, 2 and 4."""
+    first, *lines = light_curve().decode().splitlines()
+    flags = {50: 1, 60: 2, 70: 4}
+    frames = "\n".join([f"{first},flag", *(f"{line},{flags.get(k, 0)}" for k, line in enumerate(lines))]).encode()
+    state = asked(frames, MAPPING + b'quality = "flag"\n')
+    state.enter({"quality_bits": bits})
+    page = closed(state, tmp_path)
+    assert np.count_nonzero(page.given["frames"].faults) == left_out
+    (taken,) = commands_and_programs(TAB, state.question(TAB.reads), tmp_path)
+    assert ("--quality-bits" in taken["command"]) == bool(bits)
+    assert page.study.data.quality_bits == (bits or None)
+
+
+def test_frames_are_read_again_for_other_quality_bits() -> None:
+    """The last frames are cached by everything that decides how they are read."""
+    first, *lines = light_curve().decode().splitlines()
+    frames = "\n".join([f"{first},flag", *(f"{line},{int(k == 50)}" for k, line in enumerate(lines))]).encode()
+    state = asked(frames, MAPPING + b'quality = "flag"\n')
+    visitor = Visitor.__new__(Visitor)
+    visitor._digests, visitor._given = {}, None
+    for bits, left_out in (("", 1), ("none", 0), ("all", 1)):
+        state.enter({"quality_bits": bits})
+        assert np.count_nonzero(visitor.given(state, TAB)["frames"].faults) == left_out
+    RESULTS.leave(visitor)
+
+
+def test_unknown_quality_bits_are_refused_with_their_name(tmp_path: Path) -> None:
+    state = asked(light_curve(), MAPPING + b'quality = "rate"\n')
+    state.enter({"quality_bits": "NoSuchBit"})
+    with pytest.raises(InputError, match="NoSuchBit"):
+        closed(state, tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,16 @@
 
 import {byId, every} from "./dom.js"
 
+/** Whether the field is empty without which a simulation cannot start.
+ * @param {string | undefined} kind
+ * @param {import("./protocol.js").Entered} entered
+ * @param {Record<string, string>} needs
+ */
+export function lacks(kind, entered, needs) {
+  const need = kind === undefined ? undefined : needs[kind]
+  return need !== undefined && !entered[need].trim()
+}
+
 /** Enable what the answer allows.
  * @param {import("./protocol.js").Answer | null} answer
  * @param {boolean} busy
@@ -12,14 +22,12 @@ import {byId, every} from "./dom.js"
 export function offer(answer, busy, entered, needs) {
   const ready = answer !== null
   const simulated = new Set(answer?.simulated ?? [])
-  byId("simulate").disabled = !ready || busy
   byId("cancel").disabled = !busy
   byId("pin").disabled = !ready
   byId("study").disabled = !ready
-  for (const button of every("[data-simulate]")) {
-    const need = needs[button.dataset.simulate]
-    const lacks = need !== undefined && !entered[need].trim()
-    button.disabled = !ready || busy || lacks
+  for (const button of [byId("simulate"), ...every("[data-simulate]")]) {
+    // Not `disabled`, so that the keyboard reaches it while the answer is on its way.
+    button.ariaDisabled = String(!ready || busy || lacks(button.dataset.simulate, entered, needs))
   }
   for (const button of every("[data-file]")) {
     const tab = button.closest("[role=tabpanel]").id.replace("panel-", "")

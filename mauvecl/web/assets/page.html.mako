@@ -118,7 +118,7 @@ ${upload(name, "Use a file", field.label, "text, ECSV, VOTable or FITS; or drop 
 <div class="row">
 % for kind, title in tab.simulations.items():
 % if kind != "detection":
-<button type="button" data-simulate="${kind}" class="main" disabled>${title}</button>
+<button type="button" data-simulate="${kind}" class="main" aria-disabled="true">${title}</button>
 % endif
 % endfor
 % if any(p for p in tab.pictures if p.name in ("excess", "recorded", "telescope", "snr", "budget")):
@@ -206,7 +206,7 @@ ${control(name)}
 </div>
 <dl id="facts"></dl>
 <div class="row run">
-<button type="button" id="simulate" class="main" disabled>Simulate</button>
+<button type="button" id="simulate" class="main" aria-disabled="true">Simulate</button>
 <span id="standing"><button type="button" id="cancel" disabled>Cancel</button>
 <progress id="progress" class="idle" max="1" value="0" aria-label="Simulation"></progress>
 <span id="status" role="status"></span></span>

@@ -6,7 +6,7 @@ import {Compare} from "./compare.js"
 import {byId, every} from "./dom.js"
 import {Export, give} from "./export.js"
 import {Fields} from "./fields.js"
-import {offer} from "./offers.js"
+import {lacks, offer} from "./offers.js"
 import {Pictures} from "./pictures.js"
 import {Live} from "./protocol.js"
 import {Routing} from "./routing.js"
@@ -48,6 +48,7 @@ class Page {
     const refused = (/** @type {string} */ why) => this.card.notices([[why, "danger"]])
     this.simulations = new Simulations(this.live, this.routing, this.card, {
       question: kind => this.asked(words.asks[kind]), ready: () => this.answer !== null, offer: () => this.offer(),
+      lacks: kind => lacks(kind, this.fields.entered, words.needs) ? "a field that it needs is empty" : "",
       ended: () => this.simulated(), refused,
     })
     this.uploads = new Uploads(words, this.fields, this.live, {

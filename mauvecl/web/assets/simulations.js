@@ -12,8 +12,8 @@ export class Simulations {
    * @param {Live} live
    * @param {Routing} routing
    * @param {Card} card
-   * @param {{question(kind: string): string, ready(): boolean, offer(): void, ended(): void, refused(why: string): void}} page
-   *   what a simulation is asked; whether it has an answer; show which buttons can be pressed; a simulation's answer is there, or not
+   * @param {{question(kind: string): string, lacks(kind: string): string, ready(): boolean, offer(): void, ended(): void, refused(why: string): void}} page
+   *   what a simulation is asked; what must be entered for it; whether it has an answer; show which buttons can be pressed; a simulation's answer is there, or not
    */
   constructor(live, routing, card, page) {
     this.live = live
@@ -29,11 +29,25 @@ export class Simulations {
     this.wanted = []
     // Where the progress is shown unless another button was pressed.
     this.home = byId("standing").parentElement
-    byId("simulate").onclick = () => this.start("detection")
+    byId("simulate").onclick = () => this.press("detection")
     byId("cancel").onclick = () => this.drop()
     for (const button of every("[data-simulate]")) {
-      button.onclick = () => this.start(button.dataset.simulate)
+      button.onclick = () => this.press(button.dataset.simulate)
     }
+  }
+
+  /** Start a simulation, or when the answer to what is entered is there; or say why not.
+   * @param {string} kind */
+  press(kind) {
+    if (this.running !== null) return
+    const lacks = this.page.lacks(kind)
+    if (!lacks && this.page.ready()) {
+      this.start(kind)
+      return
+    }
+    this.place(kind)
+    this.wanted = lacks ? [] : [kind]
+    this.card.ended(lacks || "starts when what is entered has an answer")
   }
 
   /** @param {string} kind */

@@ -229,7 +229,9 @@ class Analyse(Tab):
         """Read the frames; raises InputError with the name of the field whose file cannot be read."""
         if "frames" not in question.uploads:
             return {}
-        frames = read_frames_of(question.uploads["frames"], question.uploads.get("mapping"), "frames")
+        frames = read_frames_of(
+            question.uploads["frames"], question.uploads.get("mapping"), "frames", quality_bits=question.quality_bits
+        )
         if frames.flux.size > MOST_VALUES:
             raise InputError.of("frames", frames.flux.size, f"at most {MOST_VALUES} values, or the command line")
         return {"frames": frames}
