@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import printable, shortened, shown
+from mauvecl.schema.text import shortened, shown
 
 from .neighbours import Neighbour
 from .stars.band_names import known_band
@@ -80,10 +80,7 @@ def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[
                 path.parent / spectrum if spectrum else None, table.number(temperature, k, "K", above=0.0),
                 table.number(colour, k, "mag"),
             ))  # fmt: skip
-    unused = [one for one in table.names if not {key_of(one), key_of(divided_unit(one)[0])} & _KEYS]
-    if unused:
-        words = f"column of {named} is" if len(unused) == 1 else f"columns of {named} are"
-        notes += (f"{len(unused)} {words} not used: {printable(', '.join(unused), 200)}.",)
+    notes += table.unused([one for one in table.names if not {key_of(one), key_of(divided_unit(one)[0])} & _KEYS])
     return tuple(sorted(stars, key=lambda star: star.separation_arcsec)), notes
 
 

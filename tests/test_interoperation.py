@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+import warnings
 from pathlib import Path
 
 import astropy.units as u
@@ -19,6 +20,7 @@ from mauvecl import Source
 from mauvecl.cli.app import app
 from mauvecl.host.stars.blackbody import blackbody
 from mauvecl.host.stars.flare_table import flares_of, read_flares
+from mauvecl.study.sections import amplitudes_in
 
 
 def test_synphot_spectrum_round_trips() -> None:
@@ -107,6 +109,30 @@ def test_data_frame_and_fits_table_are_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(flares_of(frame)["amplitude"], [0.1, 0.2])
     Table({"amp": [0.3]}).write(tmp_path / "f.fits")
     np.testing.assert_array_equal(read_flares(tmp_path / "f.fits")["amplitude"], [0.3])
+
+
+@pytest.mark.parametrize(
+    ("header", "unused"),
+    [
+        ("ampl_rec", []),
+        ("Ampl_Rec,TSTART,tstop", []),
+        ("ampl_rec,tstart,tstop,Colour", ["Colour"]),
+        # Another name of an amplitude is not used either.
+        ("ed_rec,ampl_rec,amp,note (mag)", ["ed_rec", "amp", "note (mag)"]),
+    ],
+)
+def test_tables_of_flares_leave_one_remark_on_columns_that_are_not_used(
+    tmp_path: Path, header: str, unused: list[str]
+) -> None:
+    file = tmp_path / "f.csv"
+    file.write_text(f"{header}\n" + ",".join("1" for _ in header.split(",")) + "\n")
+    remarks = read_flares(file).meta["comments"]
+    assert len(remarks) == bool(unused)
+    assert all(f"not used: {', '.join(unused)}." in remark and "f.csv" in remark for remark in remarks)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert amplitudes_in(file, "--flares") == [1.0]
+    assert [str(one.message) for one in caught] == remarks, "the command line prints it"
 
 
 @pytest.mark.parametrize("text", ["time,flux\n1,2\n", "ampl_rec\n0.1\n-0.2\n", "ampl_rec\n"])

@@ -198,7 +198,7 @@ def _kinds_of_unit(unit: str | None) -> tuple[bool, bool, FluxKind]:
 def divided(name: str) -> tuple[str, str | None]:
     """Divide a column's name into the quantity and its unit, if any."""
     name = " ".join(name.strip().strip("\"'").split())
-    if _is_unit(name, alone=True):
+    if is_unit(name, alone=True):
         return "", name
     if match := _LOGARITHM_OF.fullmatch(name):
         # log10(wave/AA), log(F) [erg/s/cm2/A]
@@ -206,9 +206,9 @@ def divided(name: str) -> tuple[str, str | None]:
     base, unit = name, None
     if (match := _BRACKETS.search(name)) and match.start() > 0:
         inner = match[1].strip()
-        if _is_unit(inner) or re.search(r"\d|\^|/", inner):
+        if is_unit(inner) or re.search(r"\d|\^|/", inner):
             base, unit = name[: match.start()], inner
-    elif (match := re.search(r"\s?/\s*(\S+)$|\sin\s+(\S+)$", name)) and _is_unit(match[1] or match[2]):
+    elif (match := re.search(r"\s?/\s*(\S+)$|\sin\s+(\S+)$", name)) and is_unit(match[1] or match[2]):
         base, unit = name[: match.start()], match[1] or match[2]
     elif (match := SCALE.search(name)) and match.start() > 0:
         # A factor without a unit, as in "flux/10^-15", is not a unit.
@@ -234,7 +234,7 @@ def _fits(base: Sequence[str], unit: str) -> bool:
     return spectral and len(unit) < 12 if is_axis else flux != "other" and unit.lower() not in ("ab", "st")
 
 
-def _is_unit(text: str, alone: bool = False) -> bool:
+def is_unit(text: str, alone: bool = False) -> bool:
     """Return whether a text is a unit of wavelength or flux; if alone, one that is unlikely to be a word."""
     if alone and text not in ("A", "Å") and (len(text) < 2 or text.lower() in ("ab", "st", "erg")):
         return False

@@ -70,7 +70,8 @@ def converted(raw: RawSpectrum, wavelength_unit: Any = None, flux_unit: Any = No
     segments = []
     for values, fluxes in raw.segments:
         nm, kept = _in_nm(values, fluxes, axis)
-        segments.append(_in_order(nm, _in_flam(kept, nm, flux)))
+        order = slice(None, None, -1 if nm.size > 1 and nm[0] > nm[-1] else 1)
+        segments.append((nm[order], _in_flam(kept, nm, flux)[order]))
     nm, flam = _joined(segments, messages)
     if flux.is_assumed:
         _check_assumed_flux(flam, raw)
@@ -221,10 +222,6 @@ def _in_flam(flux: Float, nm: Float, scale: _Scale) -> Float:
     with np.errstate(all="ignore"):
         quantity = u.Quantity(scale.linear_values(flux), scale.unit)
         return np.asarray(quantity.to_value(flam, u.spectral_density(u.Quantity(nm, u.nm))), np.float64)
-
-
-def _in_order(nm: Float, flux: Float) -> tuple[Float, Float]:
-    return (nm[::-1], flux[::-1]) if nm.size > 1 and nm[0] > nm[-1] else (nm, flux)
 
 
 def _joined(segments: list[tuple[Float, Float]], messages: list[str]) -> tuple[Float, Float]:

@@ -24,9 +24,7 @@ def ecsv_tables(text: str, name: str, origin: str) -> list[FileTable]:
         FileTable(
             [
                 # As text, because astropy keeps unknown units as objects without a dimension.
-                Column(
-                    one, partial(_ecsv_values, table, one), None if table[one].unit is None else str(table[one].unit)
-                )
+                Column(one, partial(getattr, table[one], "data"), str(table[one].unit or "") or None)
                 for one in table.colnames
             ],
             own.strip()[:80] if isinstance(own, str) and own.strip() else name,
@@ -38,10 +36,6 @@ def ecsv_tables(text: str, name: str, origin: str) -> list[FileTable]:
             messages=_texts(meta.get("told")),
         )
     ]
-
-
-def _ecsv_values(table: Any, name: str) -> Any:
-    return table[name].data
 
 
 def _texts(given: Any) -> tuple[str, ...]:

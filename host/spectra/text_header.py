@@ -11,9 +11,9 @@ from collections.abc import Callable, Sequence
 
 from mauvecl.schema.errors import InputError
 
-from ..tables.units import flux_kind, is_spectral, is_stated, unit_of
+from ..tables.units import is_stated
 from .column_choice import AXES, listed
-from .column_roles import divided, role_of, words_of
+from .column_roles import divided, is_unit, role_of, words_of
 
 #: Lines of a header, and whether each is a remark.
 Header = list[tuple[str, bool]]
@@ -81,31 +81,22 @@ def _wide(line: str) -> list[str]:
 def _recognised(cells: Sequence[str]) -> int:
     """Count the cells that name a spectrum's columns; 0 without a wavelength and another column."""
     kinds = [role_of(cell).kind for cell in cells]
-    is_named = any(kind in AXES and not _is_unit(cell) for cell, kind in zip(cells, kinds, strict=True))
+    is_named = any(kind in AXES and not is_unit(cell) for cell, kind in zip(cells, kinds, strict=True))
     # "resolution 5 nm" does not name columns; "nm error flux" does.
     others = {*kinds} - {*AXES, "unknown"} if is_named else {*kinds} & {"flux", "model", "magnitude", "counts"}
     if not others or not {*kinds} & {*AXES}:
         return 0
     # Names have precedence over the units below them.
-    return sum(1 if _is_unit(cell) else 2 for cell, kind in zip(cells, kinds, strict=True) if kind != "unknown")
-
-
-def _is_unit(cell: str) -> bool:
-    """Return whether a cell is a unit of wavelength or flux."""
-    try:
-        unit = unit_of(cell)
-    except InputError:
-        return False
-    return is_spectral(unit) or flux_kind(unit) != "other"
+    return sum(1 if is_unit(cell) else 2 for cell, kind in zip(cells, kinds, strict=True) if kind != "unknown")
 
 
 def _units(header: Header, names_at: int, n: int, split: Split) -> list[str]:
     """Return the cells of the line of units below the names, if any; IPAC tables have types in between."""
     for k, (line, _) in enumerate(header[names_at + 1 : names_at + 3]):
         cells = _cells(line, n, split)
-        is_all = any(_is_unit(cell) for cell in cells) and all(_is_unit(c) or not is_stated(c) for c in cells)
+        is_all = any(is_unit(cell) for cell in cells) and all(is_unit(c) or not is_stated(c) for c in cells)
         # "A star" is not a unit, and "nm banana" contains an unknown unit.
-        is_some = any(len(cell) > 1 and _is_unit(cell) for cell in cells) and not any(c.endswith(":") for c in cells)
+        is_some = any(len(cell) > 1 and is_unit(cell) for cell in cells) and not any(c.endswith(":") for c in cells)
         if is_all or (k == 0 and is_some):
             return cells
     return []

@@ -35,7 +35,8 @@ def read_flares(path: str | Path) -> QTable:
     Returns
     -------
     QTable
-        ``amplitude``, and ``start`` and ``stop`` in days of the table's own time system.
+        ``amplitude``, and ``start`` and ``stop`` in days of the table's own time system. Columns that are not used are
+        named in ``meta["comments"]``.
     """
     return flares_of(read_table(path, "flare table"), shortened(Path(path).name))
 
@@ -76,5 +77,6 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
         if place and held is not None:
             flares[title] = np.array([cells[row][place] for row in kept], float)
             flares[title].unit = unit
+    flares.meta["comments"] = list(rows.unused([name for name in rows.names if name not in (amplitude, start, stop)]))
     flares["amplitude"].info.description = "relative rise above the quiescent flux, in the band of the light curve"
     return flares

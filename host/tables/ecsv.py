@@ -29,9 +29,7 @@ def read_ecsv(path: str | Path, what: str, expected: str = "an ECSV table") -> T
 
     Raises InputError if the file is missing, is not an ECSV table, or would expand far beyond its size.
     """
-    path = Path(path)
-    named = f"{what} {shortened(str(path))}"
-    return parse_ecsv(as_text(unpacked(read_bytes(path, what), named), named), named, expected)
+    return parse_ecsv(*_text_and_name(path, what), expected)
 
 
 def parse_ecsv(text: str, what: str, expected: str = "an ECSV table") -> Table:
@@ -76,9 +74,14 @@ class Numbers:
 
 def read_numbers(path: str | Path, what: str) -> Numbers:
     """Read an ECSV table of numbers; raise InputError if values are missing or not numeric, or as `read_ecsv`."""
+    return parse_numbers(*_text_and_name(path, what))
+
+
+def _text_and_name(path: str | Path, what: str) -> tuple[str, str]:
+    """Read the text of a file, and return it with the file's name for messages."""
     path = Path(path)
     named = f"{what} {shortened(str(path))}"
-    return parse_numbers(as_text(unpacked(read_bytes(path, what), named), named), named)
+    return as_text(unpacked(read_bytes(path, what), named), named), named
 
 
 def parse_numbers(text: str, what: str) -> Numbers:

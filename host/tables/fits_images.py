@@ -9,6 +9,8 @@ import numpy as np
 
 from mauvecl.schema.errors import InputError
 
+from .fits import text_at
+
 #: Names of extensions with images that are not fluxes.
 _NO_FLUX = re.compile(r"err|sig|var|ivar|qual|mask|dq|snr|cont|sky|back|wave|lambda|lam$", re.IGNORECASE)
 _AXIS_NAME = re.compile(r"(?:(.+)_)?(?:WAVELENGTH|WAVE|WAVELEN|LAMBDA|LOGLAM)", re.IGNORECASE)
@@ -27,7 +29,7 @@ def paired_images(hdus: Any) -> list[tuple[str, Any, Any]]:
 
     DESI's B_WAVELENGTH and B_FLUX (https://desidatamodel.readthedocs.io, coadd-SURVEY-PROGRAM-PIXNUM.fits).
     """
-    named = {str(hdu.header.get("EXTNAME", "")).strip().upper(): hdu for hdu in hdus if getattr(hdu, "is_image", False)}
+    named = {text_at(hdu.header, "EXTNAME").upper(): hdu for hdu in hdus if getattr(hdu, "is_image", False)}
     pairs = []
     for name, hdu in named.items():
         if (match := _AXIS_NAME.fullmatch(name)) is None:
@@ -71,9 +73,9 @@ def rows_of(hdu: Any, telescope: str, asked: bool) -> tuple[Any, tuple[str, ...]
     if is_survey_image(hdu, telescope):
         return flux[0], (), (f"the first of {len(flux)} rows is its flux",)
     bands = shape[2] if len(shape) > 2 else shape[1]
-    if not asked and str(header.get("BANDID1", "")).strip().lower().startswith("spectrum") and len(flux) == bands:
+    if not asked and text_at(header, "BANDID1").lower().startswith("spectrum") and len(flux) == bands:
         return flux[0], (), (f"the first of {bands} bands (BANDID1) is its flux",)
-    return flux, tuple(str(header.get(f"BANDID{k + 1}", "")).strip() for k in range(len(flux))), ()
+    return flux, tuple(text_at(header, f"BANDID{k + 1}") for k in range(len(flux))), ()
 
 
 def axis_of(header: Any, primary: Any, n: int) -> tuple[Any, str | None, str, tuple[str, ...]]:
@@ -86,9 +88,6 @@ def axis_of(header: Any, primary: Any, n: int) -> tuple[Any, str | None, str, tu
                 if isinstance(value, int | float) and not isinstance(value, bool):
                     return float(value)
         return None
-
-    def text(key: str) -> str:
-        return str(header.get(key, "") or primary.get(key, "")).strip()
 
     first, slope = number("COEFF0"), number("COEFF1")
     if first is not None and slope is not None and 1.0 < first < 6.0:
@@ -103,8 +102,8 @@ def axis_of(header: Any, primary: Any, n: int) -> tuple[Any, str | None, str, tu
     # A missing CRPIX1 is 0 by the FITS standard, but archives' spectra without it start at their first pixel.
     reference = number("CRPIX1")
     pixel = np.arange(1, n + 1) - (1.0 if reference is None else reference)
-    kind = text("CTYPE1").upper()
-    unit = text("CUNIT1") or None
+    kind, unit = (text_at(header, key) or text_at(primary, key) or None for key in ("CTYPE1", "CUNIT1"))
+    kind = (kind or "").upper()
     value = start + step * pixel
     name, _, algorithm = kind.partition("-")
     if algorithm.strip("-") not in ("", "LOG", "LAMBDA", "LINEAR") or (

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
 
+from .fits import text_at
+
 Float = NDArray[np.float64]
 Medium = Literal["air", "vacuum"]
 
@@ -46,7 +48,7 @@ def medium_of(*headers: Mapping[str, Any]) -> Medium | None:
             name = re.sub(r"[\s-]+", "_", key.strip().upper())
             if name not in NAMED and name not in LOGICAL:
                 continue
-            medium = _stated(name, _text(header, key))
+            medium = _stated(name, text_at(header, key).lower())
             if medium is not None:
                 found[name] = medium
     if len(set(found.values())) > 1:
@@ -54,14 +56,6 @@ def medium_of(*headers: Mapping[str, Any]) -> Medium | None:
         raise InputError(f"its header contradicts itself: {words}", "one medium: `wavelength_unit='nm air'` says which",
                          key="wavelength_unit")  # fmt: skip
     return next(iter(found.values()), None)
-
-
-def _text(header: Mapping[str, Any], key: str) -> str:
-    try:
-        value = header[key]
-    except Exception:  # unparsable cards
-        return ""
-    return "" if value is None else str(value).strip().lower()
 
 
 def _stated(name: str, text: str) -> Medium | None:

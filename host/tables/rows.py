@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
+from mauvecl.schema.text import printable, shortened
 
 from .coordinates import angle, angle_unit, unit_in_name
 from .names import divided_unit, first_of
@@ -129,6 +129,11 @@ class Rows:
                 raise self.error(f"{name} has the unit {shortened(str(stated))}", "an angle", name, str(stated))
             self._units[name] = unit
         return self._units[name]
+
+    def unused(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Return the remark on columns that are not used; none if there are none."""
+        words = f"column of {self.named} is" if len(names) == 1 else f"columns of {self.named} are"
+        return (f"{len(names)} {words} not used: {printable(', '.join(names), 200)}.",) if names else ()
 
     def error(self, fault: str, expected: str, name: str, value: Any = None) -> InputError:
         """Return the error of a column or cell."""

@@ -112,6 +112,7 @@ def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any 
     time : Time, optional
         Middles of the frames, for spectra.
     """
+    import astropy.units as u
     from astropy.table import Table
 
     if not hasattr(container, "colnames"):
@@ -124,7 +125,7 @@ def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any 
         columns: dict[str, Any] = {"time": time, "flux": np.ma.MaskedArray(container.flux.value, mask)}
         if getattr(container, "uncertainty", None) is not None:
             columns["flux_err"] = _standard_deviation(container.uncertainty)
-        nm = container.spectral_axis.to_value("nm", equivalencies=_spectral())
+        nm = container.spectral_axis.to_value("nm", equivalencies=u.spectral())
         columns["wavelength"] = np.tile(nm, (len(columns["flux"]), 1))
         container = Table(
             columns, meta=dict(container.meta or {}), units={"flux": container.flux.unit, "wavelength": "nm"}
@@ -133,12 +134,6 @@ def frames_of(container: Any, mapping: FrameMapping | None = None, *, time: Any 
                                error="flux_err" if "flux_err" in columns else None)  # fmt: skip
     file = MemoryTable(container, type(container).__name__)
     return _frames_in(file, mapping or _recognised(file), str(container.meta.get("LABEL", "frames")))
-
-
-def _spectral() -> Any:
-    import astropy.units as u
-
-    return u.spectral()
 
 
 def _standard_deviation(uncertainty: Any) -> Float:

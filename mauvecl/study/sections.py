@@ -43,10 +43,15 @@ if TYPE_CHECKING:
 
 
 def amplitudes_in(path: Path, _: str) -> list[float]:
-    """Read the amplitudes of a table of flares, each value once."""
+    """Read the amplitudes of a table of flares, each value once, and warn of columns that are not used."""
+    import warnings
+
     from mauvecl.host.stars.flare_table import read_flares
 
-    return sorted({float(value) for value in read_flares(path)["amplitude"]})
+    flares = read_flares(path)
+    for remark in flares.meta["comments"]:
+        warnings.warn(remark, stacklevel=2)
+    return sorted({float(value) for value in flares["amplitude"]})
 
 
 #: Keys that only apply to a star from a file.
