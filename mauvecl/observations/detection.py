@@ -305,14 +305,18 @@ def _extended(
     quiet = ~taken
     if quiet.sum() < MIN_QUIET:
         return extents
+    steps = np.diff(survey.stare.numbers)
     sigmas = {direction: survey.along(direction, quiet) for direction in {one.direction for one in found}}
     longer = []
     for (first, last), one in zip(extents, found, strict=True):
         sigma, length = sigmas[one.direction], last - first + 1
-        stop = min(last + length, sigma.size - 1, last + int(quiet.sum()) - MIN_QUIET)
+        # Gaps that are longer than it end an event.
+        before, after = steps[max(0, first - length) : first] > length, steps[last : last + length] > length
+        stop = last + (int(after.argmax()) if after.any() else length)
+        stop = min(stop, sigma.size - 1, last + int(quiet.sum()) - MIN_QUIET)
         while last < stop and not taken[last + 1] and sigma[last + 1 : last + 1 + END_FRAMES].mean() > STILL_BRIGHT:
             last += 1
-        start = max(first - length, 0)
+        start = first - int(before[::-1].argmax()) if before.any() else max(first - length, 0)
         while (
             first > start and not taken[first - 1] and sigma[max(0, first - END_FRAMES) : first].mean() > STILL_BRIGHT
         ):

@@ -67,7 +67,35 @@ class SolvedNorms:
     unit: float  # without gaps and with constant noise
     squares: Float  # squared solution C^-1 s without gaps, from `margin` frames before the template to as many after it
     margin: int
-    frames: NDArray[np.int64]  # shape (n_onset,); frame of the peak, counted from the start of the stare
+    frames: NDArray[np.int64]  # shape (n_onset,); frame of the peak on the grid with shortened gaps
+
+
+@dataclass(frozen=True, eq=False)
+class FrameGrid:
+    """Numbers of frames with shortened gaps: no template reaches over a long gap, whose frames only take memory."""
+
+    # Shape (n_gap,); number after the middle of each shortened gap, and frames that it and those before it lack.
+    middle: NDArray[np.int64]
+    lacking: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, numbers: NDArray[np.int64], bank: Bank) -> FrameGrid:
+        """Shorten the gaps between frames that are longer than two templates."""
+        longest = 2 * max(abs(one.first) + one.shapes.shape[1] for one in bank.templates)
+        steps = np.diff(numbers)
+        long = np.flatnonzero(steps > longest)
+        lacking = np.cumsum(steps[long] - longest)
+        return cls(numbers[long] + longest // 2 - np.concatenate([[0], lacking])[:-1], lacking)
+
+    def shortened(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the numbers of frames on the grid."""
+        part = np.searchsorted(self.middle + np.concatenate([[0], self.lacking])[:-1], numbers, side="right")
+        return np.asarray(numbers - np.concatenate([[0], self.lacking])[part])
+
+    def numbers(self, shortened: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the numbers of places on the grid; a gap belongs to the frames next to each of its halves."""
+        part = np.searchsorted(self.middle, shortened, side="right")
+        return np.asarray(shortened + np.concatenate([[0], self.lacking])[part])
 
 
 class ProcessSearch:
@@ -93,7 +121,9 @@ class ProcessSearch:
         before: ProcessSearch | None = None,
     ) -> None:  # fmt: skip
         self.bank, self.stare, self.processes, self.variance = bank, stare, processes, variance
-        self.at = stare.numbers - stare.numbers[0]
+        self.grid: FrameGrid = FrameGrid.of(stare.numbers, bank) if before is None else before.grid
+        self.frames = self.grid.shortened(stare.numbers)
+        self.at = self.frames - self.frames[0]
         self.n_grid = int(self.at[-1]) + 1
         self._before = before
         self._norms_of: dict[tuple[float, int, int], SolvedNorms] = {}
@@ -178,7 +208,7 @@ class ProcessSearch:
 
     def peak_s(self, row: FilterRow, onset: NDArray[np.int64]) -> Float:
         """Return the times of the peaks of templates, from the start of the stare's numbering."""
-        frames = self.stare.numbers[0] + row.peaks[onset] + row.template.phases[row.phase]
+        frames = self.grid.numbers(self.frames[0] + row.peaks[onset]) + row.template.phases[row.phase]
         return np.asarray(frames * self.bank.frame_s)
 
     def _row(self, template: Template, phase: int) -> FilterRow:
@@ -186,7 +216,7 @@ class ProcessSearch:
         bright = np.flatnonzero(whole > NEGLECTED * whole.max())
         shape = whole[bright[0] : bright[-1] + 1]
         first = template.first + int(bright[0])
-        peaks = np.arange(-int(self.stare.numbers[0]) % template.stride, self.n_grid, template.stride)
+        peaks = np.arange(-int(self.frames[0]) % template.stride, self.n_grid, template.stride)
         norms, full = np.zeros((2, len(self.processes), peaks.size))
         for k in range(len(self.processes)):
             norms[k], full[k] = self._norms(k, template, phase, shape, first, peaks)
@@ -247,7 +277,7 @@ class ProcessSearch:
         missing = _correlated(single.astype(np.float64), squares, start)[peaks] / centre
         norm = np.maximum(unit - missing, 0.0)
         norm = norm / np.maximum(1.0 + _correlated(moved, squares, start)[peaks] / unit, 0.1)
-        one = SolvedNorms(norm, unit, squares, margin, int(self.stare.numbers[0]) + peaks)
+        one = SolvedNorms(norm, unit, squares, margin, self.frames[0] + peaks)
         self._solve(one, share[size + peaks] > IRREGULAR * float(squares.sum()), process, variance, shape, first, peaks)
         return one
 
@@ -260,9 +290,9 @@ class ProcessSearch:
         before = self._before
         gone = np.zeros(before.n_grid)
         gone[before.at] = 1.0
-        origin = int(self.stare.numbers[0] - before.stare.numbers[0])
+        origin = int(self.frames[0] - before.frames[0])
         gone[origin + self.at] = 0.0
-        part = np.searchsorted(earlier.frames, self.stare.numbers[0] + peaks)
+        part = np.searchsorted(earlier.frames, self.frames[0] + peaks)
         one = replace(earlier, norm=earlier.norm[part], frames=earlier.frames[part])
         share = _correlated(gone, earlier.squares, first - earlier.margin)[origin + peaks]
         # Correlations by Fourier transforms are not exactly zero where no frame contributes.

@@ -26,8 +26,6 @@ Bool = NDArray[np.bool_]
 
 #: Step between half-widths of a bank: the same as that of `lightcurve.defaults.HALF_WIDTHS_S`.
 WIDTH_STEP = 1.86
-#: Longest gap between searched frames, in frames; longer ones are shortened to it.
-MAX_GAP = 2**15
 #: Narrowest template in frames, and widest as a share of the time in all frames and in seconds.
 NARROWEST, WIDEST, WIDEST_S = 1.5, 0.15, 7200.0
 #: Smallest window around an event, in cadences and seconds.
@@ -163,14 +161,13 @@ class SeriesSurvey:
 
 
 def stare_of(frames: Frames, used: Bool) -> Stare:
-    """Return the frames that are searched as a stare on the regular grid of the cadence; long gaps are shortened."""
+    """Return the frames that are searched as a stare on the regular grid of the cadence."""
     numbers = frames.numbers[used]
-    # Nothing is shared over long gaps, whose frames would only take memory.
-    numbers = np.concatenate([[0], np.cumsum(np.minimum(np.diff(numbers), MAX_GAP))])
     ones = np.ones(numbers.size)
     return Stare(
-        np.asarray(numbers * frames.cadence_s, np.float64), frames.cadence_s, ones, ones, ones, np.zeros(numbers.size)
-    )
+        np.asarray((numbers - numbers[0]) * frames.cadence_s, np.float64), frames.cadence_s, ones, ones, ones,
+        np.zeros(numbers.size),
+    )  # fmt: skip
 
 
 def bank_of(stare: Stare, directions: Float, shape: Shape) -> Bank:
