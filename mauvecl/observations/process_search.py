@@ -8,7 +8,7 @@ generalised least squares,
 which is normal with unit variance without a flare, and the S/N of the template with one. Numerators of all onsets are
 correlations of the template with C^-1 (y - level), zero in missing frames, and exact over gaps. Denominators are exact
 near gaps, ends and large changes of the noise; elsewhere they follow from one solution, to first order in changes of
-the noise and exactly for single missing frames.
+the noise and in single missing frames, to some per cent.
 """
 
 from __future__ import annotations

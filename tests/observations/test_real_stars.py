@@ -76,7 +76,7 @@ def test_covariance_is_that_of_dense_matrices() -> None:
         (ROTATOR, 300, 0.05, 0.02, 0),
         (ROTATOR, 2500, 0.05, 0.02, 0),
         (LASTING, 2500, 0.0, 0.01, 0),
-        (LASTING, 1000, 0.0, 0.01, 5 * 10**7),
+        (ROTATOR, 1000, 0.05, 0.02, 5 * 10**7),
     ],
 )
 def test_statistics_have_unit_variance_over_gaps_and_changing_noise(
