@@ -37,7 +37,9 @@ NEGLECTED = 1e-4
 #: largest number.
 MARGIN, LEAST_MARGIN, MOST_MARGIN = 4, 1024, 4096
 #: Share of a denominator in frames next to gaps or with other noise from which it is solved exactly.
-IRREGULAR = 1e-3
+IRREGULAR = 1e-4
+#: The same for frames that are taken away, next to ends and gaps, too, where they matter more than `squares` say.
+CHANGED = 1e-2
 #: Relative change of the variance of a frame that is treated exactly.
 OTHER_NOISE = 0.5
 #: Number of frames, unless a template is longer, and largest number of templates in one solution.
@@ -65,9 +67,18 @@ class SolvedNorms:
 
     norm: Float  # shape (n_onset,)
     unit: float  # without gaps and with constant noise
+    diagonal: float  # of C^-1 without gaps and with constant noise
     squares: Float  # squared solution C^-1 s without gaps, from `margin` frames before the template to as many after it
     margin: int
     frames: NDArray[np.int64]  # shape (n_onset,); frame of the peak on the grid with shortened gaps
+
+    @property
+    def irregular(self) -> Float:
+        """Sum of `squares` in irregular frames above which a norm is solved exactly, shape (n_onset,).
+
+        A single frame contributes its square over the diagonal of C^-1.
+        """
+        return IRREGULAR * self.diagonal * np.maximum(self.norm, IRREGULAR * self.unit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,8 +288,8 @@ class ProcessSearch:
         missing = _correlated(single.astype(np.float64), squares, start)[peaks] / centre
         norm = np.maximum(unit - missing, 0.0)
         norm = norm / np.maximum(1.0 + _correlated(moved, squares, start)[peaks] / unit, 0.1)
-        one = SolvedNorms(norm, unit, squares, margin, self.frames[0] + peaks)
-        self._solve(one, share[size + peaks] > IRREGULAR * float(squares.sum()), process, variance, shape, first, peaks)
+        one = SolvedNorms(norm, unit, centre, squares, margin, self.frames[0] + peaks)
+        self._solve(one, share[size + peaks] > one.irregular, process, variance, shape, first, peaks)
         return one
 
     def _updated(
@@ -295,9 +306,7 @@ class ProcessSearch:
         part = np.searchsorted(earlier.frames, self.frames[0] + peaks)
         one = replace(earlier, norm=earlier.norm[part], frames=earlier.frames[part])
         share = _correlated(gone, earlier.squares, first - earlier.margin)[origin + peaks]
-        # Correlations by Fourier transforms are not exactly zero where no frame contributes.
-        changed = share > IRREGULAR * float(earlier.squares.sum())
-        self._solve(one, changed, process, variance, shape, first, peaks)
+        self._solve(one, share > CHANGED * one.irregular, process, variance, shape, first, peaks)
         return one
 
     def _solve(
