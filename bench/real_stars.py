@@ -247,6 +247,8 @@ def short(number: int, seed: int) -> Iterator[Trial]:
             rng = np.random.default_rng([seed, 2, index, k])
             after = rng.uniform(0.2, 1.2) if kind == "cut-end" else between(rng, 1.2, 20)
             before = -rng.uniform(0.1, 1.5) if kind == "cut-start" else between(rng, 2, 10)
+            # A window that begins after the peak ends half a half-width later at least.
+            after = max(after, 0.5 - before)
             # At least 60 frames, of 5 s.
             cadence, least = 5.0, 5 * 60 / (before + after)
             half_width = between(rng, max(20.0, least), max(600.0, 1.5 * least))
