@@ -21,6 +21,8 @@ Bool = NDArray[np.bool_]
 #: Share of the frames in events of a star whose light is constant, and of one that rotates, and noise relative to the
 #: stated one, above which losses are tried (assumed).
 MOST_FLARING, MOST_ACTIVE, MOST_EXCESS = 0.1, 0.3, 1.5
+#: Largest share of the frames in losses; more of them are the level of the star, before or after a step (assumed).
+MOST_LOST = 0.4
 #: Standard deviations of a frame above the median of a constant light from which frames belong to flares; their number
 #: before and, relative to the length, after the bright frames; the largest share of such frames (assumed).
 BRIGHT, BEFORE, DECAY, MOST_BRIGHT = 4.0, 2, 3, 0.3
@@ -73,7 +75,7 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool) -> Bo
     down = replace(survey.inverted(), bank=bank_of(survey.stare, survey.bank.directions, Loss()))
     # Losses in independent noise are the first guess: a process that is fitted to losses would hide them.
     other, losses = alternate(down, detect_events(down, PROVISIONAL)[1])
-    if losses.any() and criterion(other, losses, shapeless=True) < criterion(fitted, taken):
+    if 0 < losses.mean() < MOST_LOST and criterion(other, losses, shapeless=True) < criterion(fitted, taken):
         none[dark] = losses
     return none
 
