@@ -102,8 +102,8 @@ def axis_of(header: Any, primary: Any, n: int) -> tuple[Any, str | None, str, tu
     # A missing CRPIX1 is 0 by the FITS standard, but archives' spectra without it start at their first pixel.
     reference = number("CRPIX1")
     pixel = np.arange(1, n + 1) - (1.0 if reference is None else reference)
-    kind, unit = (text_at(header, key) or text_at(primary, key) or None for key in ("CTYPE1", "CUNIT1"))
-    kind = (kind or "").upper()
+    kind = (text_at(header, "CTYPE1") or text_at(primary, "CTYPE1")).upper()
+    unit = text_at(header, "CUNIT1") or text_at(primary, "CUNIT1") or None
     value = start + step * pixel
     name, _, algorithm = kind.partition("-")
     if algorithm.strip("-") not in ("", "LOG", "LAMBDA", "LINEAR") or (

@@ -110,8 +110,7 @@ class Analysis:
             lines.append(f"{np.count_nonzero(reasons)} of {reasons.size} frames are not searched; the table of frames "
                          "states the reason of each.")  # fmt: skip
         if lost := np.count_nonzero(reasons & Reason.LOSS):
-            lines.append(f"The light is suddenly lost in {lost} of {reasons.size} frames, as by pointing losses or "
-                         "eclipses; these frames are not searched.")  # fmt: skip
+            lines.append(f"In {lost} of these frames light is suddenly lost, as by pointing losses or eclipses.")
         if self.level.excess > 1.2:
             lines.append(f"The scatter of quiescent frames is {self.level.excess:.2f} times the stated errors; the "
                          "measured scatter is used.")  # fmt: skip

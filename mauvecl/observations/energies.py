@@ -342,11 +342,8 @@ def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: De
 
     Parameters
     ----------
-    taken : ndarray of bool, shape (n_frame,)
-        Frames of all events.
-    flux_level : ndarray, shape (n_frame,)
-        Quiescent level of the flux, in units of the survey's scale.
-    one : Detection
+    survey, taken, flux_level, one
+        As for `measure_event`.
     """
     shapes = [survey.bank.shape, *(SHAPES[name] for name in AVERAGED if SHAPES[name] is not survey.bank.shape)]
     shapes = list({shape.name: shape for shape in shapes}.values())

@@ -141,8 +141,7 @@ class Frames:
             raise _bad(name, "shape", (time.shape, light.shape), "times of shape (n,), flux of (n,) or (n, n_pixel)")
         if not MIN_FRAMES <= n <= MAX_FRAMES:
             raise _bad(name, "frames", n, f"{MIN_FRAMES} to {MAX_FRAMES} frames")
-        finite = light[np.isfinite(light)]
-        if (beyond := finite[np.abs(finite) > MAX_FLUX]).size:
+        if (beyond := light[np.isfinite(light) & (np.abs(light) > MAX_FLUX)]).size:
             raise _bad(name, "flux", f"{beyond[0]:g}", f"values between -{MAX_FLUX:g} and {MAX_FLUX:g}")
         if not np.isfinite(time).all():
             raise _bad(name, "time", f"{time[~np.isfinite(time)][0]} in row {int(np.argmin(np.isfinite(time)))}",

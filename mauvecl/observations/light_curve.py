@@ -59,11 +59,12 @@ def survey_light_curve(frames: Frames, shape: Shape, seed: int) -> tuple[SeriesS
         reasons[spikes(frames.numbers, flux, error, reasons == 0)] |= Reason.SPIKE
     used = reasons == 0
     guessed = np.zeros(flux.size, np.bool_)
-    guessed[used] = guess_flares(frames.numbers[used], flux[used])
-    level = np.full(flux.size, _mean(flux[used & ~guessed]))
     survey: SeriesSurvey | None = None
     for number in range(ROUNDS):
         used = reasons == 0
+        if survey is None:
+            guessed[used] = guess_flares(frames.numbers[used], flux[used])
+            level = np.full(flux.size, _mean(flux[used & ~guessed]))
         quiet = used & ~guessed
         variance, photon = _noise(frames, flux, error, level, quiet, counts)
         typical = float(np.median(level[quiet]))
@@ -71,9 +72,7 @@ def survey_light_curve(frames: Frames, shape: Shape, seed: int) -> tuple[SeriesS
         survey, taken = fit_quiet_light(new, guessed[used], survey)
         if number == 0 and counts is None and (lost := sudden_losses(new, survey, taken)).any():
             reasons[used] |= np.where(lost, Reason.LOSS, 0)
-            used = reasons == 0
-            guessed[used] = guess_flares(frames.numbers[used], flux[used])
-            level, survey = np.full(flux.size, _mean(flux[used & ~guessed])), None
+            survey = None
             continue
         level = level_of(frames, flux, used, survey, ~taken)
         sd = np.sqrt(variance) * survey.flux_process.excess

@@ -85,9 +85,8 @@ class SolvedNorms:
 class FrameGrid:
     """Numbers of frames with shortened gaps: no template reaches over a long gap, whose frames only take memory."""
 
-    # Shape (n_gap,); number after the middle of each shortened gap, and frames that it and those before it lack.
-    middle: NDArray[np.int64]
-    lacking: NDArray[np.int64]
+    middle: NDArray[np.int64]  # shape (n_gap,); middle of each shortened gap on the grid
+    lacking: NDArray[np.int64]  # shape (n_gap + 1,); frames that all gaps before each part of the grid lack
 
     @classmethod
     def of(cls, numbers: NDArray[np.int64], bank: Bank) -> FrameGrid:
@@ -95,18 +94,18 @@ class FrameGrid:
         longest = 2 * max(abs(one.first) + one.shapes.shape[1] for one in bank.templates)
         steps = np.diff(numbers)
         long = np.flatnonzero(steps > longest)
-        lacking = np.cumsum(steps[long] - longest)
-        return cls(numbers[long] + longest // 2 - np.concatenate([[0], lacking])[:-1], lacking)
+        lacking = np.concatenate([[0], np.cumsum(steps[long] - longest)])
+        return cls(numbers[long] + longest // 2 - lacking[:-1], lacking)
 
     def shortened(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the numbers of frames on the grid."""
-        part = np.searchsorted(self.middle + np.concatenate([[0], self.lacking])[:-1], numbers, side="right")
-        return np.asarray(numbers - np.concatenate([[0], self.lacking])[part])
+        part = np.searchsorted(self.middle + self.lacking[:-1], numbers, side="right")
+        return np.asarray(numbers - self.lacking[part])
 
     def numbers(self, shortened: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the numbers of places on the grid; a gap belongs to the frames next to each of its halves."""
         part = np.searchsorted(self.middle, shortened, side="right")
-        return np.asarray(shortened + np.concatenate([[0], self.lacking])[part])
+        return np.asarray(shortened + self.lacking[part])
 
 
 class ProcessSearch:
