@@ -113,6 +113,25 @@ def test_page_and_command_line_give_the_same_bits(page: Page, tmp_path: Path) ->
     page.get_by_role("button", name="Open run 1").wait_for()
 
 
+def test_legends_keep_their_lines_when_an_entry_appears(page: Page) -> None:
+    """Compare the heights of a legend, at every width, while its entry is absent and when it is shown."""
+    enter(page, "Flare amplitude", "1.9")
+    page.locator("#figure-excess .legend li:visible", has_text="drawn exposure").wait_for()
+    heights = """absent => {
+        const legend = document.querySelector("#figure-excess .legend")
+        const entry = [...legend.children].find(item => item.textContent == "drawn exposure")
+        entry.classList.toggle("absent", absent)
+        legend.style.alignSelf = "end"
+        return [...Array(60).keys()].map(k => {
+            legend.style.width = `${150 + 10 * k}px`
+            return legend.offsetHeight
+        })
+    }"""
+    shown = page.evaluate(heights, False)
+    assert len(set(shown)) > 2, "the widths wrap it differently"
+    assert page.evaluate(heights, True) == shown
+
+
 def test_pictures_are_drawn_and_downloaded(page: Page) -> None:
     tab(page, "Spectrum")
     page.locator("#figure-recorded .legend li:visible", has_text="drawn exposure").wait_for()
@@ -321,6 +340,7 @@ def test_click_on_the_map_sets_the_question(page: Page) -> None:
 
 def test_invalid_field_removes_the_answer(page: Page) -> None:
     before = shown(page)
+    page.locator("#plot-excess .bk-Figure").wait_for()
     place = "document.querySelector('#plot-excess').getBoundingClientRect().y + scrollY"
     top = page.evaluate(place)
     for label, wrong, right, reported in (

@@ -148,13 +148,15 @@ class Picture {
     this.some()
   }
 
-  // The legend holds what is there to be seen; what is not there yet has its room, so that nothing jumps.
+  // The legend holds what is there to be seen. What is not there yet keeps its room at the end of the legend, and
+  // stays at the end when it comes, so that the lines of the legend break at the same entries and nothing jumps.
   some() {
     const empty = new Set(this.figure?.empty ?? [])
     for (const item of every(".legend li", this.frame)) {
       const {shows, called} = item.dataset
       item.hidden = shows !== "" && shows !== "if any" && !this.wanted.has(shows)
-      item.classList.toggle("absent", empty.has(called))
+      const absent = item.classList.toggle("absent", empty.has(called))
+      if (absent) item.classList.add("late")
     }
   }
 
