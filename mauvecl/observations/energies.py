@@ -124,6 +124,8 @@ class Window:
     inside: Bool  # shape (n,); bins of the event
     scale: float  # value of unit amplitude
     photon: float  # rise of the variance of a frame with the amplitude
+    #: Level of the star at the peak by the frames without events, in units of the survey's level.
+    quiet_level: float = 1.0
 
     @classmethod
     def of(cls, survey: SeriesSurvey, taken: Bool, one: Detection, direction: int | None = None) -> Window:
@@ -274,6 +276,15 @@ class Likelihood:
         slope = np.where(information > least, models @ (self.inverse @ values), 0.0)
         return slope, np.maximum(information, least)
 
+    def level_without(self, light: Float) -> Float:
+        """Return the level of the star at the peak without the light of flares, shape (n,) or (k, n).
+
+        The frames without events decide where the values are not the star's light, or leave no level above zero. Near a
+        bright flare they hold its tail, which raises their level.
+        """
+        fitted = (self.window.values - light) @ self.level
+        return np.where(fitted > 0, fitted, self.window.quiet_level)
+
     def chi2(self, model: Float) -> Float:
         """Return chi-squared of the values with models, of shape (n,) or (k, n), added to the level."""
         left = self.window.values - model
@@ -347,10 +358,9 @@ def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: De
     """
     shapes = [survey.bank.shape, *(SHAPES[name] for name in AVERAGED if SHAPES[name] is not survey.bank.shape)]
     shapes = list({shape.name: shape for shape in shapes}.values())
-    window = Window.of(survey, taken, one)
     peak = int(np.clip(np.searchsorted(survey.stare.middle_s, one.peak_s), 0, survey.stare.n_frames - 1))
     level = float(flux_level[peak]) * survey.scale / survey.level
-    level = level if level > 0 else 1.0
+    window = replace(Window.of(survey, taken, one), quiet_level=level if level > 0 else 1.0)
     directions = _directions(survey, taken, one)
     parts, weights, fits = [], [], []
     for shape in shapes:
@@ -374,16 +384,17 @@ def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: De
     plain = Likelihood.of(window, flares, shape, 0.0)
     model = sum((f.amplitude * window.model(shape, np.array([f.peak_s]), np.array([f.half_width_s]))[0]
                  for f in flares), np.zeros(window.values.size))  # fmt: skip
+    level = float(plain.level_without(model))
     summed, error = _summed(survey, taken, flux_level, one)
     frame_s = survey.stare.frame_s
     start = survey.stare.start_s[one.first : one.last + 1]
     edges = np.column_stack([start, start + frame_s])
     within = sum(float(f.amplitude * shape.mean_over(edges, f.peak_s, f.half_width_s).sum()) * frame_s for f in flares)
-    ends = [[mixture.quantile(0.5 + sign * width / 2) / level for width in LEVELS] for sign in (-1, 1)]
+    ends = [[mixture.quantile(0.5 + sign * width / 2) for width in LEVELS] for sign in (-1, 1)]
     apart_s = np.abs(survey.stare.middle_s[one.first : one.last + 1] - flares[0].peak_s)
     observed = bool((apart_s <= 1.5 * frame_s).any())
     return Energy(
-        summed / level, error / level, within / level, mixture.quantile(0.5) / level, (ends[0][0], ends[0][1]),
+        summed / level, error / level, within / level, mixture.quantile(0.5), (ends[0][0], ends[0][1]),
         (ends[1][0], ends[1][1]),
         tuple(replace(f, amplitude=f.amplitude / level, equivalent_duration_s=f.equivalent_duration_s / level)
               for f in flares), shape.name, float(plain.chi2(model)), window.values.size - 1 - 3 * len(flares),
@@ -606,11 +617,12 @@ def _posterior(
     toward = likelihood.inverse @ likelihood.departure
     model = window.model(shape, grid.peaks_s, grid.half_widths_s)
     per_amplitude = grid.half_widths_s * shape.equivalent_duration - model @ toward
-    mean = grid.amplitude * per_amplitude + float(toward @ window.values)
+    level = likelihood.level_without(grid.amplitude[:, None] * model)
+    mean = (grid.amplitude * per_amplitude + float(toward @ window.values)) / level
     left = max(likelihood.variance - float(toward @ likelihood.departure), 0.0)
     # Durations are relative to the level, which is lower where the flare is brighter.
     along = per_amplitude + mean * (model @ likelihood.level)
-    sd = np.sqrt(along**2 / grid.information + left + mean**2 * likelihood.level_variance)
+    sd = np.sqrt(along**2 / grid.information + left + mean**2 * likelihood.level_variance) / level
     constant = likelihood.log_factor - 0.5 * float(window.values @ likelihood.inverse @ window.values)
     return Mixture(grid.log + constant, mean, sd), flares
 
@@ -644,13 +656,14 @@ def _linearised(
     gradient[0::3] = gradient[2::3] = total
     toward = likelihood.inverse @ likelihood.departure
     along = gradient - jacobian @ toward
-    mean = float(total.sum() + toward @ (window.values - light))
+    level = float(likelihood.level_without(light))
+    mean = float(total.sum() + toward @ (window.values - light)) / level
     # Durations are relative to the level, which is lower where the flares are brighter.
     along += mean * (jacobian @ likelihood.level)
     left = max(likelihood.variance - float(toward @ likelihood.departure), 0.0)
     variance = float(along @ covariance @ along) + left + mean**2 * likelihood.level_variance
     log = likelihood.log_factor - 0.5 * float(likelihood.chi2(light)) + 0.5 * float(np.linalg.slogdet(covariance)[1])
-    return Mixture(np.array([log]), np.array([mean]), np.array([np.sqrt(variance)])), flares
+    return Mixture(np.array([log]), np.array([mean]), np.array([np.sqrt(variance) / level])), flares
 
 
 def _summed(survey: SeriesSurvey, taken: Bool, level: Float, one: Detection) -> tuple[float, float]:
