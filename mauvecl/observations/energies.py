@@ -124,8 +124,7 @@ class Window:
     inside: Bool  # shape (n,); bins of the event
     scale: float  # value of unit amplitude
     photon: float  # rise of the variance of a frame with the amplitude
-    #: Level of the star at the peak by the frames without events, in units of the survey's level.
-    quiet_level: float = 1.0
+    quiet_level: float = 1.0  # of the star at the peak, by the frames without events, in units of the survey's level
 
     @classmethod
     def of(cls, survey: SeriesSurvey, taken: Bool, one: Detection, direction: int | None = None) -> Window:
@@ -277,10 +276,10 @@ class Likelihood:
         return slope, np.maximum(information, least)
 
     def level_without(self, light: Float) -> Float:
-        """Return the level of the star at the peak without the light of flares, shape (n,) or (k, n).
+        """Return the level of the star at the peak once the light of flares, shape (n,) or (k, n), is subtracted.
 
-        The frames without events decide where the values are not the star's light, or leave no level above zero. Near a
-        bright flare they hold its tail, which raises their level.
+        The tail of a bright flare raises the level of the frames without events. That level is returned only where the
+        values are not the star's light, or where the fitted level is not above zero.
         """
         fitted = (self.window.values - light) @ self.level
         return np.where(fitted > 0, fitted, self.window.quiet_level)

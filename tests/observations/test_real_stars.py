@@ -174,7 +174,7 @@ def test_window_that_begins_in_a_tail_has_the_energy_relative_to_the_star(
 ) -> None:
     """Observe 700 s of the tail of a bright flare: the frames without its event hold more light than the star's.
 
-    The 95 % interval of one of the three misses the truth with a probability of 0.14; five standard errors are tested.
+    The energy lies within five standard errors, which a normal error exceeds once in 1.7 million cases.
     """
     rng, frame_s, noise = np.random.default_rng([402, seed]), 5.0, 0.007
     time = (np.arange(140) + 0.5) * frame_s
