@@ -8,8 +8,9 @@ The level has the covariance of the process of the star. The departure d of a fl
 of standard deviation epsilon in the logarithm of the time from the peak (a model discrepancy as of Kennedy & O'Hagan
 2001, doi 10.1111/1467-9868.00294). It makes the sum of the observed light decide where a flare is bright, and the
 shape where it is not observed. Peak and half-width of a single flare are integrated on a grid, amplitudes, level and
-departures in closed form; shapes and epsilon are averaged with the weights of their marginal likelihoods. Several
-flares are fitted by least squares, and their errors are those of the linearised model.
+departures in closed form; the shapes of `families` and epsilon are averaged with the weights of their marginal
+likelihoods. Several flares of a published shape are fitted by least squares, and their errors are those of the
+linearised model. Priors are flat in the peak and in the logarithms of half-width and amplitude.
 """
 
 from __future__ import annotations
@@ -23,28 +24,32 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.flares.shapes import SHAPES, Shape, between, sides
+from mauvecl.lightcurve.flares.shapes import Integrable, Shape, between, consecutive_integrals, sides
+from mauvecl.observations.families import Family, WeightedSum, families
 from mauvecl.observations.search import MIN_BASELINE
 
 if TYPE_CHECKING:
     from mauvecl.observations.process import Process
     from mauvecl.observations.search import Detection, SeriesSurvey
 
+Profile = Shape | WeightedSum
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-#: Departures of flares from their shape, and their prior weights (assumed).
-EPSILON, EPSILON_WEIGHTS = (0.0, 0.02, 0.06, 0.2), (0.25, 0.25, 0.25, 0.25)
 #: Correlation of departures in the logarithm of 1 + time from the peak in half-widths (assumed).
 LOG_TIME = 0.7
-#: Shapes that are averaged, besides that of the search.
-AVERAGED = ("davenport2014", "tovarmendoza2022")
+#: Light that departs where a shape has none, as a share of the amplitude at the peak (assumed); it falls by e in each
+#: half-width.
+FLOOR = 0.1
 #: Largest number of bins in an event, and on each side of it; growth of the bins with the distance from the peak.
-MAX_INSIDE, MAX_OUTSIDE, GROWTH = 400, 120, 6.0
+MAX_INSIDE, MAX_OUTSIDE, GROWTH = 160, 80, 6.0
 #: Bins outside are shorter than this share of the shortest time scale of the process.
 SHORT = 0.2
-#: Nodes of the grid in peak and half-width, and the fall of the log posterior beyond which nodes are neglected.
-NODES, NEGLIGIBLE = 25, 14.0
+#: Nodes of the grid along peak and half-width for a shape and for many, and the fall of the log posterior beyond
+#: which nodes are neglected.
+NODES, NODES_OF_MANY, NEGLIGIBLE = 25, 17, 14.0
+#: Logarithm of the largest amplitude in units of the range of the frames of the event, for a peak that is not seen.
+MAX_LOG_AMPLITUDE = 5.0
 #: Largest number of refinements of the grid.
 REFINEMENTS = 6
 #: First range of the peak, in half-widths of the template, and factor on the half-width.
@@ -60,8 +65,9 @@ STEP_GAIN = 9.0
 LACKING_ERRORS, LACKING_SHARE = 5.0, 0.5
 #: Levels of the intervals.
 LEVELS = (0.6826894921370859, 0.95)
-#: Rounds in which the photon noise and the departures follow the fit.
-ROUNDS = 3
+#: Rounds in which the photon noise and the departures follow the fit, and the change of the logarithm of the equivalent
+#: duration at which they end.
+ROUNDS, SETTLED = 3, 0.02
 #: Number of frames on each side of an event from which the error of its level follows.
 NEARBY = 10_000
 
@@ -183,7 +189,7 @@ class Window:
             total += weight**2 * process.at(lags)
         return total
 
-    def model(self, shape: Shape, peak_s: Float, half_width_s: Float) -> Float:
+    def model(self, shape: Integrable, peak_s: Float, half_width_s: Float) -> Float:
         """Return the mean of shapes in the bins, in the unit of the values, (n_shape, n)."""
         times, place = self._times
         peak, width = (np.atleast_1d(one)[:, None] for one in (peak_s, half_width_s))
@@ -230,7 +236,7 @@ class Likelihood:
     level_variance: float
 
     @classmethod
-    def of(cls, window: Window, flares: Sequence[FittedFlare], shape: Shape, epsilon: float) -> Likelihood:
+    def of(cls, window: Window, flares: Sequence[FittedFlare], shape: Profile, epsilon: float) -> Likelihood:
         """Compute the likelihood for the photon noise of some flares and departures from their shape."""
         n = window.values.size
         covariance = window.process + np.diag(window.noise)
@@ -239,6 +245,7 @@ class Likelihood:
             light = one.amplitude * window.model(shape, np.array([one.peak_s]), np.array([one.half_width_s]))[0]
             covariance += np.diag(window.photon * light / window.scale / window.frames)
             if epsilon:
+                light = light + _floor(window.middle, one) * window.scale
                 cells, cell_light = _unobserved(window, one, shape)
                 place = _log_time(window.middle, one)
                 elsewhere = _log_time(cells, one)
@@ -265,14 +272,23 @@ class Likelihood:
         log_factor = -float(np.log(np.diag(factor[0])).sum()) - 0.5 * float(np.log(total))
         return cls(window, inverse, log_factor, shared, variance, level, level_variance)
 
-    def matched(self, models: Float, values: Float) -> tuple[Float, Float]:
-        """Return the products of models and values, and of models with themselves, shape (n_model,).
+    def matched(self, parts: Float, weights: Float, values: Float) -> tuple[Float, Float]:
+        """Return the products of models and values, and of models with themselves, shape (n_shape, n_node).
 
-        The first is zero for models that are constant but for rounding errors, as bright in all bins as the level.
+        Models are sums of parts, shape (n_part, n_node, n), with weights, shape (n_shape, n_part). The first product is
+        zero for models that are constant but for rounding errors, as bright in all bins as the level.
         """
-        information = np.einsum("ki,ki->k", models @ self.inverse, models)
-        least = np.maximum(1e-9 * models**2 @ np.diag(self.inverse), 1e-300)
-        slope = np.where(information > least, models @ (self.inverse @ values), 0.0)
+
+        # A shape has few of the parts.
+        pairs = scipy.sparse.csr_array((weights[:, :, None] * weights[:, None]).reshape(len(weights), -1))
+
+        def norms(weighted: Float) -> Float:
+            gram = weighted.transpose(1, 0, 2) @ parts.transpose(1, 2, 0)
+            return np.asarray(pairs @ gram.reshape(len(gram), -1).T)
+
+        information = norms((parts.reshape(-1, values.size) @ self.inverse).reshape(parts.shape))
+        least = np.maximum(1e-9 * norms(parts * np.diag(self.inverse)), 1e-300)
+        slope = np.where(information > least, weights @ (parts @ (self.inverse @ values)), 0.0)
         return slope, np.maximum(information, least)
 
     def level_without(self, light: Float) -> Float:
@@ -295,7 +311,12 @@ def _log_time(time_s: Float, one: FittedFlare) -> Float:
     return np.asarray(np.sign(tau) * np.log1p(np.abs(tau)))
 
 
-def _unobserved(window: Window, one: FittedFlare, shape: Shape) -> tuple[Float, Float]:
+def _floor(time_s: Float, one: FittedFlare) -> Float:
+    """Return the light of a flare that may be where its shape has none."""
+    return np.asarray(FLOOR * one.amplitude * np.exp(-np.abs(time_s - one.peak_s) / one.half_width_s))
+
+
+def _unobserved(window: Window, one: FittedFlare, shape: Profile) -> tuple[Float, Float]:
     """Return middles of intervals without bins near a flare, and the light of the flare in them, in amplitude x s."""
     tau = np.concatenate([-np.geomspace(REACH[0], 0.05, 12), [0.0], np.geomspace(0.05, REACH[1], 24)])
     edges = np.unique(np.concatenate([one.peak_s + tau * one.half_width_s, window.edges.ravel()]))
@@ -306,8 +327,8 @@ def _unobserved(window: Window, one: FittedFlare, shape: Shape) -> tuple[Float, 
     middle = (edges[:-1] + edges[1:]) / 2
     place = np.searchsorted(window.edges[:, 0], middle, side="right") - 1
     seen = (place >= 0) & (middle < window.edges[np.maximum(place, 0), 1])
-    mean = shape.mean_over(edges, one.peak_s, one.half_width_s)
-    light = one.amplitude * mean * np.diff(edges)
+    integrals = consecutive_integrals(shape, (edges - one.peak_s) / one.half_width_s)
+    light = one.amplitude * one.half_width_s * integrals + _floor(middle, one) * np.diff(edges)
     return middle[~seen], light[~seen]
 
 
@@ -339,12 +360,37 @@ class Mixture:
         ) if high > low else low  # fmt: skip
 
 
-def _joined(parts: Sequence[Mixture], log_weights: Sequence[float]) -> Mixture:
-    return Mixture(
-        np.concatenate([part.log_weight + w for part, w in zip(parts, log_weights, strict=True)]),
-        np.concatenate([part.mean for part in parts]),
-        np.concatenate([part.sd for part in parts]),
-    )
+def _joined(parts: Sequence[Mixture]) -> Mixture:
+    """Return the mixture of several."""
+    names = ("log_weight", "mean", "sd")
+    return Mixture(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Fit of an event by flares of a family with some departure from their shape."""
+
+    mixture: Mixture
+    shape: Profile  # the best of the family
+    flares: list[FittedFlare]  # the best, of that shape
+    epsilon: float
+
+
+def _fits(window: Window, searched: Shape) -> list[Fit]:
+    """Fit an event by a single flare of each family, and by several flares of each published shape that needs them."""
+    *published, general = families(searched)
+    first = {family.name: _first_fit(window, family) for family in published}
+    fits = []
+    for family in published:
+        grid = first[family.name]
+        shape, flare = grid.best
+        fits += _single(window, family, shape, flare, grid.box)
+        several = _further(window, shape, [flare])
+        if len(several) > 1:
+            fits += _several(window, family, several)
+    best = max(first.values(), key=lambda grid: float(scipy.special.logsumexp(grid.log)))
+    boxes = np.array([grid.box for grid in first.values()])
+    return fits + _single(window, general, *best.best, _wider(boxes))
 
 
 def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: Detection) -> Energy:
@@ -355,40 +401,29 @@ def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: De
     survey, taken, flux_level, one
         As for `measure_event`.
     """
-    shapes = [survey.bank.shape, *(SHAPES[name] for name in AVERAGED if SHAPES[name] is not survey.bank.shape)]
-    shapes = list({shape.name: shape for shape in shapes}.values())
     peak = int(np.clip(np.searchsorted(survey.stare.middle_s, one.peak_s), 0, survey.stare.n_frames - 1))
     level = float(flux_level[peak]) * survey.scale / survey.level
     window = replace(Window.of(survey, taken, one), quiet_level=level if level > 0 else 1.0)
     directions = _directions(survey, taken, one)
-    parts, weights, fits = [], [], []
-    for shape in shapes:
-        flares, box = _first_fit(window, shape)
-        flares = _further(window, shape, flares)
-        for epsilon, prior in zip(EPSILON, EPSILON_WEIGHTS, strict=True):
-            posterior, flares_of = _posterior(window, shape, flares, epsilon, box)
-            parts.append(posterior)
-            weights.append(float(np.log(prior)) + _log_prior(len(flares_of)))
-            fits.append((shape, flares_of, epsilon))
-    totals = np.array([part.log_total + w for part, w in zip(parts, weights, strict=True)])
-    share = np.exp(totals - totals.max())
-    share /= share.sum()
-    mixture = _joined(parts, weights)
-    best = int(np.argmax(totals))
-    shape, flares, _ = fits[best]
+    fits = _fits(window, survey.bank.shape)
+    mixture = _joined([fit.mixture for fit in fits])
+    totals = np.array([fit.mixture.log_total for fit in fits])
+    share = np.exp(totals - mixture.log_total)
+    best = fits[int(np.argmax(totals))]
+    shape, flares = best.shape, best.flares
     if len(directions) > 1:
         # Flares of other temperatures have another light for the same sum.
-        mixture = _joined([Mixture(mixture.log_weight, factor * mixture.mean, factor * mixture.sd)
-                           for _, factor in directions], [weight for weight, _ in directions])  # fmt: skip
+        mixture = _joined([Mixture(mixture.log_weight + weight, factor * mixture.mean, factor * mixture.sd)
+                           for weight, factor in directions])  # fmt: skip
     plain = Likelihood.of(window, flares, shape, 0.0)
-    model = sum((f.amplitude * window.model(shape, np.array([f.peak_s]), np.array([f.half_width_s]))[0]
-                 for f in flares), np.zeros(window.values.size))  # fmt: skip
+    model = _light(window, shape, flares)
     level = float(plain.level_without(model))
     summed, error = _summed(survey, taken, flux_level, one)
     frame_s = survey.stare.frame_s
     start = survey.stare.start_s[one.first : one.last + 1]
-    edges = np.column_stack([start, start + frame_s])
-    within = sum(float(f.amplitude * shape.mean_over(edges, f.peak_s, f.half_width_s).sum()) * frame_s for f in flares)
+    within = sum(f.amplitude * f.half_width_s * float(between(
+        sides(shape, (start - f.peak_s) / f.half_width_s), sides(shape, (start + frame_s - f.peak_s) / f.half_width_s)
+    ).sum()) for f in flares)  # fmt: skip
     ends = [[mixture.quantile(0.5 + sign * width / 2) for width in LEVELS] for sign in (-1, 1)]
     apart_s = np.abs(survey.stare.middle_s[one.first : one.last + 1] - flares[0].peak_s)
     observed = bool((apart_s <= 1.5 * frame_s).any())
@@ -397,7 +432,7 @@ def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: De
         (ends[1][0], ends[1][1]),
         tuple(replace(f, amplitude=f.amplitude / level, equivalent_duration_s=f.equivalent_duration_s / level)
               for f in flares), shape.name, float(plain.chi2(model)), window.values.size - 1 - 3 * len(flares),
-        float(share @ np.array([epsilon for *_, epsilon in fits])),
+        float(share @ np.array([fit.epsilon for fit in fits])),
         _is_step(window, plain, float(plain.chi2(model)), len(flares)), observed, level,
     )  # fmt: skip
 
@@ -415,12 +450,7 @@ def flares_of(survey: SeriesSurvey, taken: Bool, one: Detection) -> tuple[list[F
     """
     window = Window.of(survey, taken, one)
     shape = survey.bank.shape
-    return _further(window, shape, _first_fit(window, shape)[0]), window.scale, window.photon
-
-
-def _log_prior(n_flares: int) -> float:
-    """Return the logarithm of the prior weight of a number of flares."""
-    return -float(n_flares - 1)
+    return _further(window, shape, [_first_fit(window, Family.of(shape, 1.0)).best[1]]), window.scale, window.photon
 
 
 def _directions(survey: SeriesSurvey, taken: Bool, one: Detection) -> list[tuple[float, float]]:
@@ -444,7 +474,7 @@ def _directions(survey: SeriesSurvey, taken: Bool, one: Detection) -> list[tuple
             for value, scale in scores if value > 0]  # fmt: skip
 
 
-def _flare(shape: Shape, peak: float, width: float, amplitude: float) -> FittedFlare:
+def _flare(shape: Profile, peak: float, width: float, amplitude: float) -> FittedFlare:
     return FittedFlare(
         float(peak), float(amplitude), float(width), float(amplitude * width * shape.equivalent_duration)
     )
@@ -452,9 +482,13 @@ def _flare(shape: Shape, peak: float, width: float, amplitude: float) -> FittedF
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Log posterior of a single flare at nodes of peak and half-width."""
+    """Posterior of a single flare of a family at nodes of peak and half-width that are not negligible."""
 
-    # Peaks, half-widths, log posteriors, amplitudes and their information, shape (n_node,).
+    family: Family
+    parts: Float  # means of the parts of the family in the bins at all nodes, shape (n_part, n_node, n)
+    # Shape and node, peak, half-width, log posterior, amplitude and its information, shape (n,).
+    shape: NDArray[np.intp]
+    node: NDArray[np.intp]
     peaks_s: Float
     half_widths_s: Float
     log: Float
@@ -462,13 +496,19 @@ class Grid:
     information: Float
     box: Float  # range of the peak and of the logarithm of the half-width outside which it is negligible, (2, 2)
 
-    def best(self, shape: Shape) -> FittedFlare:
-        """Return the flare of the largest posterior."""
+    @property
+    def best(self) -> tuple[Profile, FittedFlare]:
+        """Shape and flare of the largest posterior."""
         k = int(np.argmax(self.log))
-        return _flare(shape, self.peaks_s[k], self.half_widths_s[k], max(self.amplitude[k], 1e-12))
+        shape = self.family.shape(int(self.shape[k]))
+        return shape, _flare(shape, self.peaks_s[k], self.half_widths_s[k], max(self.amplitude[k], 1e-12))
+
+    def along(self, weights: Float) -> Float:
+        """Return the sums of the means over the bins with weights, for unit amplitude, shape (n,)."""
+        return np.asarray((self.family.weights @ (self.parts @ weights))[self.shape, self.node])
 
     @classmethod
-    def of(cls, likelihood: Likelihood, shape: Shape, box: Float, outer: Float) -> Grid:
+    def of(cls, likelihood: Likelihood, family: Family, box: Float, outer: Float) -> Grid:
         """Compute the posterior on a grid that is refined or widened until it covers all that is not negligible.
 
         Parameters
@@ -477,18 +517,25 @@ class Grid:
             First and largest range of the peak and of the logarithm of the half-width.
         """
         window = likelihood.window
+        n_node = NODES if len(family.weights) == 1 else NODES_OF_MANY
+        brightest = np.exp(MAX_LOG_AMPLITUDE) * float(np.ptp(window.values[window.inside])) / window.scale
         for _ in range(REFINEMENTS):
-            axes = [np.linspace(low, high, NODES) for low, high in box]
+            axes = [np.linspace(low, high, n_node) for low, high in box]
             p, w = (each.ravel() for each in np.meshgrid(axes[0], axes[1], indexing="ij"))
-            model = window.model(shape, p, np.exp(w))
-            slope, information = likelihood.matched(model, window.values)
-            step = (box[:, 1] - box[:, 0]) / (NODES - 1)
-            # A flat prior on the equivalent duration and on the logarithm of the half-width.
-            log = np.where(slope > 0, 0.5 * slope**2 / information, -1e300) - 0.5 * np.log(information) - w
-            log += float(np.log(step).sum())
-            found = cls(p, np.exp(w), log, slope / information, information, box)
-            near = log >= log.max() - NEGLIGIBLE
-            ends = np.array([[p[near].min(), p[near].max()], [w[near].min(), w[near].max()]])
+            parts = np.array([window.model(part, p, np.exp(w)) for part in family.parts])
+            slope, information = likelihood.matched(parts, family.weights, window.values)
+            amplitude = slope / information
+            step = (box[:, 1] - box[:, 0]) / (n_node - 1)
+            # The integral over the logarithm of the amplitude divides by the S/N.
+            snr = np.maximum(slope / np.sqrt(information), 1.0)
+            log = 0.5 * slope**2 / information - np.log(snr) + float(np.log(step).sum() - np.log(len(family.weights)))
+            log[(slope <= 0) | (amplitude > max(brightest, 1e-12))] = -1e300
+            which, node = np.nonzero(log >= log.max() - NEGLIGIBLE)
+            found = cls(
+                family, parts, which, node, p[node], np.exp(w[node]), log[which, node], amplitude[which, node],
+                information[which, node], box,
+            )  # fmt: skip
+            ends = np.array([[p[node].min(), p[node].max()], [w[node].min(), w[node].max()]])
             low, high = ends[:, 0] - step, ends[:, 1] + step
             # Where the posterior reaches an end, the grid is widened.
             wide = np.diff(box)[:, 0]
@@ -500,6 +547,12 @@ class Grid:
                 break
             box = new
         return found
+
+
+def _wider(boxes: Float) -> Float:
+    """Return a range that contains others, and half as much on each side."""
+    low, high = boxes[..., 0].min(axis=0), boxes[..., 1].max(axis=0)
+    return np.column_stack([low - (high - low) / 2, high + (high - low) / 2])
 
 
 def _ranges(window: Window) -> Float:
@@ -519,17 +572,15 @@ def _ranges(window: Window) -> Float:
     return np.array([[low, high], np.log(width)])
 
 
-def _first_fit(window: Window, shape: Shape) -> tuple[list[FittedFlare], Float]:
-    """Return the best single flare, and the range of its peak and half-width."""
+def _first_fit(window: Window, family: Family) -> Grid:
+    """Return the posterior of a single flare without departures from a shape."""
     outer = _ranges(window)
-    flares, box = list[FittedFlare](), outer
-    for _ in range(2):
-        grid = Grid.of(Likelihood.of(window, flares, shape, 0.0), shape, box, outer)
-        flares, box = [grid.best(shape)], grid.box
-    return flares, box
+    grid = Grid.of(Likelihood.of(window, [], family.shape(0), 0.0), family, outer, outer)
+    shape, flare = grid.best
+    return Grid.of(Likelihood.of(window, [flare], shape, 0.0), family, grid.box, outer)
 
 
-def _further(window: Window, shape: Shape, flares: list[FittedFlare]) -> list[FittedFlare]:
+def _further(window: Window, shape: Profile, flares: list[FittedFlare]) -> list[FittedFlare]:
     """Add flares to an event as long as they improve the fit, even if each departs from its shape."""
     frame_s = window.survey.stare.frame_s
     inside = window.middle[window.inside]
@@ -538,16 +589,16 @@ def _further(window: Window, shape: Shape, flares: list[FittedFlare]) -> list[Fi
     widths = np.geomspace(max(frame_s, 0.1 * flares[0].half_width_s), max(2 * frame_s, 3 * flares[0].half_width_s), 8)
     step = max(frame_s / 2, float(np.ptp(inside)) / 200)
     p, w = (grid.ravel() for grid in np.meshgrid(np.arange(inside[0], inside[-1], step), widths, indexing="ij"))
-    every = window.model(shape, p, w)
+    every = window.model(shape, p, w)[None]
     while len(flares) < MAX_FLARES:
         likelihood = Likelihood.of(window, flares, shape, FURTHER_EPSILON)
         light = _light(window, shape, flares)
-        slope, information = likelihood.matched(every, window.values - light)
-        gain = np.where(slope > 0, slope**2 / information, 0.0)
+        slope, information = likelihood.matched(every, np.ones((1, 1)), window.values - light)
+        gain = np.where(slope > 0, slope**2 / information, 0.0)[0]
         k = int(np.argmax(gain))
         if gain[k] < FURTHER_GAIN:
             break
-        more = [*flares, _flare(shape, p[k], w[k], slope[k] / information[k])]
+        more = [*flares, _flare(shape, p[k], w[k], slope[0, k] / information[0, k])]
         refined = _refined(likelihood, shape, more)
         fall = float(likelihood.chi2(light) - likelihood.chi2(_light(window, shape, refined)))
         if fall < FURTHER_GAIN:
@@ -556,18 +607,37 @@ def _further(window: Window, shape: Shape, flares: list[FittedFlare]) -> list[Fi
     return flares
 
 
-def _light(window: Window, shape: Shape, flares: Sequence[FittedFlare]) -> Float:
-    peak, width, amplitude = (
-        np.array([getattr(f, name) for f in flares]) for name in ("peak_s", "half_width_s", "amplitude")
-    )
-    return np.asarray(amplitude @ window.model(shape, peak, width))
+def _light(window: Window, shape: Profile, flares: Sequence[FittedFlare]) -> Float:
+    """Return the mean light of flares in the bins, in the unit of the values."""
+    return np.asarray(_lights(window, shape, _parameters(flares)).sum(axis=0))
+
+
+def _lights(window: Window, shape: Profile, parameters: Float) -> Float:
+    """Return the light of each flare, shape (n_flare, n), for the parameters of `_parameters`."""
+    amplitude, peak, width = parameters.reshape(-1, 3).T
+    return np.asarray(np.exp(amplitude)[:, None] * window.model(shape, peak, np.exp(width)))
+
+
+def _slopes(window: Window, shape: Profile, parameters: Float) -> Float:
+    """Return the derivatives of the light with the parameters of `_parameters`, shape (n_parameter, n)."""
+    rows = parameters.reshape(-1, 3)
+    steps = 1e-4 * np.column_stack([np.exp(rows[:, 2]), np.ones(len(rows))])
+    moved = np.repeat(rows[:, None], 4, axis=1)
+    moved[:, 0, 1] += steps[:, 0]
+    moved[:, 1, 1] -= steps[:, 0]
+    moved[:, 2, 2] += steps[:, 1]
+    moved[:, 3, 2] -= steps[:, 1]
+    light = _lights(window, shape, moved).reshape(len(rows), 4, -1)
+    along = (light[:, 0::2] - light[:, 1::2]) / (2 * steps[:, :, None])
+    return np.concatenate([_lights(window, shape, parameters)[:, None], along], axis=1).reshape(parameters.size, -1)
 
 
 def _parameters(flares: Sequence[FittedFlare]) -> Float:
+    """Return the logarithm of the amplitude, the peak and the logarithm of the half-width of each flare."""
     return np.array([[np.log(f.amplitude), f.peak_s, np.log(f.half_width_s)] for f in flares]).ravel()
 
 
-def _refined(likelihood: Likelihood, shape: Shape, flares: Sequence[FittedFlare]) -> list[FittedFlare]:
+def _refined(likelihood: Likelihood, shape: Profile, flares: Sequence[FittedFlare]) -> list[FittedFlare]:
     """Return the flares that fit best, by least squares from a starting point."""
     window = likelihood.window
     # The inverse has rank n - 1; its root is that of its eigenvalues.
@@ -583,86 +653,95 @@ def _refined(likelihood: Likelihood, shape: Shape, flares: Sequence[FittedFlare]
     low[1::3], high[1::3] = span[0, 0] - 4 * reach, span[-1, 1]
     low[2::3], high[2::3] = start[2::3] - 3.0, start[2::3] + 3.0
 
-    def made(x: Float) -> list[FittedFlare]:
-        return [_flare(shape, p, np.exp(w), np.exp(a)) for a, p, w in x.reshape(-1, 3)]
-
     def residual(x: Float) -> Float:
-        return np.asarray(root @ (window.values - _light(window, shape, made(x))))
+        return np.asarray(root @ (window.values - _lights(window, shape, x).sum(axis=0)))
+
+    def jacobian(x: Float) -> Float:
+        return np.asarray(-root @ _slopes(window, shape, x).T)
 
     found = scipy.optimize.least_squares(
-        residual, np.clip(start, low, high), bounds=(low, high), x_scale=scale, max_nfev=60,
+        residual, np.clip(start, low, high), jac=jacobian, bounds=(low, high), x_scale=scale,
+        ftol=1e-6, xtol=1e-6, max_nfev=60,
     )  # fmt: skip
-    return made(found.x)
+    return [_flare(shape, p, np.exp(w), np.exp(a)) for a, p, w in found.x.reshape(-1, 3)]
 
 
-def _posterior(
-    window: Window, shape: Shape, flares: list[FittedFlare], epsilon: float, box: Float
-) -> tuple[Mixture, list[FittedFlare]]:
-    """Return the distribution of the equivalent duration for a shape and a departure from it, and the best flares.
+def _single(window: Window, family: Family, shape: Profile, flare: FittedFlare, box: Float) -> list[Fit]:
+    """Fit a single flare with each departure of a family from its shapes.
 
-    `box` is a range of peak and half-width of a single flare from which the grid begins.
+    Parameters
+    ----------
+    shape, flare
+        A first fit, from which the departures follow.
+    box : ndarray, shape (2, 2)
+        Range of the peak and of the logarithm of the half-width from which the grid begins.
     """
-    if len(flares) > 1:
-        return _linearised(window, shape, flares, epsilon)
     outer = _ranges(window)
-    for _ in range(ROUNDS if epsilon else 1):
-        likelihood = Likelihood.of(window, flares, shape, epsilon)
-        grid = Grid.of(likelihood, shape, box, outer)
-        new, box = [grid.best(shape)], grid.box
-        moved = abs(np.log(new[0].equivalent_duration_s / flares[0].equivalent_duration_s))
-        flares = new
-        if moved < 0.02:
-            break
-    toward = likelihood.inverse @ likelihood.departure
-    model = window.model(shape, grid.peaks_s, grid.half_widths_s)
-    per_amplitude = grid.half_widths_s * shape.equivalent_duration - model @ toward
-    level = likelihood.level_without(grid.amplitude[:, None] * model)
-    mean = (grid.amplitude * per_amplitude + float(toward @ window.values)) / level
-    left = max(likelihood.variance - float(toward @ likelihood.departure), 0.0)
-    # Durations are relative to the level, which is lower where the flare is brighter.
-    along = per_amplitude + mean * (model @ likelihood.level)
-    sd = np.sqrt(along**2 / grid.information + left + mean**2 * likelihood.level_variance) / level
-    constant = likelihood.log_factor - 0.5 * float(window.values @ likelihood.inverse @ window.values)
-    return Mixture(grid.log + constant, mean, sd), flares
+    box = np.column_stack([np.maximum(box[:, 0], outer[:, 0]), np.minimum(box[:, 1], outer[:, 1])])
+    fits = []
+    for epsilon in family.epsilon:
+        for _ in range(ROUNDS if epsilon else 1):
+            likelihood = Likelihood.of(window, [flare], shape, epsilon)
+            grid = Grid.of(likelihood, family, box, outer)
+            before, box = flare.equivalent_duration_s, grid.box
+            shape, flare = grid.best
+            if abs(np.log(flare.equivalent_duration_s / before)) < SETTLED:
+                break
+        toward = likelihood.inverse @ likelihood.departure
+        per_amplitude = grid.half_widths_s * family.durations[grid.shape] - grid.along(toward)
+        in_level = grid.along(likelihood.level)
+        level = float(window.values @ likelihood.level) - grid.amplitude * in_level
+        level = np.where(level > 0, level, window.quiet_level)
+        mean = (grid.amplitude * per_amplitude + float(toward @ window.values)) / level
+        left = max(likelihood.variance - float(toward @ likelihood.departure), 0.0)
+        # Durations are relative to the level, which is lower where the flare is brighter.
+        along = per_amplitude + mean * in_level
+        sd = np.sqrt(along**2 / grid.information + left + mean**2 * likelihood.level_variance) / level
+        constant = likelihood.log_factor - 0.5 * float(window.values @ likelihood.inverse @ window.values)
+        prior = float(np.log(family.prior / len(family.epsilon)))
+        fits.append(Fit(Mixture(grid.log + constant + prior, mean, sd), shape, [flare], epsilon))
+    return fits
 
 
-def _linearised(
-    window: Window, shape: Shape, flares: list[FittedFlare], epsilon: float
-) -> tuple[Mixture, list[FittedFlare]]:
-    """Return the normal distribution of the equivalent duration of several flares from the linearised model."""
-    for _ in range(ROUNDS):
+def _several(window: Window, family: Family, flares: list[FittedFlare]) -> list[Fit]:
+    """Fit several flares of a published shape with each departure from it, by the linearised model."""
+    shape, n = family.shape(0), len(flares)
+    # Each further flare may have any peak in the event, half-width and amplitude, in any order.
+    outer = _ranges(window)
+    span = window.edges[window.inside]
+    each = np.log(span[-1, 1] - span[0, 0]) + np.log(np.ptp(outer[1])) + np.log(MAX_LOG_AMPLITUDE)
+    prior = float(np.log(family.prior / len(family.epsilon)) - (n - 1) * (each + 1.0) + scipy.special.gammaln(n + 1))
+    fits = []
+    for epsilon in family.epsilon:
+        for _ in range(ROUNDS if epsilon else 1):
+            likelihood = Likelihood.of(window, flares, shape, epsilon)
+            before = sum(f.equivalent_duration_s for f in flares)
+            flares = _refined(likelihood, shape, flares)
+            if abs(np.log(sum(f.equivalent_duration_s for f in flares) / before)) < SETTLED:
+                break
         likelihood = Likelihood.of(window, flares, shape, epsilon)
-        flares = _refined(likelihood, shape, flares)
-    likelihood = Likelihood.of(window, flares, shape, epsilon)
-    start = _parameters(flares)
-    light = _light(window, shape, flares)
-    jacobian = np.empty((start.size, window.values.size))
-    for k in range(start.size):
-        step = 1e-4 * (flares[k // 3].half_width_s if k % 3 == 1 else 1.0)
-        ends = []
-        for sign in (-1, 1):
-            x = start.copy()
-            x[k] += sign * step
-            ends.append(_light(window, shape, [_flare(shape, p, np.exp(w), np.exp(a)) for a, p, w in x.reshape(-1, 3)]))
-        jacobian[k] = (ends[1] - ends[0]) / (2 * step)
-    information = jacobian @ likelihood.inverse @ jacobian.T
-    # Priors as wide as the parameters can be: a factor of e^2 in amplitude and half-width, two half-widths in peak.
-    wide = np.tile([2.0, 1.0, 2.0], len(flares))
-    wide[1::3] = [2 * f.half_width_s for f in flares]
-    covariance = np.linalg.inv(information + np.diag(wide**-2.0))
-    total = np.array([f.equivalent_duration_s for f in flares])
-    gradient = np.zeros(start.size)
-    gradient[0::3] = gradient[2::3] = total
-    toward = likelihood.inverse @ likelihood.departure
-    along = gradient - jacobian @ toward
-    level = float(likelihood.level_without(light))
-    mean = float(total.sum() + toward @ (window.values - light)) / level
-    # Durations are relative to the level, which is lower where the flares are brighter.
-    along += mean * (jacobian @ likelihood.level)
-    left = max(likelihood.variance - float(toward @ likelihood.departure), 0.0)
-    variance = float(along @ covariance @ along) + left + mean**2 * likelihood.level_variance
-    log = likelihood.log_factor - 0.5 * float(likelihood.chi2(light)) + 0.5 * float(np.linalg.slogdet(covariance)[1])
-    return Mixture(np.array([log]), np.array([mean]), np.array([np.sqrt(variance) / level])), flares
+        parameters = _parameters(flares)
+        light, slopes = _light(window, shape, flares), _slopes(window, shape, parameters)
+        # Priors as wide as the parameters can be: a factor of e^2 in amplitude and half-width, two half-widths in peak.
+        wide = np.tile([2.0, 1.0, 2.0], n)
+        wide[1::3] = [2 * f.half_width_s for f in flares]
+        covariance = np.linalg.inv(slopes @ likelihood.inverse @ slopes.T + np.diag(wide**-2.0))
+        total = np.array([f.equivalent_duration_s for f in flares])
+        gradient = np.zeros(parameters.size)
+        gradient[0::3] = gradient[2::3] = total
+        toward = likelihood.inverse @ likelihood.departure
+        along = gradient - slopes @ toward
+        level = float(likelihood.level_without(light))
+        mean = float(total.sum() + toward @ (window.values - light)) / level
+        # Durations are relative to the level, which is lower where the flares are brighter.
+        along += mean * (slopes @ likelihood.level)
+        left = max(likelihood.variance - float(toward @ likelihood.departure), 0.0)
+        variance = float(along @ covariance @ along) + left + mean**2 * likelihood.level_variance
+        # As the grid of a single flare, without the factor of one amplitude.
+        log = likelihood.log_factor - 0.5 * float(likelihood.chi2(light)) + prior
+        log += 0.5 * float(np.linalg.slogdet(covariance)[1]) + (3 * n - 1) / 2 * np.log(2 * np.pi)
+        fits.append(Fit(Mixture(*np.array([[log], [mean], [np.sqrt(variance) / level]])), shape, flares, epsilon))
+    return fits
 
 
 def _summed(survey: SeriesSurvey, taken: Bool, level: Float, one: Detection) -> tuple[float, float]:

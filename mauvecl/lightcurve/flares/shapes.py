@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import scipy
@@ -22,6 +22,16 @@ from mauvecl.schema.physical import Duration
 from mauvecl.schema.text import shortened
 
 Float = NDArray[np.float64]
+
+
+class Integrable(Protocol):
+    """What has an integral over time; see `Shape`."""
+
+    def before(self, tau: ArrayLike) -> Float:
+        """Return the integral up to tau."""
+
+    def after(self, tau: ArrayLike) -> Float:
+        """Return the integral from tau to the end, without cancellation."""
 
 
 @validated
@@ -110,7 +120,7 @@ class Shape(ABC):
         return np.asarray(integrals * scale / lengths)
 
 
-def sides(shape: Shape, tau: ArrayLike) -> Float:
+def sides(shape: Integrable, tau: ArrayLike) -> Float:
     """Return the integrals up to min(tau, 0) and from max(tau, 0), in half-widths, shape (2, *tau.shape).
 
     `between` subtracts them. Differences of integrals from one end only would cancel on the other side of the peak.
@@ -125,7 +135,7 @@ def between(first: Float, last: Float) -> Float:
     return np.asarray(np.maximum(last[0] - first[0] + (first[1] - last[1]), 0.0))
 
 
-def consecutive_integrals(shape: Shape, tau: ArrayLike) -> Float:
+def consecutive_integrals(shape: Integrable, tau: ArrayLike) -> Float:
     """Return the integrals between consecutive values of tau along the last axis, in half-widths."""
     both = sides(shape, tau)
     return between(both[..., :-1], both[..., 1:])
