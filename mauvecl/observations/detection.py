@@ -111,8 +111,8 @@ def criterion(survey: SeriesSurvey, taken: Bool, shapeless: bool = False) -> flo
     In independent noise, or if `shapeless`, the light of an event may have any smooth shape.
     """
     found, _ = detect_events(survey, PROVISIONAL)
-    start, size = survey.stare.start_s, float(np.log(survey.stare.n_frames))
-    edges = np.column_stack([start, start + survey.stare.frame_s])
+    start, frame_s, size = survey.stare.start_s, survey.stare.frame_s, float(np.log(survey.stare.n_frames))
+    edges = np.column_stack([start, start + frame_s])
     fits = []
     for one in found:
         flares, scale, photon = flares_of(survey, taken, one)
@@ -129,7 +129,13 @@ def criterion(survey: SeriesSurvey, taken: Bool, shapeless: bool = False) -> flo
             extra += photons + (epsilon * mine) ** 2
         total = PARAMETERS * size * sum(count for *_, count in fits)
         for process, column in zip(survey.processes, (survey.sums - light).T, strict=True):
-            covariance = process.covariance(start[kept], (survey.variance * process.excess**2 + extra)[kept])
+            noise = (survey.variance * process.excess**2 + extra)[kept]
+            if fits and not process.terms:
+                # Frames without events in the tail of a flare have more scatter than noise.
+                noise = (survey.variance + extra)[kept]
+                process = fit_process(Binned(start[kept], column[kept], noise, frame_s), process)
+                noise = noise * process.excess**2
+            covariance = process.covariance(start[kept], noise)
             total += process.n_parameters * size - 2 * level_fit(covariance, column[kept]).log_likelihood
         return total
 
