@@ -31,6 +31,9 @@ Float = NDArray[np.float64]
 
 #: False alarms per star-day above which events are candidates.
 CANDIDATES = 1.0
+#: Share of the searched frames in events, their number, and length of the light curve in seconds or in half-widths of
+#: the longest event, above which the events are no exception from the light of the star (assumed).
+MOST_IN_EVENTS, MOST_EVENTS, LONG_S, LONG = 0.5, 2, 2 * DAY_S, 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +87,24 @@ class Analysis:
         series = None if self.spectra is None else self.spectra.series
         return series is not None and bool(series.changes) and bool(np.isfinite(series.jitters["light"]))
 
+    @cached_property
+    def in_events(self) -> float:
+        """Share of the searched frames in events."""
+        inside = np.zeros(self.survey.stare.n_frames, np.bool_)
+        for one in self.events:
+            inside[one.first : one.last + 1] = True
+        return float(inside.mean())
+
+    @property
+    def crowded(self) -> bool:
+        """True if most frames of a long light curve are in events: too few show the star without them.
+
+        One flare may fill a short window.
+        """
+        longest = max((one.half_width_s for one in self.events), default=0.0)
+        many = len(self.events) > MOST_EVENTS and self.in_events > MOST_IN_EVENTS
+        return many and self.survey.stare.duration_s > min(LONG * longest, LONG_S)
+
     def false_alarms(self, event: ObservedEvent) -> tuple[float, float]:
         """Return the false alarms per star-day at an event's statistic: by the process, and with measured residuals."""
         return self.modelled.rate(event.value), self.measured.rate(event.value)
@@ -105,12 +126,20 @@ class Analysis:
     def messages(self) -> list[str]:
         """Statements about the data that a reader must know, the most important first."""
         lines = list(self.frames.remarks)
+        if self.crowded:
+            lines.append(
+                f"Events take {100 * self.in_events:.2g} % of the searched frames, so that what the star does without "
+                "them is not known, and there are no verdicts: the light probably has eclipses, transits or pulsation, "
+                "or is another column than the flux; mark the frames to leave out in a column of quality, or name the "
+                "columns in a mapping (--mapping)."
+            )
         reasons = self.level.reasons
         if (reasons != 0).any():
             lines.append(f"{np.count_nonzero(reasons)} of {reasons.size} frames are not searched; the table of frames "
                          "states the reason of each.")  # fmt: skip
         if lost := np.count_nonzero(reasons & Reason.LOSS):
-            lines.append(f"In {lost} of these frames light is suddenly lost, as by pointing losses or eclipses.")
+            lines.append(f"In {lost} of these frames light is suddenly lost, as by pointing losses or eclipses; flares "
+                         "in them are not searched.")  # fmt: skip
         if self.level.excess > 1.2:
             lines.append(f"The scatter of quiescent frames is {self.level.excess:.2f} times the stated errors; the "
                          "measured scatter is used.")  # fmt: skip

@@ -109,6 +109,11 @@ class Energy:
         return bool(lacking > LACKING_ERRORS * error and lacking > LACKING_SHARE * self.within_s)
 
     @property
+    def unclear(self) -> bool:
+        """Whether the frames of the event do not show its light: their sum is negative, or its error is larger."""
+        return self.summed_s <= 0 or self.summed_error_s > self.within_s
+
+    @property
     def p_value(self) -> float:
         """Probability of a chi-squared at least as large."""
         return float(scipy.stats.chi2.sf(self.chi2, self.dof)) if self.dof > 0 else float("nan")

@@ -7,9 +7,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import median_filter, uniform_filter1d
 
 from mauvecl.lightcurve.flares.shapes import Shape
-from mauvecl.observations.detection import PROVISIONAL, alternate, criterion, detect_events
+from mauvecl.observations.detection import (
+    END_FRAMES,
+    PROVISIONAL,
+    alternate,
+    criterion,
+    detect_events,
+    fit_quiet_light,
+)
+from mauvecl.observations.level import guess_flares
+from mauvecl.observations.process import Binned, fit_process, level_fit
 from mauvecl.observations.search import bank_of
 
 if TYPE_CHECKING:
@@ -26,6 +36,15 @@ MOST_LOST = 0.4
 #: Standard deviations of a frame above the median of a constant light from which frames belong to flares; their number
 #: before and, relative to the length, after the bright frames; the largest share of such frames (assumed).
 BRIGHT, BEFORE, DECAY, MOST_BRIGHT = 4.0, 2, 3, 0.3
+#: Shortest period of eclipses, their durations as shares of the period, and the factor by which the guessed ones are
+#: widened, because they begin and end gradually (assumed).
+SHORTEST_PERIOD_S, ECLIPSES, WIDENED = 17_280.0, np.array([0.03, 0.06, 0.12]), 1.6
+#: Largest number of values in which eclipses are guessed, and the shift of a box in its durations between two periods.
+MOST_BINNED, MOVED = 3000, 0.5
+#: Share of the period whose median is the light around an eclipse, and parameters of the times of eclipses.
+AROUND, EPHEMERIS = 0.3, 5
+#: Mean of consecutive frames, in standard deviations of a frame below the star, that belong to an eclipse.
+FAINT = 1.5
 
 
 class Loss(Shape):
@@ -67,24 +86,111 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool) -> Bo
     none, process = np.zeros_like(taken), fitted.flux_process
     rotates = any(term.kind == "rotation" for term in process.terms)
     fast = any(term.kind != "rotation" and term.scale_s < survey.stare.duration_s / 3 for term in process.terms)
-    many = taken.mean() > (MOST_ACTIVE if rotates else MOST_FLARING)
-    if survey.weighted or not (many or process.excess > MOST_EXCESS or fast):
+    restless = process.excess > MOST_EXCESS or fast
+    if survey.weighted or not (taken.mean() > MOST_FLARING or restless):
         return none
+    many = taken.mean() > (MOST_ACTIVE if rotates else MOST_FLARING)
     dark = ~_bright(survey)
     survey, fitted, taken = survey.frames(dark), fitted.frames(dark), taken[dark]
     down = replace(survey.inverted(), bank=bank_of(survey.stare, survey.bank.directions, Loss()))
     # Losses in independent noise are the first guess: a process that is fitted to losses would hide them.
-    other, losses = alternate(down, detect_events(down, PROVISIONAL)[1])
+    guessed = detect_events(down, PROVISIONAL)[1]
+    # Those of a star that varies are most of its frames; eclipses repeat.
+    if guessed.mean() >= MOST_LOST and (lost := _eclipses(survey, criterion(fitted, taken))).any():
+        none[dark] = lost
+        return none
+    if not (many or restless):
+        return none
+    other, losses = alternate(down, guessed)
     if 0 < losses.mean() < MOST_LOST and criterion(other, losses, shapeless=True) < criterion(fitted, taken):
         none[dark] = losses
     return none
 
 
+def _eclipses(survey: SeriesSurvey, usual: float) -> Bool:
+    """Return the frames in periodic losses, if these lower the criterion, shape (n_frame,).
+
+    Parameters
+    ----------
+    survey : SeriesSurvey
+        Without processes.
+    usual : float
+        Criterion without losses.
+    """
+    guessed = guess_eclipses(survey)
+    none = np.zeros_like(guessed)
+    if not 0 < guessed.mean() < MOST_LOST:
+        return none
+    part = survey.frames(~guessed)
+    fitted, taken = fit_quiet_light(part, guess_flares(part.stare.numbers, part.flux))
+    # The light in eclipses may have any smooth shape.
+    dim = survey.frames(guessed)
+    data = Binned(dim.stare.start_s, dim.sums[:, 0], dim.variance, dim.stare.frame_s)
+    process = fit_process(data)
+    light = level_fit(process.covariance(data.time_s, data.variance * process.excess**2), data.values)
+    cost = (EPHEMERIS + process.n_parameters) * float(np.log(guessed.size)) - 2 * light.log_likelihood
+    if criterion(fitted, taken) + cost >= usual:
+        return none
+    quiet = ~guessed
+    quiet[quiet] = ~taken
+    whole = replace(survey, processes=fitted.processes, flux_process=fitted.flux_process)
+    sigma = uniform_filter1d(whole.along(0, quiet), END_FRAMES)
+    # Frames at the ends of the guess that are as bright as the star are searched.
+    for first, last in _runs(guessed):
+        faint = np.flatnonzero(sigma[first : last + 1] < -FAINT)
+        if faint.size:
+            none[max(first, first + faint[0] - END_FRAMES) : min(last, first + faint[-1] + END_FRAMES) + 1] = True
+    return none
+
+
+def _runs(inside: Bool) -> list[tuple[int, int]]:
+    """Return the first and last frame of each run of frames."""
+    edges = np.diff(inside.astype(np.int8), prepend=0, append=0)
+    return list(zip(np.flatnonzero(edges > 0).tolist(), (np.flatnonzero(edges < 0) - 1).tolist(), strict=True))
+
+
+def guess_eclipses(survey: SeriesSurvey) -> Bool:
+    """Return a first guess of the frames in periodic losses, by box least squares, shape (n_frame,).
+
+    They are the box that fits best and, as of a binary star, the best one at the same period in the other frames
+    (Kovacs, Zucker & Mazeh 2002, doi 10.1051/0004-6361:20020802).
+    """
+    from astropy.timeseries import BoxLeastSquares
+
+    time = survey.stare.start_s
+    inside = np.zeros(time.size, np.bool_)
+    data = Binned.of(time, survey.flux, survey.flux_variance, survey.stare.frame_s, MOST_BINNED)
+    period = max(SHORTEST_PERIOD_S, 2 * data.step_s / ECLIPSES[0])
+    grids = []
+    while period < data.span_s / 3:
+        # Between neighbouring periods the last box moves by a part of the shortest duration.
+        number = max(2, int(data.span_s / (2 * period) / (MOVED * ECLIPSES[0])))
+        grids.append(1 / np.linspace(1 / (2 * period), 1 / period, number))
+        period *= 2
+    if not grids:
+        return inside
+    values = data.values
+    for _ in range(2):
+        kept = ~inside[np.searchsorted(time, data.time_s)]
+        search = BoxLeastSquares(data.time_s[kept], values[kept])
+        found = [search.power(grid, ECLIPSES * grid.min()) for grid in grids]
+        best = max(found, key=lambda one: float(one.power.max()))
+        k = int(np.argmax(best.power))
+        period, middle, length = (float(one[k]) for one in (best.period, best.transit_time, best.duration))
+        apart = np.abs((time - middle + period / 2) % period - period / 2)
+        inside |= apart < WIDENED * length / 2
+        grids = [np.array([period])]
+        # The star may vary by more than the shallower eclipse.
+        kept = ~inside[np.searchsorted(time, data.time_s)]
+        values = data.values.copy()
+        values[kept] -= median_filter(values[kept], max(3, round(AROUND * period / data.step_s)), mode="nearest")
+    return inside
+
+
 def _bright(survey: SeriesSurvey) -> Bool:
     """Return frames far above the level that most frames have, and those after them, as long as flares decay."""
     sigmas = (survey.flux - np.median(survey.flux)) / np.sqrt(survey.flux_variance)
-    edges = np.diff((sigmas > BRIGHT).astype(np.int8), prepend=0, append=0)
     bright = np.zeros(sigmas.size, np.bool_)
-    for first, stop in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
-        bright[max(0, first - BEFORE) : stop + DECAY * (stop - first)] = True
+    for first, last in _runs(sigmas > BRIGHT):
+        bright[max(0, first - BEFORE) : last + 1 + DECAY * (last + 1 - first)] = True
     return bright if bright.mean() < MOST_BRIGHT else np.zeros_like(bright)

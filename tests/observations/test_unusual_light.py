@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mauvecl import Frames, Study, analyse
 from mauvecl.observations.analysis import analyse_frames
-from mauvecl.observations.frames import Frames
 
 Float = NDArray[np.float64]
 #: Equivalent duration of a flare of unit amplitude and half-width in the shape of `flare`.
@@ -54,3 +54,59 @@ def test_tail_of_a_bright_flare_without_its_peak_is_an_event(
     truth = amplitude * half_width_s * DURATION
     low, high = event.energy.low_s[0], event.energy.high_s[0]
     assert abs(event.energy.fitted_s - truth) < 2.5 * (high - low)
+
+
+def spotted_binary(rng: np.random.Generator, days: float, frame_s: float) -> tuple[Float, Float, Float, list[float]]:
+    """Draw times, light, depth of the eclipses and peaks of five flares of 0.8 to 15 %, with noise of 5e-4."""
+    time = np.arange(int(days * 86_400 / frame_s)) * frame_s
+    period, spots = 1.37 * 86_400, rng.uniform(0.01, 0.03)
+    phase = (time / period + rng.uniform()) % 1
+    turn = 2 * np.pi * (time / (period * rng.uniform(0.97, 1.03)) + rng.uniform())
+    depth = np.zeros(time.size)
+    for middle, size in ((0.25, 0.12), (0.75, 0.05)):
+        depth += size * np.clip(1.3 * (1 - np.abs(phase - middle) / 0.05), 0, 1)
+    light = (1 + spots * (np.sin(turn) + rng.uniform(0, 0.7) * np.sin(2 * turn + 1))) * (1 - depth)
+    peaks = [float(one) for one in rng.uniform(0.03, 0.97, 5) * time[-1]]
+    for size, peak in zip(np.geomspace(0.008, 0.15, 5), peaks, strict=True):
+        light += size * flare(time, frame_s, peak, rng.uniform(200, 1000))
+    return time, light + 5e-4 * rng.standard_normal(time.size), depth, peaks
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_eclipses_of_a_spotted_binary_are_no_flares(seed: int) -> None:
+    """Observe eight days of eclipses of 12 and 5 % in frames of 2 minutes.
+
+    Either the eclipses are left out, or a message says that there are no verdicts.
+    """
+    time, flux, depth, peaks = spotted_binary(np.random.default_rng([502, seed]), 8.0, 120.0)
+    frames = Frames.of(time, flux, np.full(time.size, 5e-4), exposure_s=120.0)
+    answer = analyse(Study(), frames=frames)
+    searched = np.array(answer.frames["reason"]) == ""
+    assert searched[depth < 1e-9].mean() > 0.9
+    events = answer.events[answer.events["verdict"] == "detected"]
+    if searched[depth > 0.005].mean() > 0.05:
+        assert answer.analysis.crowded
+        assert not len(events)
+        assert any("eclipses" in message and "no verdicts" in message for message in answer.messages)
+    start, stop = (events[name].to_value("s") - 600 for name in ("tstart", "tstop"))
+    # A flare in an eclipse may be seen by its tail.
+    for first, last in zip(start, stop, strict=True):
+        assert any(first < peak + 1200 and peak < last for peak in peaks)
+    assert (events["ed_rec"] > 0).all()
+
+
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long), pytest.param(3, marks=pytest.mark.long)])
+def test_light_whose_frames_are_mostly_in_events_has_no_verdict(seed: int) -> None:
+    """Observe dips of 2 to 30 % that follow each other at random for 25 days, in frames of 30 minutes."""
+    rng, frame_s = np.random.default_rng([503, seed]), 1800.0
+    time = np.arange(1200) * frame_s
+    flux = np.ones(time.size)
+    for middle in rng.uniform(0, time[-1], 38):
+        flux *= 1 - rng.uniform(0.02, 0.3) * np.exp(-(((time - middle) / (rng.uniform(0.05, 0.3) * 86_400)) ** 4))
+    flux += 1e-3 * rng.standard_normal(time.size)
+    answer = analyse(Study(), frames=Frames.of(time, flux, np.full(time.size, 1e-3), exposure_s=frame_s))
+    assert answer.analysis.crowded
+    assert set(answer.events["verdict"]) == {"undecided"}
+    (message,) = [one for one in answer.messages if "no verdicts" in one and "eclipses" in one]
+    assert "--mapping" in message

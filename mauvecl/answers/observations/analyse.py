@@ -119,14 +119,21 @@ class EventRow:
         """Judgement of the event: a detected flare, a candidate, rejected as an event of another kind, or undecided.
 
         Where the throughput changes, only a spectrum that is clearly that of a flare makes an event a detection. Where
-        the fitted process does not describe the light, its false-alarm rate is not known.
+        the fitted process does not describe the light, or most frames are in events, its false-alarm rate is not known.
         """
+        if self.analysis.crowded:
+            return "undecided"
         if self.event.kind != "flare":
             return "rejected"
         if not self.analysis.likeness.alike:
             return "undecided"
         doubtful = self.spectrum is not None and self.spectrum.ambiguous and self.analysis.light_misleads
-        return "detected" if self.significant and not doubtful else "candidate"
+        return "detected" if self.significant and not doubtful and not self.unclear else "candidate"
+
+    @property
+    def unclear(self) -> bool:
+        """True if the frames of an event in a light curve do not show that they are brighter than the star."""
+        return self.event.energy.unclear and not self.analysis.survey.weighted
 
     @property
     def rates(self) -> tuple[float, float]:
@@ -175,6 +182,8 @@ class EventRow:
         notes += [f"{frames} interpolated"] if event.missing else []
         if event.kind == "flare" and event.energy.p_value < 1e-3:
             notes.append("the shapes of the templates do not fit it, which its interval includes")
+        if event.kind == "flare" and self.unclear:
+            notes.append("the sum of its frames does not show light above the level, which is uncertain in them")
         if event.kind == "flare" and not event.energy.peak_observed:
             notes.append("no frame shows its peak")
         return "; ".join(notes)
@@ -250,8 +259,9 @@ EVENTS = (
            "the larger rate", "from noise", _rate),
     Column("significant", "significant", "", "whether the rate is at most the wanted one", kind=bool),
     Column("verdict", "verdict", "", "detected: a flare with at most the wanted rate; candidate: a flare with a larger "
-           "one, or one like the changes of throughput in these frames; rejected: it resembles a flare, but its "
-           "spectrum or shape is of another kind", "verdict", kind=str),
+           "one, one like the changes of throughput in these frames, or one whose frames are not clearly brighter than "
+           "the level; rejected: it resembles a flare, but its spectrum or shape is of another kind; undecided: the "
+           "false-alarm rate is not known", "verdict", kind=str),
     Column("blue_over_red", lambda row: row.colour[0], "", "rise relative to the star in the blue half of the pixels "
            "over that in the red half: 1 for a change of throughput; nan: no spectra", "blue/red", number(".3g")),
     Column("blue_over_red_error", lambda row: row.colour[1], "", "its standard error"),

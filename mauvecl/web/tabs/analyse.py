@@ -27,7 +27,7 @@ Float = NDArray[np.float64]
 #: Largest numbers of points of a light curve, and of columns and rows of a dynamic spectrum.
 MOST_POINTS, MOST_COLUMNS, MOST_ROWS = 8000, 600, 300
 #: Verdicts on events, with their colours.
-VERDICTS = {"detected": "star", "candidate": "drawn", "rejected": "own"}
+VERDICTS = {"detected": "star", "candidate": "drawn", "rejected": "own", "undecided": "dark"}
 NO_FILE = "Choose a file of frames: a light curve or a sequence of spectra."
 
 
@@ -101,7 +101,8 @@ class LightCurve(Picture):
 def _summary(rows: Any, one: Analysis) -> str:
     """Return the numbers of events in words."""
     verdicts = [row.verdict for row in rows]
-    counts = ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in VERDICTS)
+    named = [verdict for verdict in VERDICTS if verdict != "undecided" or verdict in verdicts]
+    counts = ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in named)
     return f"Events in {short(one.days)} star-days: {counts}; detected above an S/N of {one.threshold:.2f}."
 
 
