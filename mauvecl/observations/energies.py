@@ -110,8 +110,8 @@ class Energy:
 
     @property
     def unclear(self) -> bool:
-        """Whether the frames of the event do not show its light: their sum is negative, or its error is larger."""
-        return self.summed_s <= 0 or self.summed_error_s > self.within_s
+        """Whether the frames of the event do not show its light: they are together not brighter than the level."""
+        return self.summed_s <= 0
 
     @property
     def p_value(self) -> float:

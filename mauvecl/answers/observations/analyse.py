@@ -132,7 +132,7 @@ class EventRow:
 
     @property
     def unclear(self) -> bool:
-        """True if the frames of an event in a light curve do not show that they are brighter than the star."""
+        """True if the frames of an event in a light curve are together not brighter than the star."""
         return self.event.energy.unclear and not self.analysis.survey.weighted
 
     @property
@@ -183,7 +183,7 @@ class EventRow:
         if event.kind == "flare" and event.energy.p_value < 1e-3:
             notes.append("the shapes of the templates do not fit it, which its interval includes")
         if event.kind == "flare" and self.unclear:
-            notes.append("the sum of its frames does not show light above the level, which is uncertain in them")
+            notes.append("the sum of its frames is not brighter than the level, which is uncertain in them")
         if event.kind == "flare" and not event.energy.peak_observed:
             notes.append("no frame shows its peak")
         return "; ".join(notes)
@@ -259,7 +259,7 @@ EVENTS = (
            "the larger rate", "from noise", _rate),
     Column("significant", "significant", "", "whether the rate is at most the wanted one", kind=bool),
     Column("verdict", "verdict", "", "detected: a flare with at most the wanted rate; candidate: a flare with a larger "
-           "one, one like the changes of throughput in these frames, or one whose frames are not clearly brighter than "
+           "one, one like the changes of throughput in these frames, or one whose frames are together not brighter than "
            "the level; rejected: it resembles a flare, but its spectrum or shape is of another kind; undecided: the "
            "false-alarm rate is not known", "verdict", kind=str),
     Column("blue_over_red", lambda row: row.colour[0], "", "rise relative to the star in the blue half of the pixels "
