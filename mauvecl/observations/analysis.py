@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +25,15 @@ from mauvecl.observations.light_curve import survey_light_curve
 from mauvecl.observations.noise import Likeness, Scatter, binned_scatter, likeness
 from mauvecl.observations.search import NO_COLOUR_K, SeriesSurvey
 from mauvecl.observations.spectra import CleanedSpectra, SpectralSeries, clean_spectra, survey_spectra
+from mauvecl.observations.steps import Steps
 from mauvecl.results.measurements.fit import Measurement
 from mauvecl.schema.physical import DAY_S
 
 Float = NDArray[np.float64]
 
+#: Shares of the work at which its stages begin and end: level, false alarms, search, events and injections (measured
+#: with a light curve of 10^5 frames).
+STAGES = (0.0, 0.45, 0.55, 0.65, 0.95, 1.0)
 #: False alarms per star-day above which events are candidates.
 CANDIDATES = 1.0
 #: Share of the searched frames in events, their number, and length of the light curve in seconds or in half-widths of
@@ -180,6 +185,7 @@ def analyse_frames(
     rank: int = RANK,
     jitters: Mapping[str, float] | None = None,
     temperature_k: float = NO_COLOUR_K,
+    report: Callable[[float], None] | None = None,
 ) -> Analysis:
     """Find the flares in observed frames.
 
@@ -201,18 +207,24 @@ def analyse_frames(
         leaves out. Where they do not state it, that of the light is infinite and that of the dark current as measured.
     temperature_k : float
         Temperature of injected flares in spectra.
+    report : callable, optional
+        Called with the share of the work that is done, which rises to 1; may raise to stop the work.
     """
+    steps = Steps(report)
+    level_steps, rate_steps, search_steps, event_steps, injection_steps = (
+        steps.part(first, last) for first, last in pairwise(STAGES)
+    )
     wanted = per_day(false_alarms, per)
     cleaned = None if model is None else clean_spectra(frames, model)
     frames = frames if cleaned is None else cleaned.frames
     series = None
     if cleaned is None:
-        survey, level, frames = survey_light_curve(frames, shape_of(shape), seed)
+        survey, level, frames = survey_light_curve(frames, shape_of(shape), seed, level_steps)
     else:
-        survey, series, level = survey_spectra(cleaned, shape_of(shape), rank, seed, jitters)
+        survey, series, level = survey_spectra(cleaned, shape_of(shape), rank, seed, jitters, level_steps)
     flux, error = frames.white_light
     frequent = max(wanted, CANDIDATES)
-    modelled, measured = simulated_rates(survey, level.quiet[level.used], wanted, seed)
+    modelled, measured = simulated_rates(survey, level.quiet[level.used], wanted, seed, rate_steps)
     threshold, candidates = (max(one.threshold(rate) for one in (modelled, measured)) for rate in (wanted, frequent))
     dip = largest_dip(survey, level.quiet[level.used])
     days = survey.stare.observed_s / DAY_S
@@ -220,10 +232,10 @@ def analyse_frames(
         threshold = max(threshold, dip)
     else:
         dip = float("nan")
-    detected, taken = detect_events(survey, candidates)
+    detected, taken = detect_events(survey, candidates, search_steps)
     seen = None if series is None else [event_spectrum(survey, series, taken, one) for one in detected]
     causes = None if seen is None else [one.cause for one in seen]
-    events = measure_events(survey, taken, detected, causes)
+    events = measure_events(survey, taken, detected, causes, event_steps)
     spectra = None
     if cleaned is not None and series is not None and seen is not None:
         measured_flares = [
@@ -237,7 +249,7 @@ def analyse_frames(
     numbers = survey.stare.numbers[quiet]
     return Analysis(
         frames, flux, error, level, survey, wanted, modelled, measured, threshold, candidates, dip, events,
-        inject(survey, ~taken, threshold, seed, temperature_k),
+        inject(survey, ~taken, threshold, seed, temperature_k, injection_steps),
         binned_scatter(numbers, residual @ middle), residual, quiet, likeness(numbers, residual), spectra,
     )  # fmt: skip
 

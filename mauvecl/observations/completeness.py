@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.observations.search import NO_COLOUR_K, SeriesSurvey
+from mauvecl.observations.steps import Steps
 from mauvecl.statistics.intervals import Interval, clopper_pearson
 
 Float = NDArray[np.float64]
@@ -63,8 +64,9 @@ class Completeness:
 
 
 def inject(
-    survey: SeriesSurvey, free: NDArray[np.bool_], threshold: float, seed: int, temperature_k: float = NO_COLOUR_K
-) -> Completeness:
+    survey: SeriesSurvey, free: NDArray[np.bool_], threshold: float, seed: int, temperature_k: float = NO_COLOUR_K,
+    steps: Steps | None = None,
+) -> Completeness:  # fmt: skip
     """Inject flares of several half-widths and sizes at random times, and count those that the search detects.
 
     Parameters
@@ -76,7 +78,10 @@ def inject(
     seed : int
     temperature_k : float
         Temperature of the flares; light curves have no colour.
+    steps : Steps, optional
+        Reports each half-width.
     """
+    steps = steps or Steps()
     every = np.flatnonzero(free)
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, INJECTION_KEY]))
     bank, frame_s = survey.bank, survey.stare.frame_s
@@ -88,7 +93,7 @@ def inject(
     size_of = float(np.linalg.norm(direction))
     durations = np.zeros((WIDTHS, SIZES))
     detected = np.zeros((WIDTHS, SIZES), np.int64)
-    for w, width in enumerate(widths):
+    for w, width in steps.each(enumerate(widths), WIDTHS):
         if w == 0 or every.size > MAX_FRAMES:
             # Part of a long light curve, another one for each half-width.
             start = int(rng.integers(max(every.size - MAX_FRAMES, 0) + 1))

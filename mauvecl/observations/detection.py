@@ -12,10 +12,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.observations.energies import flares_of
+from mauvecl.observations.energies import REACH, flares_of
 from mauvecl.observations.process import Binned, Process, fit_process, level_fit
 from mauvecl.observations.process_search import ProcessSearch
 from mauvecl.observations.search import Detection, SeriesSurvey
+from mauvecl.observations.steps import Steps
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -49,7 +50,9 @@ NEAR_WIDTHS, NEAR_SCALES = 20.0, 2.0
 STILL_BRIGHT, END_FRAMES = 1.0, 4
 
 
-def fit_processes(survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None = None) -> SeriesSurvey:
+def fit_processes(
+    survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None = None, steps: Steps | None = None
+) -> SeriesSurvey:
     """Return a survey with the processes that fit its sums and its flux outside some frames.
 
     Parameters
@@ -58,12 +61,14 @@ def fit_processes(survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None 
         Frames of events.
     start : SeriesSurvey, optional
         Survey of nearly the same frames, with processes; their terms are kept.
+    steps : Steps, optional
+        Reports each fit.
     """
     quiet = ~taken
     time, step = survey.stare.start_s[quiet], survey.stare.frame_s
 
     def fitted(values: Float, variance: Float, before: Process | None) -> Process:
-        return fit_process(Binned.of(time, values[quiet], variance[quiet], step), before)
+        return fit_process(Binned.of(time, values[quiet], variance[quiet], step), before, steps)
 
     processes = tuple(
         fitted(column, survey.variance, None if start is None else start.processes[k])
@@ -77,7 +82,7 @@ def fit_processes(survey: SeriesSurvey, taken: Bool, start: SeriesSurvey | None 
 
 
 def fit_quiet_light(
-    survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None = None
+    survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None = None, steps: Steps | None = None
 ) -> tuple[SeriesSurvey, Bool]:
     """Fit process and events in alternation, from the guess and, if need be, from the events in independent noise.
 
@@ -87,17 +92,17 @@ def fit_quiet_light(
 
     Parameters
     ----------
-    survey, guessed, before
+    survey, guessed, before, steps
         As for `alternate`.
     """
-    fitted, taken = alternate(survey, guessed, before)
+    fitted, taken = alternate(survey, guessed, before, steps)
     if not _seen_once(fitted):
         return fitted, taken
     noise = tuple(Process((), process.excess) for process in fitted.processes)
     found, others = detect_events(replace(survey, processes=noise), PROVISIONAL)
     if len(found) > MAX_COMPARED or not (others & ~taken).any():
         return fitted, taken
-    other, others = alternate(survey, others)
+    other, others = alternate(survey, others, None, steps)
     if float((others ^ taken).mean()) <= SETTLED:
         return fitted, taken
     first, second = criterion(fitted, taken), criterion(other, others)
@@ -112,21 +117,22 @@ def criterion(survey: SeriesSurvey, taken: Bool, shapeless: bool = False) -> flo
     """
     found, _ = detect_events(survey, PROVISIONAL)
     start, frame_s, size = survey.stare.start_s, survey.stare.frame_s, float(np.log(survey.stare.n_frames))
-    edges = np.column_stack([start, start + frame_s])
     fits = []
     for one in found:
         flares, scale, photon = flares_of(survey, taken, one)
-        mine = np.zeros(start.size)
-        for flare in flares:
-            mine += flare.amplitude * survey.bank.shape.mean_over(edges, flare.peak_s, flare.half_width_s)
-        fits.append((one, scale * mine, photon * mine, len(flares)))
+        lights = [_light_of(survey, each.peak_s, each.half_width_s, each.amplitude) for each in flares]
+        first, stop = min(rows.start for rows, _ in lights), max(rows.stop for rows, _ in lights)
+        mine = np.zeros(stop - first)
+        for rows, flux in lights:
+            mine[rows.start - first : rows.stop - first] += flux
+        fits.append((one, slice(first, stop), scale * mine, photon * mine, len(flares)))
 
-    def cost(epsilon: float, fits: list[tuple[Detection, Float, Float, int]], kept: Bool) -> float:
+    def cost(epsilon: float, fits: list[tuple[Detection, slice, Float, Float, int]], kept: Bool) -> float:
         """Return the criterion of some frames, with flares that depart by a share from their shape."""
         light, extra = np.zeros_like(survey.sums), np.zeros(start.size)
-        for one, mine, photons, _ in fits:
-            light += mine[:, None] * survey.bank.directions[one.direction]
-            extra += photons + (epsilon * mine) ** 2
+        for one, rows, mine, photons, _ in fits:
+            light[rows] += mine[:, None] * survey.bank.directions[one.direction]
+            extra[rows] += photons + (epsilon * mine) ** 2
         total = PARAMETERS * size * sum(count for *_, count in fits)
         for process, column in zip(survey.processes, (survey.sums - light).T, strict=True):
             noise = (survey.variance * process.excess**2 + extra)[kept]
@@ -164,7 +170,9 @@ def _seen_once(survey: SeriesSurvey) -> bool:
     )
 
 
-def alternate(survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None = None) -> tuple[SeriesSurvey, Bool]:
+def alternate(
+    survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None = None, steps: Steps | None = None
+) -> tuple[SeriesSurvey, Bool]:
     """Fit process and events in alternation.
 
     Parameters
@@ -175,6 +183,8 @@ def alternate(survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None =
         First guess of the frames of events.
     before : SeriesSurvey, optional
         Survey of nearly the same frames, with processes; their terms are kept as long as the events hardly change.
+    steps : Steps, optional
+        Reports each fit and each search.
 
     Returns
     -------
@@ -185,8 +195,8 @@ def alternate(survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None =
     """
     taken = guessed
     for _ in range(ROUNDS):
-        fitted = fit_processes(survey, taken, before)
-        _, now = detect_events(fitted, PROVISIONAL)
+        fitted = fit_processes(survey, taken, before, steps)
+        _, now = detect_events(fitted, PROVISIONAL, steps)
         changed = float((now ^ taken).mean())
         taken = now
         if changed <= SETTLED:
@@ -196,11 +206,19 @@ def alternate(survey: SeriesSurvey, guessed: Bool, before: SeriesSurvey | None =
     return fitted, taken
 
 
-def detect_events(survey: SeriesSurvey, threshold: float) -> tuple[list[Detection], Bool]:
-    """Detect events above a threshold, the largest first, and return them in order of time with their frames."""
+def detect_events(survey: SeriesSurvey, threshold: float, steps: Steps | None = None) -> tuple[list[Detection], Bool]:
+    """Detect events above a threshold, the largest first, and return them in order of time with their frames.
+
+    Parameters
+    ----------
+    steps : Steps, optional
+        Reports each search.
+    """
+    steps = steps or Steps()
     n = survey.stare.n_frames
     taken, found = np.zeros(n, np.bool_), list[Detection]()
     light = np.zeros_like(survey.sums)
+    noise = float(np.sqrt(np.median(survey.variance))) * min(process.excess for process in survey.processes)
     search = survey.search
     for _ in range(MAX_PASSES):
         left = ~taken
@@ -210,18 +228,22 @@ def detect_events(survey: SeriesSurvey, threshold: float) -> tuple[list[Detectio
         if taken.any():
             search = ProcessSearch(part.bank, part.stare, part.processes, part.variance, search)
         new = _search_once(part, search, light[left], threshold)
+        steps.step()
         if not new:
             break
         for one in new:
             unit = survey.bank.directions[one.direction]
-            light += _template_light(survey, one)[:, None] * unit
-        mine = []
+            rows, flux = _light_of(survey, one.peak_s, one.half_width_s, one.amplitude)
+            light[rows] += flux[:, None] * unit
+        mine, free = [], int(left.sum())
         for one in new:
-            first, last = _extent(survey, taken, one)
+            first, last = _extent(survey, taken, noise, one)
             # Some frames are left for the level, the faintest of the event.
-            short = MIN_QUIET - int((~taken).sum()) + last - first + 1
-            mine.append((first, max(last - max(short, 0), first)))
-            taken[first : mine[-1][1] + 1] = True
+            short = MIN_QUIET - free + last - first + 1
+            last = max(last - max(short, 0), first)
+            mine.append((first, last))
+            free -= int(np.count_nonzero(~taken[first : last + 1]))
+            taken[first : last + 1] = True
         mine = _extended(survey, taken, mine, new)
         for (first, last), one in zip(mine, new, strict=True):
             taken[first : last + 1] = True
@@ -241,13 +263,14 @@ def _merged(found: list[Detection]) -> list[Detection]:
     return kept
 
 
-def _template_light(survey: SeriesSurvey, one: Detection) -> Float:
+def _light_of(
+    survey: SeriesSurvey, peak_s: float, half_width_s: float, amplitude: float
+) -> tuple[slice, Float]:  # fmt: skip
+    """Return the frames in which a flare is not negligible, and its mean in each, in the unit of the amplitude."""
     start = survey.stare.start_s
-    edges = np.column_stack([start, start + survey.stare.frame_s])
-    near = slice(*np.searchsorted(start, [one.peak_s - 5 * one.half_width_s, one.peak_s + 80 * one.half_width_s]))
-    light = np.zeros(start.size)
-    light[near] = one.amplitude * survey.bank.shape.mean_over(edges[near], one.peak_s, one.half_width_s)
-    return light
+    rows = slice(*np.searchsorted(start, [peak_s - REACH[0] * half_width_s, peak_s + REACH[1] * half_width_s]))
+    edges = np.column_stack([start[rows], start[rows] + survey.stare.frame_s])
+    return rows, amplitude * survey.bank.shape.mean_over(edges, peak_s, half_width_s)
 
 
 def _search_once(part: SeriesSurvey, search: ProcessSearch, light: Float, threshold: float) -> list[Detection]:
@@ -271,29 +294,26 @@ def _search_once(part: SeriesSurvey, search: ProcessSearch, light: Float, thresh
     order = np.argsort(values)[::-1][: 4 * MAX_EVENTS]
     scales = min(one.shortest_s for one in part.processes)
     scale = NEAR_SCALES * scales if np.isfinite(scales) else 0.0
-    waiting: list[tuple[float, float]] = []
-    for k in order:
+    peaks, reaches = np.empty((2, order.size))
+    for n, k in enumerate(order):
         one = places[int(k)]
-        reach = max(NEAR_WIDTHS * one.half_width_s, scale)
-        if not any(abs(one.peak_s - peak) <= max(reach, other) for peak, other in waiting):
+        peaks[n], reaches[n] = one.peak_s, max(NEAR_WIDTHS * one.half_width_s, scale)
+        if (np.abs(one.peak_s - peaks[:n]) > np.maximum(reaches[n], reaches[:n])).all():
             accepted.append(one)
-        waiting.append((one.peak_s, reach))
     return accepted
 
 
-def _extent(survey: SeriesSurvey, taken: Bool, one: Detection) -> tuple[int, int]:
-    """Return the first and last frame in which the template of an event is brighter than `FAINT`."""
-    middle = survey.stare.middle_s
-    excess = min(process.excess for process in survey.processes)
-    noise = float(np.sqrt(np.median(survey.variance))) * excess
+def _extent(survey: SeriesSurvey, taken: Bool, noise: float, one: Detection) -> tuple[int, int]:
+    """Return the first and last frame in which the template of an event is brighter than `FAINT` times the noise."""
     tau = np.linspace(0.0, LONGEST_TAIL, 1200)
     bright = tau[one.amplitude * survey.bank.shape.at(tau) > FAINT * noise]
     tail = max(1.0, float(bright[-1]) if bright.size else 0.0)
     frame_s = survey.stare.frame_s
     start = one.peak_s - BEGINNING * one.half_width_s - frame_s / 2
     stop = one.peak_s + tail * one.half_width_s + frame_s / 2
-    first, last = np.searchsorted(middle, [start, stop])
-    peak = int(np.clip(np.searchsorted(middle, one.peak_s), 0, middle.size - 1))
+    # As the middles of frames, at which they are looked up, but for half a frame.
+    first, last, peak = np.searchsorted(survey.stare.start_s, np.array([start, stop, one.peak_s]) - frame_s / 2)
+    peak = min(int(peak), survey.stare.n_frames - 1)
     first, last = min(int(first), peak), max(int(last) - 1, peak)
     # Other events end it.
     before, after = np.flatnonzero(taken[first:peak]), np.flatnonzero(taken[peak : last + 1])

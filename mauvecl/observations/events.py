@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mauvecl.observations.energies import Energy, measure_energy
 from mauvecl.observations.search import Detection, SeriesSurvey
+from mauvecl.observations.steps import Steps
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -52,15 +53,18 @@ class ObservedEvent:
 
 
 def measure_events(
-    survey: SeriesSurvey, taken: Bool, found: list[Detection], causes: Sequence[Kind] | None = None
-) -> list[ObservedEvent]:
+    survey: SeriesSurvey, taken: Bool, found: list[Detection], causes: Sequence[Kind] | None = None,
+    steps: Steps | None = None,
+) -> list[ObservedEvent]:  # fmt: skip
     """Measure detected events in order of time; `taken` are their frames, and `causes` follow from their spectra.
 
-    Weaker events next to a step or a dip belong to it.
+    Weaker events next to a step or a dip belong to it. `steps` reports each event.
     """
+    steps = steps or Steps()
     known: Sequence[Kind] = causes or ["flare"] * len(found)
     level = survey.flux_level(~taken)
-    events = [measure_event(survey, taken, level, *one) for one in zip(found, known, strict=True)]
+    each = steps.each(zip(found, known, strict=True), len(found))
+    events = [measure_event(survey, taken, level, *one) for one in each]
     for k, event in enumerate(events):
         ends = (event.first - 1, event.last + 1)
         sides = [each for each in events[max(0, k - 1) : k + 2] if each.last == ends[0] or each.first == ends[1]]
@@ -88,10 +92,9 @@ def measure_event(
     first, last = found.first, found.last
     rows = slice(first, last + 1)
     energy = measure_energy(survey, taken, level, found)
-    flux, numbers = (survey.flux - level)[rows] * survey.scale, survey.stare.numbers
+    flux, numbers = (survey.flux[rows] - level[rows]) * survey.scale, survey.stare.numbers
     ends = (first == 0, last == survey.stare.n_frames - 1)
-    gaps = np.diff(numbers) > GAP_FRAMES
-    cut = any(ends) or bool(gaps[first - 1]) or bool(gaps[last])
+    cut = any(ends) or bool((np.diff(numbers[[first - 1, first, last, last + 1]])[::2] > GAP_FRAMES).any())
     kind = cause
     if cause == "flare":
         # The sum over wavelength of spectra may fall during a flare, by a loss of light that their weights leave out.

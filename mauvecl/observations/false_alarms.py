@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.observations.level import process_level
+from mauvecl.observations.steps import Steps
 from mauvecl.schema.physical import DAY_S
 
 if TYPE_CHECKING:
@@ -95,7 +96,9 @@ class SimulatedRate:
         return float(brentq(lambda u: min(self._log_rate(u), 1e3) - goal, low, high, xtol=1e-4))
 
 
-def simulated_rates(survey: SeriesSurvey, quiet: Bool, rate: float, seed: int) -> tuple[SimulatedRate, SimulatedRate]:
+def simulated_rates(
+    survey: SeriesSurvey, quiet: Bool, rate: float, seed: int, steps: Steps | None = None
+) -> tuple[SimulatedRate, SimulatedRate]:
     """Return the false-alarm rates in light curves of the fitted process, and in those of measured residuals.
 
     Both have the covariance of the process, and levels are fitted and subtracted as in the search. The noise of the
@@ -108,7 +111,10 @@ def simulated_rates(survey: SeriesSurvey, quiet: Bool, rate: float, seed: int) -
         Searched frames that belong to no event.
     rate : float
         Smallest rate of interest, per star-day: enough light curves are drawn for `MIN_ALARMS`, up to a limit.
+    steps : Steps, optional
+        Reports each batch of light curves.
     """
+    steps = steps or Steps()
     residual = innovations(survey, quiet)
     part = survey.frames(np.arange(survey.stare.n_frames) < MAX_LENGTH)
     n, n_sum = part.sums.shape
@@ -120,8 +126,9 @@ def simulated_rates(survey: SeriesSurvey, quiet: Bool, rate: float, seed: int) -
     covariances = part.search.covariances
     counts = _mean_counts(survey, quiet)[:n] if survey.counts else None
     largest: tuple[list[Float], list[Float]] = ([], [])
-    for first in range(0, count, max(1, BATCH // (n * n_sum))):
-        size = min(max(1, BATCH // (n * n_sum)), count - first)
+    batch = max(1, BATCH // (n * n_sum))
+    for first in steps.each(range(0, count, batch), -(-count // batch)):
+        size = min(batch, count - first)
         starts = rng.integers(0, len(residual), (size, -(-n // length)))
         rows = (starts[:, :, None] + np.arange(length)) % len(residual)
         for white, found in zip(

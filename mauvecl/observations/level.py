@@ -10,6 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.observations.frames import Frames, Reason
+from mauvecl.observations.steps import Steps
 
 if TYPE_CHECKING:
     from mauvecl.observations.process import Process
@@ -32,6 +33,8 @@ JUMP, JUMP_FRAMES = 8.0, (1, 2, 3)
 DECAYED, WITHIN = 0.02, 3.0
 #: Largest share of the frames in guessed flares.
 MOST_GUESSED = 0.8
+#: Frames in which the end of a guessed flare is looked for first; the next pieces are longer.
+FIRST_PIECE = 256
 #: Largest mean of counts in a frame whose noise is treated as Poisson noise rather than as normal noise.
 MAX_COUNTS = 100.0
 #: Factor by which the noise of frames without weight exceeds the standard deviation of the process.
@@ -110,21 +113,29 @@ def guess_flares(numbers: NDArray[np.int64], flux: Float) -> Bool:
         rise = np.where(numbers[lag:] - numbers[:-lag] <= 2 * lag, flux[lag:] - flux[:-lag], 0.0)
         limit = JUMP * PER_MAD * float(np.median(np.abs(rise)))
         rises += [(float(rise[k]), int(k), lag) for k in np.flatnonzero(rise > max(limit, 1e-300))]
+    n_inside = 0
     for rise_of, start, _ in sorted(rises, reverse=True):
         if inside[start]:
             continue
-        before = float(flux[start])
-        faint = flux[start + 1 :] < before + max(WITHIN * noise, DECAYED * rise_of)
-        # Two faint frames in a row end the flare.
-        both = faint[:-1] & faint[1:]
-        # The first frames belong to the rise.
-        ends = np.flatnonzero(both[3:]) + 3
-        last = start + 1 + (int(ends[0]) if ends.size else faint.size)
-        new = inside.copy()
-        new[start + 1 : last + 1] = True
-        if new.mean() <= MOST_GUESSED:
-            inside = new
+        last = _first_faint(flux, start, float(flux[start]) + max(WITHIN * noise, DECAYED * rise_of))
+        more = int(np.count_nonzero(~inside[start + 1 : last + 1]))
+        if n_inside + more <= MOST_GUESSED * flux.size:
+            inside[start + 1 : last + 1] = True
+            n_inside += more
     return inside
+
+
+def _first_faint(flux: Float, start: int, limit: float) -> int:
+    """Return the first of two frames in a row below a limit, from the fourth after `start` on, or the end."""
+    # The first frames belong to the rise.
+    first, size = start + 4, FIRST_PIECE
+    while first + 1 < flux.size:
+        faint = flux[first : first + size + 1] < limit
+        ends = np.flatnonzero(faint[:-1] & faint[1:])
+        if ends.size:
+            return first + int(ends[0])
+        first, size = first + size, 2 * size
+    return flux.size
 
 
 def quiet_variance(flux: Float, error: Float | None, level: Float, quiet: Bool) -> tuple[Float, float]:
@@ -154,38 +165,67 @@ def process_level(process: Process, time_s: Float, values: Float, variance: Floa
         Variance of the noise of each value, without the excess of the process.
     quiet : ndarray of bool, shape (n,)
     """
-    columns = values.reshape(len(values), -1)
-    noise = variance * process.excess**2
-    one = process.covariance(time_s[quiet], noise[quiet])
-    level = one.solve(np.ones(int(quiet.sum())))
-    mean = level @ columns[quiet] / level.sum()
-    if not process.terms:
-        return np.asarray(np.broadcast_to(mean, columns.shape)).reshape(values.shape)
-    # Values without weight have a large variance; the mean of the process at a value is the value less its noise.
-    held = np.where(quiet[:, None], columns - mean, 0.0)
-    noise = np.where(quiet, noise, NO_WEIGHT**2 * (process.sd**2 + np.median(noise)))
-    solved = process.covariance(time_s, noise).solve(held)
-    return np.asarray(held - noise[:, None] * solved + mean).reshape(values.shape)
+    return LevelGiven(process, time_s, variance, quiet).of(values)
 
 
-def level_error(process: Process, time_s: Float, variance: Float, quiet: Bool, seed: int) -> Float:
+class LevelGiven:
+    """Means of a process at all times given quiescent values: one factorisation for all values at the same times.
+
+    Parameters
+    ----------
+    process, time_s, variance, quiet
+        As for `process_level`.
+    """
+
+    def __init__(self, process: Process, time_s: Float, variance: Float, quiet: Bool) -> None:
+        self.process, self.quiet = process, quiet
+        noise = variance * process.excess**2
+        self._weights = np.where(quiet, 1.0 / noise, 0.0)
+        if process.terms:
+            # Values without weight have a large variance.
+            self._noise = np.where(quiet, noise, NO_WEIGHT**2 * (process.sd**2 + np.median(noise)))
+            self._covariance = process.covariance(time_s, self._noise)
+            self._weights = np.where(quiet, self._covariance.solve(quiet.astype(np.float64)), 0.0)
+
+    @property
+    def constant_variance(self) -> float:
+        """Variance of the constant level."""
+        return 1.0 / float(self._weights.sum())
+
+    def of(self, values: Float) -> Float:
+        """Return the mean of the process given values, shape (n,) or (n, k) as these."""
+        columns = values.reshape(len(values), -1)
+        quiet, weights = self.quiet, self._weights
+        mean = weights[quiet] @ columns[quiet] / weights.sum()
+        if not self.process.terms:
+            return np.asarray(np.broadcast_to(mean, columns.shape)).reshape(values.shape)
+        held = np.where(quiet[:, None], columns - mean, 0.0)
+        # The mean of the process at a value is the value less its noise.
+        return np.asarray(held - self._noise[:, None] * self._covariance.solve(held) + mean).reshape(values.shape)
+
+
+def level_error(
+    process: Process, time_s: Float, variance: Float, quiet: Bool, seed: int, steps: Steps | None = None
+) -> Float:
     """Return the standard error of the mean of a process at all times, shape (n,).
 
     It is the scatter of differences between simulated processes and their means given noisy values (Matheron's rule),
-    with that of the constant level.
+    with that of the constant level. `steps` reports each of these.
     """
-    noise = variance * process.excess**2
-    fixed = process.covariance(time_s[quiet], noise[quiet]).solve(np.ones(int(quiet.sum()))).sum()
+    steps = steps or Steps()
+    given = LevelGiven(process, time_s, variance, quiet)
     if not process.terms:
-        return np.full(time_s.size, float(fixed**-0.5))
+        return np.full(time_s.size, given.constant_variance**0.5)
+    noise = variance * process.excess**2
     rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, LEVEL_KEY]))
     tiny = np.full(time_s.size, 1e-9 * (process.sd**2 + float(np.median(noise))))
+    simulated = process.covariance(time_s, tiny)
     total = np.zeros(time_s.size)
     draws = int(np.clip(LEVEL_VALUES // time_s.size, *LEVEL_DRAWS))
-    for _ in range(draws):
-        truth = process.covariance(time_s, tiny).coloured(rng.standard_normal(time_s.size))
+    for _ in steps.each(range(draws), draws):
+        truth = simulated.coloured(rng.standard_normal(time_s.size))
         seen = truth + np.sqrt(noise) * rng.standard_normal(time_s.size)
-        total += (process_level(process, time_s, seen, variance, quiet) - truth) ** 2
+        total += (given.of(seen) - truth) ** 2
     return np.sqrt(total / draws)
 
 

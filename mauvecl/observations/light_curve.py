@@ -24,6 +24,7 @@ from mauvecl.observations.level import (
 )
 from mauvecl.observations.losses import sudden_losses
 from mauvecl.observations.search import SeriesSurvey
+from mauvecl.observations.steps import Steps
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -38,8 +39,17 @@ MIN_USABLE = 10
 ROUNDS = 3
 
 
-def survey_light_curve(frames: Frames, shape: Shape, seed: int) -> tuple[SeriesSurvey, QuiescentLevel, Frames]:
+def survey_light_curve(
+    frames: Frames, shape: Shape, seed: int, steps: Steps | None = None
+) -> tuple[SeriesSurvey, QuiescentLevel, Frames]:
     """Fit the quiescent light of a light curve, and prepare its search.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the standard error of the level.
+    steps : Steps, optional
+        Reports fits, searches and draws.
 
     Returns
     -------
@@ -48,6 +58,8 @@ def survey_light_curve(frames: Frames, shape: Shape, seed: int) -> tuple[SeriesS
     frames : Frames
         With a remark, and without errors, if they hold few counts.
     """
+    steps = steps or Steps()
+    fits = steps.part(0.0, 0.9)
     counts = counts_per_unit(frames)
     if counts is not None:
         remark = "the frames hold few counts: their noise is Poisson noise of the level, and stated errors are not used"
@@ -69,7 +81,7 @@ def survey_light_curve(frames: Frames, shape: Shape, seed: int) -> tuple[SeriesS
         variance, photon = _noise(frames, flux, error, level, quiet, counts)
         typical = float(np.median(level[quiet]))
         new = SeriesSurvey.of(frames, flux, variance, used, typical, photon, shape, counts or 0.0)
-        survey, taken = fit_quiet_light(new, guessed[used], survey)
+        survey, taken = fit_quiet_light(new, guessed[used], survey, fits)
         if number == 0 and counts is None and (lost := sudden_losses(new, survey, taken)).any():
             reasons[used] |= np.where(lost, Reason.LOSS, 0)
             survey = None
@@ -88,7 +100,9 @@ def survey_light_curve(frames: Frames, shape: Shape, seed: int) -> tuple[SeriesS
     reasons = np.where(below, reasons | Reason.BELOW, reasons)
     used = reasons == 0
     survey = survey.frames(used[searched_among(survey, frames)])
-    return survey, quiescent_light(frames, flux, error, survey, used, used & ~guessed, reasons, seed), frames
+    draws = steps.part(0.9, 1.0)
+    light = quiescent_light(frames, flux, error, survey, used, used & ~guessed, reasons, seed, draws)
+    return survey, light, frames
 
 
 def searched_among(survey: SeriesSurvey, frames: Frames) -> NDArray[np.intp]:
@@ -165,7 +179,7 @@ def _single(
 
 def quiescent_light(
     frames: Frames, flux: Float, error: Float | None, survey: SeriesSurvey, used: Bool, quiet: Bool,
-    reasons: NDArray[np.int64], seed: int,
+    reasons: NDArray[np.int64], seed: int, steps: Steps,
 ) -> QuiescentLevel:  # fmt: skip
     """Return level, its error, and noise of all frames."""
     process, time = survey.flux_process, survey.stare.start_s
@@ -177,7 +191,7 @@ def quiescent_light(
 
     return QuiescentLevel(
         level,
-        everywhere(level_error(process, time, survey.flux_variance, part, seed)),
+        everywhere(level_error(process, time, survey.flux_variance, part, seed, steps)),
         everywhere(np.sqrt(survey.flux_variance) * process.excess),
         process.excess if error is not None else float("nan"),
         quiet,

@@ -96,18 +96,16 @@ def binned_scatter(numbers: NDArray[np.int64], residual: Float) -> list[Scatter]
         Flux of quiescent frames less their level, in units of the noise of one frame.
     """
     found = []
+    # Place of each frame among consecutive ones, and their number.
+    first = np.flatnonzero(np.diff(numbers, prepend=numbers[:1] - 2) != 1)
+    lengths = np.diff(np.append(first, numbers.size))
+    place, length = np.arange(numbers.size) - np.repeat(first, lengths), np.repeat(lengths, lengths)
     for size in BINS:
-        starts = np.arange(0, numbers.size - size + 1)
-        whole = starts[numbers[starts + size - 1] - numbers[starts] == size - 1]
-        # Bins do not overlap.
-        kept, free = [], -1
-        for start in whole:
-            if start > free:
-                kept.append(int(start))
-                free = int(start) + size - 1
+        # Bins do not overlap, and begin with the first frame after a gap.
+        kept = np.flatnonzero((place % size == 0) & (place + size <= length))
         if len(kept) < MIN_BINS:
             break
-        means = residual[np.array(kept)[:, None] + np.arange(size)].mean(axis=1)
+        means = residual[kept[:, None] + np.arange(size)].mean(axis=1)
         dof = len(kept) - 1
         low, high = (float(np.sqrt(scipy.stats.chi2.ppf(p, dof) / dof / size)) for p in (0.025, 0.975))
         found.append(Scatter(size, len(kept), float(means.std(ddof=1)), size**-0.5, low, high))

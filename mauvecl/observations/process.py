@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.observations.steps import Steps
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
@@ -155,6 +156,10 @@ class Process:
             return np.zeros(np.shape(lags_s))
         return np.asarray(self.kernel().get_value(np.abs(lags_s)))
 
+    def times(self, time_s: Float, weights: Float) -> Float:
+        """Return the covariance of the process at ascending times with its weighted sum at the same times."""
+        return np.asarray(self.kernel().dot(time_s, np.zeros(time_s.size), weights)).reshape(time_s.shape)
+
     def covariance(self, time_s: Float, variance: Float) -> Covariance:
         """Return the covariance of values at ascending times, with the variance of each value's noise."""
         return Covariance(self.kernel(), time_s, variance)
@@ -220,6 +225,22 @@ class Covariance:
         """
         sd = np.sqrt(self._d[self._d.size - len(values) :])
         return np.asarray(self._solved_lower(values) / sd[:, None]).reshape(np.shape(values))
+
+    def squared_norms(self, columns: Float, first: int) -> Float:
+        """Return v^T C^-1 v of each column, shape (n_column,), without the innovations after its last value.
+
+        Parameters
+        ----------
+        columns : ndarray, shape (n, n_column)
+            Values from a time on, with zeros at all times before; they are overwritten.
+        first : int
+            Number of this time.
+        """
+        rows = slice(first, first + len(columns))
+        innovations = self._driver.solve_lower(
+            self._time[rows], self._rates, self._u[rows], self._w[rows], columns, columns
+        )
+        return np.asarray((1.0 / self._d[rows]) @ np.square(innovations, out=innovations))
 
     def coloured(self, white: Float) -> Float:
         """Return values of this covariance from innovations, shape (n,) or (n, k)."""
@@ -287,7 +308,7 @@ class Binned:
         return cls(total(time_s) / count, total(values) / count, total(variance) / count**2, factor * step_s)
 
 
-def fit_process(data: Binned, start: Process | None = None) -> Process:
+def fit_process(data: Binned, start: Process | None = None, steps: Steps | None = None) -> Process:
     """Fit a process to a light curve without flares.
 
     Parameters
@@ -295,7 +316,10 @@ def fit_process(data: Binned, start: Process | None = None) -> Process:
     data : Binned
     start : Process, optional
         Process of nearly the same data: its terms are kept, and their parameters are the starting point.
+    steps : Steps, optional
+        Reports each combination of terms.
     """
+    steps = steps or Steps()
     noise = max(data.noise / float(np.sqrt(np.median(data.variance))), 1e-6)
     if start is not None:
         process = _fitted(data, start.terms, np.log(start.excess))[0]
@@ -304,11 +328,11 @@ def fit_process(data: Binned, start: Process | None = None) -> Process:
     tried = {best.name: value}
     while len(best.terms) < MAX_TERMS:
         size = best.n_parameters
-        options = [
-            _fitted(data, (*best.terms, term), np.log(best.excess))
-            for term in _starts(data, best)
-            if (size + SIZES[term.kind]) * VALUES_PER_PARAMETER <= data.values.size
-        ]
+        options = []
+        for term in _starts(data, best):
+            if (size + SIZES[term.kind]) * VALUES_PER_PARAMETER <= data.values.size:
+                options.append(_fitted(data, (*best.terms, term), np.log(best.excess)))
+                steps.step()
         tried |= {one.name: min(bic, tried.get(one.name, np.inf)) for one, bic in options}
         other, lowest = min(options, key=lambda pair: pair[1], default=(best, np.inf))
         if not lowest < value:

@@ -251,17 +251,18 @@ class ProcessSearch:
         else:
             key = (template.half_width_s, phase, k)
             earlier = None if self._before is None else self._before._norms_of[key]
-            one = self._solved(process, variance, shape, first, peaks) if earlier is None else self._updated(
-                earlier, process, variance, shape, first, peaks
+            one = self._solved(k, variance, shape, first, peaks) if earlier is None else self._updated(
+                earlier, k, shape, first, peaks
             )  # fmt: skip
             self._norms_of[key] = one
             norm, full = one.norm, np.full(peaks.size, one.unit)
         return np.maximum(norm - shared**2 / level.sum(), 0.0), full
 
     def _solved(
-        self, process: Process, variance: Float, shape: Float, first: int, peaks: NDArray[np.int64]
-    ) -> SolvedNorms:
-        """Compute s^T C^-1 s at peaks."""
+        self, k: int, variance: Float, shape: Float, first: int, peaks: NDArray[np.int64]
+    ) -> SolvedNorms:  # fmt: skip
+        """Compute s^T C^-1 s of a sum at peaks."""
+        process = self.processes[k]
         margin = int(np.clip(MARGIN * shape.size, LEAST_MARGIN, MOST_MARGIN))
         typical, frame_s = float(np.median(variance)), self.bank.frame_s
         size = shape.size + 2 * margin
@@ -288,13 +289,10 @@ class ProcessSearch:
         norm = np.maximum(unit - missing, 0.0)
         norm = norm / np.maximum(1.0 + _correlated(moved, squares, start)[peaks] / unit, 0.1)
         one = SolvedNorms(norm, unit, centre, squares, margin, self.frames[0] + peaks)
-        self._solve(one, share[size + peaks] > one.irregular, process, variance, shape, first, peaks)
+        self._solve(one, share[size + peaks] > one.irregular, k, shape, first, peaks)
         return one
 
-    def _updated(
-        self, earlier: SolvedNorms, process: Process, variance: Float, shape: Float, first: int,
-        peaks: NDArray[np.int64],
-    ) -> SolvedNorms:  # fmt: skip
+    def _updated(self, earlier: SolvedNorms, k: int, shape: Float, first: int, peaks: NDArray[np.int64]) -> SolvedNorms:
         """Return earlier norms at peaks, solved anew where frames that are missing now contribute to them."""
         assert self._before is not None
         before = self._before
@@ -305,36 +303,37 @@ class ProcessSearch:
         part = np.searchsorted(earlier.frames, self.frames[0] + peaks)
         one = replace(earlier, norm=earlier.norm[part], frames=earlier.frames[part])
         share = _correlated(gone, earlier.squares, first - earlier.margin)[origin + peaks]
-        self._solve(one, share > CHANGED * one.irregular, process, variance, shape, first, peaks)
+        self._solve(one, share > CHANGED * one.irregular, k, shape, first, peaks)
         return one
 
     def _solve(
-        self, one: SolvedNorms, chosen: Bool, process: Process, variance: Float, shape: Float, first: int,
-        peaks: NDArray[np.int64],
-    ) -> None:  # fmt: skip
+        self, one: SolvedNorms, chosen: Bool, k: int, shape: Float, first: int, peaks: NDArray[np.int64]
+    ) -> None:
         """Replace norms by exact ones at chosen onsets."""
         left = np.flatnonzero(chosen)
+        starts = peaks[left] + first
         while left.size:
-            near = peaks[left] - peaks[left[0]] <= max(CHUNK_FRAMES, shape.size)
-            near &= np.arange(left.size) < CHUNK_TEMPLATES
-            part, left = left[near], left[~near]
-            one.norm[part] = self._exact(process, variance, shape, peaks[part] + first, one.margin)
+            stop = int(np.searchsorted(starts, starts[0] + max(CHUNK_FRAMES, shape.size), side="right"))
+            stop = min(stop, CHUNK_TEMPLATES)
+            one.norm[left[:stop]] = self._exact(k, shape, starts[:stop], one.margin)
+            left, starts = left[stop:], starts[stop:]
 
-    def _exact(self, process: Process, variance: Float, shape: Float, starts: NDArray[np.int64], margin: int) -> Float:
-        """Return s^T C^-1 s of a shape that starts at some frames of the grid, shape (n_start,)."""
-        low, high = np.searchsorted(self.at, [starts[0] - MOST_MARGIN, starts[-1] + shape.size + margin])
-        # The innovations of a template are zero before its first frame.
-        begin = int(np.searchsorted(self.at, starts[0]))
-        if high <= begin:
+    def _exact(self, k: int, shape: Float, starts: NDArray[np.int64], margin: int) -> Float:
+        """Return s^T C^-1 s of a shape that starts at some frames of the grid, shape (n_start,).
+
+        The innovations of a template are zero before its first frame, and are neglected from `margin` frames after its
+        last.
+        """
+        begin, end, stop = np.searchsorted(
+            self.at, [starts[0], starts[-1] + shape.size, starts[-1] + shape.size + margin]
+        )
+        if stop <= begin:
             return np.zeros(starts.size)
-        at = self.at[begin:high]
-        columns = np.zeros((at.size, starts.size))
-        for column, start, (first, last) in zip(
-            columns.T, starts, np.searchsorted(at, np.stack([starts, starts + shape.size], axis=1)), strict=True
-        ):
-            column[first:last] = shape[at[first:last] - start]
-        white = process.covariance(self.stare.start_s[low:high], variance[low:high]).whitened(columns)
-        return np.asarray(np.einsum("to,to->o", white, white))
+        columns = np.zeros((stop - begin, starts.size))
+        padded = np.pad(shape, 1)
+        place = self.at[begin:end, None] - starts + 1
+        columns[: end - begin] = padded[np.clip(place, 0, shape.size + 1, out=place)]
+        return self.covariances[k].squared_norms(columns, int(begin))
 
 
 def _correlated(values: Float, kernel: Float, first: int) -> Float:

@@ -22,6 +22,7 @@ from mauvecl.observations.level import PER_MAD, QuiescentLevel, guess_flares, si
 from mauvecl.observations.light_changes import LightChange, light_changes
 from mauvecl.observations.light_curve import check_usable, quiescent_light, searched_among
 from mauvecl.observations.search import WHITE, SeriesSurvey, bank_of, stare_of
+from mauvecl.observations.steps import Steps
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.nuisances import Nuisances
 
@@ -208,6 +209,7 @@ def survey_spectra(
     rank: int,
     seed: int,
     jitters: Mapping[str, float] | None = None,
+    steps: Steps | None = None,
 ) -> tuple[SeriesSurvey, SpectralSeries, QuiescentLevel]:
     """Prepare the search of spectra that is weighted for flares.
 
@@ -224,6 +226,8 @@ def survey_spectra(
     jitters : mapping of str to float, optional
         Standard deviations of unknowns of each frame, infinite for those that are projected out. Where they do not
         state it, that of the light is infinite and that of the dark current as measured.
+    steps : Steps, optional
+        Reports fits, searches and draws.
 
     Returns
     -------
@@ -232,6 +236,8 @@ def survey_spectra(
     level : QuiescentLevel
         Of the sum over wavelength, with flags of single frames that only the weighted sums show.
     """
+    steps = steps or Steps()
+    fits = steps.part(0.0, 0.9)
     frames = cleaned.frames
     flux, error = frames.white_light
     assert error is not None
@@ -256,7 +262,7 @@ def survey_spectra(
             flux[used] / scale, variance, WHITE, scale, abs(float(np.median(flux[used & ~events]))), photon,
             frames.time_s[used], weighted=True,
         )  # fmt: skip
-        survey, taken = fit_quiet_light(survey, events[used])
+        survey, taken = fit_quiet_light(survey, events[used], None, fits)
         now = np.zeros(flux.size, np.bool_)
         now[used] = taken
         sigmas = np.zeros(flux.size)
@@ -271,7 +277,8 @@ def survey_spectra(
     kept = reasons[searched_among(survey, frames)] == 0
     survey = survey.frames(kept)
     series = replace(series, excess=series.excess[used])
-    level = quiescent_light(frames, flux, frames.error, survey, used, used & ~events, reasons, seed)
+    draws = steps.part(0.9, 1.0)
+    level = quiescent_light(frames, flux, frames.error, survey, used, used & ~events, reasons, seed, draws)
     return survey, series, level
 
 
