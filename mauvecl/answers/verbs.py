@@ -316,6 +316,7 @@ VERBS: dict[str, Verb] = {
                 "search.per",
                 "run.seed",
             ),
+            counts="frames",
             without="observation.exposure_s",
             tab=True,
         ),

@@ -32,8 +32,8 @@ class Meter:
     # Returns the progress of a pool, with parts from a checkpoint and parts that were counted again.
     standing: Callable[[], PoolProgress] | None = None
 
-    def __init__(self, *, quiet: bool = False, unit: str = "realisations") -> None:
-        self._quiet, self._unit = quiet, unit
+    def __init__(self, *, quiet: bool = False, unit: str = "realisations", work: str = "drawing") -> None:
+        self._quiet, self._unit, self._work = quiet, unit, work
         self._started = self._shown = time.monotonic()
         self._last = self._total = 0
         self._bar: Progress | None = None
@@ -92,7 +92,7 @@ class Meter:
 
         if self._bar is None:
             self._bar = Progress(
-                TextColumn("drawing"),
+                TextColumn(self._work),
                 BarColumn(),
                 TaskProgressColumn(),
                 TextColumn(f"{{task.fields[rate]}} {self._unit}/s"),

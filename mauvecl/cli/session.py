@@ -135,11 +135,11 @@ class Session:
         if self.pictures and available():
             canvas()
 
-    def metered(self, unit: str) -> Meter:
-        """Return the progress in a unit, for a `with` block."""
+    def metered(self, unit: str, work: str = "drawing") -> Meter:
+        """Return the progress in a unit, for a `with` block; a word names the work."""
         from mauvecl.cli.console import Meter
 
-        return Meter(quiet=self.quiet or self.as_json, unit=unit)
+        return Meter(quiet=self.quiet or self.as_json, unit=unit, work=work)
 
     def _kept(self, checkpoint: Checkpoint) -> str:
         kept = checkpoint.kept

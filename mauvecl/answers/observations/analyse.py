@@ -550,8 +550,10 @@ def analyse(
         Its sections `data` and `search`: `data.file` is read, `search.false_alarms` are allowed for a detection. With
         `data.barycentric` times become those at the Solar System's barycentre, by the satellite's orbit.
         Fainter events are candidates, down to one false alarm per star-day.
-    engine, progress : optional
+    engine : optional
         Not used: nothing is drawn on a device.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in frames, as the share of the work that is done; may raise to stop it.
     frames : Frames, optional
         Frames in memory, in place of the file.
     """
@@ -571,9 +573,26 @@ def analyse(
     analysis = analyse_frames(
         frames, false_alarms=search.false_alarms, per=search.per, shape=search.shape, seed=study.run.seed,
         model=model if isinstance(model, FrameModel) else None, rank=search.sums, jitters=jitters,
-        temperature_k=study.flare.temperature_k,
+        temperature_k=study.flare.temperature_k, report=_in_frames(progress, frames.n_frames),
     )  # fmt: skip
     return AnalyseAnswer(study, analysis, model if isinstance(model, str) else "")
+
+
+def _in_frames(progress: Callable[[int, int], None] | None, total: int) -> Callable[[float], None] | None:
+    """Return a function of the share that is done, which reports it in whole frames whenever their number rises."""
+    if progress is None:
+        return None
+    last = -1
+
+    def report(share: float) -> None:
+        nonlocal last
+        done = round(share * total)
+        if done > last:
+            last = done
+            progress(done, total)
+
+    report(0.0)
+    return report
 
 
 def frame_model(study: Study, frames: Frames) -> FrameModel | str:
