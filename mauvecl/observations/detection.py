@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mauvecl.observations.energies import REACH, flares_of
 from mauvecl.observations.process import Binned, Process, fit_process, level_fit
-from mauvecl.observations.process_search import ProcessSearch
+from mauvecl.observations.process_search import FilterRow, ProcessSearch
 from mauvecl.observations.search import Detection, SeriesSurvey
 from mauvecl.observations.steps import Steps
 
@@ -276,30 +276,31 @@ def _light_of(
 def _search_once(part: SeriesSurvey, search: ProcessSearch, light: Float, threshold: float) -> list[Detection]:
     """Return the largest events among the frames that are left, at most one near another."""
     both = np.stack([part.sums, UNCERTAIN * light]) if light.any() else part.sums[None]
-    values, places = [], []
+    # Local maxima above the threshold, of which there are many where the process does not describe the light.
+    found: list[tuple[FilterRow, NDArray[np.intp], NDArray[np.intp], Float, Float]] = []
     for row, rho in search.values(both):
         excess = rho[0] - np.abs(np.where(np.isfinite(rho[1]), rho[1], 0.0)) if len(rho) > 1 else rho[0]
         direction = excess.argmax(axis=0)
         best = excess[direction, np.arange(excess.shape[1])]
         # Local maxima only: neighbours belong to the same event.
         top = (best >= np.append(best[1:], -np.inf)) & (best >= np.insert(best[:-1], 0, -np.inf))
-        for onset in np.flatnonzero(top & (best >= threshold)):
-            along = int(direction[onset])
-            value = float(rho[0, along, onset])
-            amplitude = value / float(row.per_amplitude[along, onset])
-            peak = float(search.peak_s(row, np.array([onset]))[0])
-            places.append(Detection(value, row.template.half_width_s, peak, along, amplitude, 0, 0))
-            values.append(float(best[onset]))
-    accepted: list[Detection] = []
-    order = np.argsort(values)[::-1][: 4 * MAX_EVENTS]
+        onset = np.flatnonzero(top & (best >= threshold))
+        found.append((row, onset, direction[onset], rho[0, direction[onset], onset], best[onset]))
+    which = np.repeat(np.arange(len(found)), [onset.size for _, onset, *_ in found])
+    onsets, directions, values, bests = (np.concatenate([one[k] for one in found]) for k in range(1, 5))
+    order = np.argsort(bests)[::-1][: 4 * MAX_EVENTS]
     scales = min(one.shortest_s for one in part.processes)
     scale = NEAR_SCALES * scales if np.isfinite(scales) else 0.0
+    accepted: list[Detection] = []
     peaks, reaches = np.empty((2, order.size))
     for n, k in enumerate(order):
-        one = places[int(k)]
-        peaks[n], reaches[n] = one.peak_s, max(NEAR_WIDTHS * one.half_width_s, scale)
-        if (np.abs(one.peak_s - peaks[:n]) > np.maximum(reaches[n], reaches[:n])).all():
-            accepted.append(one)
+        row, onset = found[which[k]][0], onsets[k]
+        peak, half_width = float(search.peak_s(row, np.array([onset]))[0]), row.template.half_width_s
+        peaks[n], reaches[n] = peak, max(NEAR_WIDTHS * half_width, scale)
+        if (np.abs(peak - peaks[:n]) > np.maximum(reaches[n], reaches[:n])).all():
+            along, value = int(directions[k]), float(values[k])
+            amplitude = value / float(row.per_amplitude[along, onset])
+            accepted.append(Detection(value, half_width, peak, along, amplitude, 0, 0))
     return accepted
 
 

@@ -82,7 +82,7 @@ def survey_light_curve(
         typical = float(np.median(level[quiet]))
         new = SeriesSurvey.of(frames, flux, variance, used, typical, photon, shape, counts or 0.0)
         survey, taken = fit_quiet_light(new, guessed[used], survey, fits)
-        if number == 0 and counts is None and (lost := sudden_losses(new, survey, taken)).any():
+        if number == 0 and counts is None and (lost := sudden_losses(new, survey, taken, fits)).any():
             reasons[used] |= np.where(lost, Reason.LOSS, 0)
             survey = None
             continue

@@ -24,6 +24,7 @@ from mauvecl.observations.search import bank_of
 
 if TYPE_CHECKING:
     from mauvecl.observations.search import SeriesSurvey
+    from mauvecl.observations.steps import Steps
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -65,7 +66,7 @@ class Loss(Shape):
         return np.clip(1.0 - np.asarray(tau, np.float64), 0.0, 2.0)
 
 
-def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool) -> Bool:
+def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps: Steps | None = None) -> Bool:
     """Return the frames in which light is lost, if losses explain a light curve better than flares do.
 
     Without losses, a star does not flare in many of its frames, keeps its noise, and varies slowly. Where that does not
@@ -78,6 +79,8 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool) -> Bo
     fitted : SeriesSurvey
     taken : ndarray of bool, shape (n_frame,)
         Process and events of `fit_quiet_light`.
+    steps : Steps, optional
+        Reports each fit and each search.
 
     Returns
     -------
@@ -94,14 +97,14 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool) -> Bo
     survey, fitted, taken = survey.frames(dark), fitted.frames(dark), taken[dark]
     down = replace(survey.inverted(), bank=bank_of(survey.stare, survey.bank.directions, Loss()))
     # Losses in independent noise are the first guess: a process that is fitted to losses would hide them.
-    guessed = detect_events(down, PROVISIONAL)[1]
+    guessed = detect_events(down, PROVISIONAL, steps)[1]
     # Those of a star that varies are most of its frames; eclipses repeat.
     if guessed.mean() >= MOST_LOST and (lost := _eclipses(survey, criterion(fitted, taken))).any():
         none[dark] = lost
         return none
     if not (many or restless):
         return none
-    other, losses = alternate(down, guessed)
+    other, losses = alternate(down, guessed, None, steps)
     if 0 < losses.mean() < MOST_LOST and criterion(other, losses, shapeless=True) < criterion(fitted, taken):
         none[dark] = losses
     return none

@@ -226,21 +226,35 @@ class Covariance:
         sd = np.sqrt(self._d[self._d.size - len(values) :])
         return np.asarray(self._solved_lower(values) / sd[:, None]).reshape(np.shape(values))
 
-    def squared_norms(self, columns: Float, first: int) -> Float:
-        """Return v^T C^-1 v of each column, shape (n_column,), without the innovations after its last value.
+    def squared_norms(self, columns: Float, first: int, after: int) -> Float:
+        """Return v^T C^-1 v of each column, shape (n_column,).
+
+        Innovations after the last value follow from the state of the recursion there, so that their sum of squares is a
+        quadratic form of as many variables as the process has, the same for all columns.
 
         Parameters
         ----------
         columns : ndarray, shape (n, n_column)
-            Values from a time on, with zeros at all times before; they are overwritten.
+            Values from a time on, with zeros at all times before and after; they are overwritten.
         first : int
             Number of this time.
+        after : int
+            Number of times after the values from which innovations are neglected.
         """
-        rows = slice(first, first + len(columns))
-        innovations = self._driver.solve_lower(
-            self._time[rows], self._rates, self._u[rows], self._w[rows], columns, columns
-        )
-        return np.asarray((1.0 / self._d[rows]) @ np.square(innovations, out=innovations))
+        last = first + len(columns)
+        rows, rest = slice(first, last), slice(last, last + after)
+        time, rates, solve = self._time, self._rates, self._driver.solve_lower
+        innovations = solve(time[rows], rates, self._u[rows], self._w[rows], columns, columns)
+        total = 0.0
+        if time[rest].size:
+            decay = np.exp((time[rows, None] - time[last]) * rates)
+            state = (decay * self._w[rows]).T @ innovations
+            # Innovations of each unit state.
+            units = -self._u[rest] * np.exp((time[last] - time[rest, None]) * rates)
+            units = solve(time[rest], rates, self._u[rest], self._w[rest], units, units)
+            form = (units / self._d[rest, None]).T @ units
+            total = np.einsum("jo,jo->o", state, form @ state)
+        return np.asarray((1.0 / self._d[rows]) @ np.square(innovations, out=innovations) + total)
 
     def coloured(self, white: Float) -> Float:
         """Return values of this covariance from innovations, shape (n,) or (n, k)."""

@@ -315,25 +315,21 @@ class ProcessSearch:
         while left.size:
             stop = int(np.searchsorted(starts, starts[0] + max(CHUNK_FRAMES, shape.size), side="right"))
             stop = min(stop, CHUNK_TEMPLATES)
-            one.norm[left[:stop]] = self._exact(k, shape, starts[:stop], one.margin)
+            one.norm[left[:stop]] = self._exact(k, shape, starts[:stop])
             left, starts = left[stop:], starts[stop:]
 
-    def _exact(self, k: int, shape: Float, starts: NDArray[np.int64], margin: int) -> Float:
+    def _exact(self, k: int, shape: Float, starts: NDArray[np.int64]) -> Float:
         """Return s^T C^-1 s of a shape that starts at some frames of the grid, shape (n_start,).
 
-        The innovations of a template are zero before its first frame, and are neglected from `margin` frames after its
-        last.
+        The innovations of a template are zero before its first frame, and are neglected `MOST_MARGIN` frames after it.
         """
-        begin, end, stop = np.searchsorted(
-            self.at, [starts[0], starts[-1] + shape.size, starts[-1] + shape.size + margin]
-        )
-        if stop <= begin:
+        begin, end = np.searchsorted(self.at, [starts[0], starts[-1] + shape.size])
+        if end <= begin:
             return np.zeros(starts.size)
-        columns = np.zeros((stop - begin, starts.size))
         padded = np.pad(shape, 1)
         place = self.at[begin:end, None] - starts + 1
-        columns[: end - begin] = padded[np.clip(place, 0, shape.size + 1, out=place)]
-        return self.covariances[k].squared_norms(columns, int(begin))
+        columns = padded[np.clip(place, 0, shape.size + 1, out=place)]
+        return self.covariances[k].squared_norms(columns, int(begin), MOST_MARGIN)
 
 
 def _correlated(values: Float, kernel: Float, first: int) -> Float:

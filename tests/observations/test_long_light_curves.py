@@ -116,10 +116,15 @@ def test_end_of_a_guessed_flare_is_looked_for_near_it(monkeypatch: pytest.Monkey
     np.testing.assert_array_equal(level.guess_flares(np.arange(3000), flux), whole)
 
 
-def test_level_norms_and_covariances_are_those_of_the_matrices() -> None:
+@pytest.mark.parametrize(
+    "term",
+    [ProcessTerm("rotation", (1.0, 8.0, 1.0, 0.1, -0.5)), ProcessTerm("correlated", (0.5, 6.0)), *SMOOTH.terms],
+    ids=lambda term: term.kind,
+)
+def test_level_norms_and_covariances_are_those_of_the_matrices(term: ProcessTerm) -> None:
     rng = np.random.default_rng(8)
     time = np.sort(rng.choice(900, 500, replace=False)) * CADENCE_S
-    model = Process((ProcessTerm("smooth", (np.log(3.0), np.log(2000.0))), SMOOTH.terms[0]), 1.1)
+    model = Process((ProcessTerm("smooth", (np.log(3.0), np.log(2000.0))), term), 1.1)
     variance = rng.uniform(0.8, 1.3, time.size)
     quiet = rng.random(time.size) < 0.8
     values = rng.normal(1000.0, 2.0, (time.size, 2))
@@ -132,11 +137,10 @@ def test_level_norms_and_covariances_are_those_of_the_matrices() -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-8)
     weights = np.where(np.arange(time.size) % 90 < 20, rng.random(time.size), 0.0)
     np.testing.assert_allclose(model.times(time, weights), between @ weights, rtol=1e-9)
-    columns = np.zeros((time.size - 30, 3))
-    columns[:40] = rng.normal(size=(40, 3))
-    padded = np.pad(columns, [(30, 0), (0, 0)])
+    columns = rng.normal(size=(40, 3))
+    padded = np.pad(columns, [(30, time.size - 70), (0, 0)])
     exact = np.einsum("ik,ik->k", padded, np.linalg.solve(between + np.diag(noise), padded))
-    np.testing.assert_allclose(model.covariance(time, noise).squared_norms(columns.copy(), 30), exact, rtol=1e-9)
+    np.testing.assert_allclose(model.covariance(time, noise).squared_norms(columns, 30, time.size), exact, rtol=1e-9)
 
 
 def test_means_of_consecutive_frames_do_not_overlap_and_have_no_gaps() -> None:
