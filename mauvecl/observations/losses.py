@@ -32,6 +32,8 @@ Bool = NDArray[np.bool_]
 #: Share of the frames in events of a star whose light is constant, and of one that rotates, and noise relative to the
 #: stated one, above which losses are tried (assumed).
 MOST_FLARING, MOST_ACTIVE, MOST_EXCESS = 0.1, 0.3, 1.5
+#: Time scale from which a process is slow, however long the light curve (assumed: 10 d): no sudden loss feigns it.
+SLOW_S = 864_000.0
 #: Largest share of the frames in losses; more of them are the level of the star, before or after a step (assumed).
 MOST_LOST = 0.4
 #: Standard deviations of a frame above the median of a constant light from which frames belong to flares; their number
@@ -88,7 +90,8 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
     """
     none, process = np.zeros_like(taken), fitted.flux_process
     rotates = any(term.kind == "rotation" for term in process.terms)
-    fast = any(term.kind != "rotation" and term.scale_s < survey.stare.duration_s / 3 for term in process.terms)
+    slow_s = min(survey.stare.duration_s / 3, SLOW_S)
+    fast = any(term.kind != "rotation" and term.scale_s < slow_s for term in process.terms)
     restless = process.excess > MOST_EXCESS or fast
     if survey.weighted or not (taken.mean() > MOST_FLARING or restless):
         return none
