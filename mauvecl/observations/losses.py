@@ -32,8 +32,9 @@ Bool = NDArray[np.bool_]
 #: Share of the frames in events of a star whose light is constant, and of one that rotates, and noise relative to the
 #: stated one, above which losses are tried (assumed).
 MOST_FLARING, MOST_ACTIVE, MOST_EXCESS = 0.1, 0.3, 1.5
-#: Time scale from which a process is slow, however long the light curve (assumed: 10 d): no sudden loss feigns it.
-SLOW_S = 864_000.0
+#: Time scale from which a process is slow, however long the light curve (assumed: 2 d, twelve times the longest loss
+#: that is searched).
+SLOW_S = 172_800.0
 #: Largest share of the frames in losses; more of them are the level of the star, before or after a step (assumed).
 MOST_LOST = 0.4
 #: Standard deviations of a frame above the median of a constant light from which frames belong to flares; their number
