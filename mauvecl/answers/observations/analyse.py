@@ -260,8 +260,8 @@ EVENTS = (
     Column("significant", "significant", "", "whether the rate is at most the wanted one", kind=bool),
     Column("verdict", "verdict", "", "detected: a flare with at most the wanted rate; candidate: a flare with a larger "
            "one, one like the changes of throughput in these frames, or one whose frames are together not brighter "
-           "than the level; rejected: it resembles a flare, but its spectrum or shape is of another kind; undecided: the "
-           "false-alarm rate is not known", "verdict", kind=str),
+           "than the level; rejected: it resembles a flare, but its spectrum or shape is of another kind; undecided: "
+           "the false-alarm rate is not known", "verdict", kind=str),
     Column("blue_over_red", lambda row: row.colour[0], "", "rise relative to the star in the blue half of the pixels "
            "over that in the red half: 1 for a change of throughput; nan: no spectra", "blue/red", number(".3g")),
     Column("blue_over_red_error", lambda row: row.colour[1], "", "its standard error"),
