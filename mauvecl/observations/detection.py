@@ -12,7 +12,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.observations.energies import REACH, flares_of
+from mauvecl.observations.event_fits import flares_of
+from mauvecl.observations.event_windows import REACH
 from mauvecl.observations.process import Binned, Process, fit_process, level_fit
 from mauvecl.observations.process_search import FilterRow, ProcessSearch
 from mauvecl.observations.search import Detection, SeriesSurvey

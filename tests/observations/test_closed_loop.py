@@ -79,7 +79,7 @@ def test_long_flares_are_fitted_in_bins_with_the_same_result(threshold: float, m
     (best,) = found
     fits = []
     for bins in (400, 150):
-        monkeypatch.setattr("mauvecl.observations.energies.MAX_INSIDE", bins)
+        monkeypatch.setattr("mauvecl.observations.event_windows.MAX_INSIDE", bins)
         fits.append(measure_event(survey, taken, survey.flux_level(~taken), best).energy)
     whole, binned = fits
     assert whole.dof > 1.3 * binned.dof

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mauvecl.lightcurve.flares.shapes import SHAPES
-from mauvecl.observations.energies import Likelihood
+from mauvecl.observations.event_windows import Likelihood
 from mauvecl.observations.families import Family, families
 
 GENERAL = Family.general()

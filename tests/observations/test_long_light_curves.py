@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mauvecl import Study, analyse
 from mauvecl.cli.session import Session
 from mauvecl.lightcurve.flares.shapes import shape_of
-from mauvecl.observations import energies, level
+from mauvecl.observations import event_windows, level
 from mauvecl.observations.detection import detect_events
 from mauvecl.observations.events import measure_event
 from mauvecl.observations.frames import Frames
@@ -71,7 +71,7 @@ class Sizes:
 @pytest.mark.parametrize("model", [SMOOTH, WHITE], ids=["smooth", "white"])
 def test_work_of_an_event_does_not_grow_with_the_light_curve(model: Process, monkeypatch: pytest.MonkeyPatch) -> None:
     sizes = Sizes(monkeypatch)
-    sizes.watch(energies, "_bins", 0)
+    sizes.watch(event_windows, "_bins", 0)
     sizes.watch(Process, "covariance", 1)
     sizes.watch(Process, "times", 1)
     sizes.watch(Process, "at", 1)
@@ -85,7 +85,7 @@ def test_work_of_an_event_does_not_grow_with_the_light_curve(model: Process, mon
         work.append(sizes.taken())
     assert work[0]
     assert work[0] == work[1]
-    assert max(size for name, size in work[0] if name != "at") <= 2 * energies.WINDOW_FRAMES + 200
+    assert max(size for name, size in work[0] if name != "at") <= 2 * event_windows.WINDOW_FRAMES + 200
     for name in ("summed_s", "summed_error_s", "fitted_s", "low_s", "high_s"):
         assert getattr(measured[1], name) == pytest.approx(getattr(measured[0], name), rel=1e-4)
 

@@ -1,0 +1,278 @@
+"""Frames around an event, and their likelihood for flares that depart from their shape.
+
+The light near an event is the level, flares of a known shape, and noise:
+
+    y = level + sum_j A_j s((t - p_j) / w_j) (1 + d(t)) + noise
+
+The level has the covariance of the process of the star. The departure d of a flare from its shape is a Gaussian process
+of standard deviation epsilon in the logarithm of the time from the peak (a model discrepancy as of Kennedy & O'Hagan
+2001, doi 10.1111/1467-9868.00294). It makes the sum of the observed light decide where a flare is bright, and the
+shape where it is not observed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from mauvecl.lightcurve.flares.shapes import Integrable, Shape, between, consecutive_integrals, sides
+from mauvecl.observations.families import WeightedSum
+
+if TYPE_CHECKING:
+    from mauvecl.observations.search import Detection, SeriesSurvey
+
+Profile = Shape | WeightedSum
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+#: Correlation of departures in the logarithm of 1 + time from the peak in half-widths (assumed).
+LOG_TIME = 0.7
+#: Light that departs where a shape has none, as a share of the amplitude at the peak (assumed); it falls by e in each
+#: half-width.
+FLOOR = 0.1
+#: Half-widths of a shape before and after the peak beyond which it is neglected.
+REACH = (5.0, 80.0)
+#: Largest number of bins in an event, and on each side of it; growth of the bins with the distance from the peak.
+MAX_INSIDE, MAX_OUTSIDE, GROWTH = 160, 80, 6.0
+#: Bins outside are shorter than this share of the shortest time scale of the process.
+SHORT = 0.2
+#: Number of frames on each side of an event that are fitted with it, and the same in lengths of the event: the level of
+#: further ones would lower the variance of its sum by 1 % at most in independent noise, and less in that of a process.
+WINDOW_FRAMES, WINDOW_LENGTHS = 2**15, 100
+
+
+@dataclass(frozen=True)
+class FittedFlare:
+    """Flare fitted to an event."""
+
+    peak_s: float  # in the stare
+    amplitude: float  # relative to the level
+    half_width_s: float
+    equivalent_duration_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Bins of frames around an event.
+
+    Frames in a bin are consecutive. Values are those of the sum along the direction of the event's template.
+    """
+
+    survey: SeriesSurvey
+    one: Detection
+    edges: Float  # shape (n, 2); start and end of each bin
+    values: Float  # shape (n,)
+    noise: Float  # shape (n,); variance of the mean of each bin's frames
+    frames: NDArray[np.int64]  # shape (n,); number of frames of each bin
+    inside: Bool  # shape (n,); bins of the event
+    scale: float  # value of unit amplitude
+    photon: float  # rise of the variance of a frame with the amplitude
+    quiet_level: float = 1.0  # of the star at the peak, by the frames without events, in units of the survey's level
+
+    @classmethod
+    def of(cls, survey: SeriesSurvey, taken: Bool, one: Detection, direction: int | None = None) -> Window:
+        """Collect the frames of an event, and those around it that belong to no event."""
+        direction = one.direction if direction is None else direction
+        unit = survey.bank.directions[direction]
+        row = survey.templates.chosen[direction]
+        scale = float(np.linalg.norm(survey.templates.directions[row]))
+        photon = float(unit @ survey.templates.noise[row] @ unit)
+        excess = float(unit**2 @ np.array([p.excess for p in survey.processes]) ** 2)
+        frame_s = survey.stare.frame_s
+        peak = one.peak_s / frame_s
+        # Only frames near the event, so that the time does not depend on the length of the light curve.
+        reach = max(WINDOW_FRAMES, WINDOW_LENGTHS * (one.last - one.first + 1))
+        low = max(0, one.first - reach)
+        near = slice(low, one.last + 1 + reach)
+        numbers, along, variance = survey.stare.numbers[near], survey.sums[near] @ unit, survey.variance[near]
+        begin, end = one.first - low, one.last - low
+        inside = np.zeros(along.size, np.bool_)
+        inside[begin : end + 1] = True
+        at = np.flatnonzero(inside | ~taken[near])
+        distance = np.abs(numbers[at] - peak)
+        size = np.ones(at.size)
+        length = numbers[end] - numbers[begin] + 1
+        size[inside[at]] = max(1, int(np.ceil(length / MAX_INSIDE)))
+        shortest = min(process.shortest_s for process in survey.processes)
+        ends = np.where(numbers[at] > peak, distance - (numbers[end] - peak), distance - (peak - numbers[begin]))
+        outer = np.clip(np.maximum(ends, 0.0) / GROWTH, 1.0, max(1.0, SHORT * shortest / frame_s))
+        size[~inside[at]] = np.maximum(np.floor(outer), size.min())[~inside[at]]
+        bins = _bins(numbers[at], size, inside[at])
+        first = np.flatnonzero(np.diff(bins, prepend=-1))
+        count = np.diff(np.append(first, at.size))
+        is_inside = inside[at][first]
+        # As the start of the next frame, to the bit.
+        start, stop = numbers[at[first]] * frame_s, (numbers[at[first + count - 1]] + 1) * frame_s
+        mean = np.add.reduceat(along[at], first) / count
+        noise = np.add.reduceat(variance[at] * excess, first) / count**2
+        # The nearest bins on each side are kept.
+        before = np.flatnonzero(~is_inside & (stop <= survey.stare.start_s[one.first] + frame_s / 2))
+        after = np.flatnonzero(~is_inside & (start >= survey.stare.start_s[one.last] + frame_s / 2))
+        kept = np.sort(np.concatenate([before[-MAX_OUTSIDE:], np.flatnonzero(is_inside), after[:MAX_OUTSIDE]]))
+        return cls(
+            survey, one, np.column_stack([start, stop])[kept], mean[kept], noise[kept], count[kept], is_inside[kept],
+            scale, photon,
+        )  # fmt: skip
+
+    @cached_property
+    def middle(self) -> Float:
+        """Middle of each bin."""
+        return np.asarray(self.edges.mean(axis=1))
+
+    @cached_property
+    def process(self) -> Float:
+        """Covariance of the level in the bins, shape (n, n)."""
+        unit = self.survey.bank.directions[self.one.direction]
+        lags = self.middle[:, None] - self.middle
+        total = np.zeros(lags.shape)
+        for weight, process in zip(unit, self.survey.processes, strict=True):
+            total += weight**2 * process.at(lags)
+        return total
+
+    def model(self, shape: Integrable, peak_s: Float, half_width_s: Float) -> Float:
+        """Return the mean of shapes in the bins, in the unit of the values, (n_shape, n)."""
+        times, place = self._times
+        peak, width = (np.atleast_1d(one)[:, None] for one in (peak_s, half_width_s))
+        both = sides(shape, (times - peak) / width)
+        integral = between(both[..., place[0]], both[..., place[1]])
+        return np.asarray(self.scale * integral * width / np.diff(self.edges)[:, 0])
+
+    @cached_property
+    def _times(self) -> tuple[Float, NDArray[np.intp]]:
+        """Edges of bins, of which neighbours share one, and the places of each bin's start and end, shape (2, n)."""
+        times, place = np.unique(self.edges.T.ravel(), return_inverse=True)
+        return times, place.reshape(2, -1)
+
+
+def _bins(numbers: NDArray[np.int64], size: Float, inside: Bool) -> NDArray[np.int64]:
+    """Return the bin of each frame: consecutive frames, at most as many as the smallest size that they allow."""
+    breaks = np.diff(numbers, prepend=numbers[:1] - 2) != 1
+    breaks |= np.diff(inside, prepend=inside[:1])
+    bins = []
+    bin_number, held, limit = -1, 0, 0.0
+    for breaks_here, most in zip(breaks.tolist(), size.tolist(), strict=True):
+        limit = most if breaks_here or held >= limit else min(limit, most)
+        if breaks_here or held >= limit:
+            bin_number, held, limit = bin_number + 1, 0, most
+        held += 1
+        bins.append(bin_number)
+    return np.array(bins, np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Likelihood:
+    """Inverse covariance of the values of a window, with the constant level integrated out."""
+
+    window: Window
+    inverse: Float  # shape (n, n)
+    log_factor: float  # of the likelihood, without the constant
+    # Integral of the departures of the flares from their shape, in amplitude x s: its covariance with the values, and
+    # its variance.
+    departure: Float  # shape (n,)
+    variance: float
+    # Weights of the values in the level of the star at the peak, and its variance with a known flare, relative to the
+    # level; zero where the values are not its light.
+    level: Float  # shape (n,)
+    level_variance: float
+
+    @classmethod
+    def of(cls, window: Window, flares: Sequence[FittedFlare], shape: Profile, epsilon: float) -> Likelihood:
+        """Compute the likelihood for the photon noise of some flares and departures from their shape."""
+        n = window.values.size
+        covariance = window.process + np.diag(window.noise)
+        shared, variance = np.zeros(n), 0.0
+        for one in flares:
+            light = one.amplitude * window.model(shape, np.array([one.peak_s]), np.array([one.half_width_s]))[0]
+            covariance += np.diag(window.photon * light / window.scale / window.frames)
+            if epsilon:
+                light = light + _floor(window.middle, one) * window.scale
+                cells, cell_light = _unobserved(window, one, shape)
+                place = _log_time(window.middle, one)
+                elsewhere = _log_time(cells, one)
+                near = np.exp(-np.abs(place[:, None] - place) / LOG_TIME)
+                covariance += epsilon**2 * light[:, None] * light * near
+                lengths = window.edges[:, 1] - window.edges[:, 0]
+                whole = np.concatenate([light / window.scale * lengths, cell_light])
+                every = np.concatenate([place, elsewhere])
+                shared += epsilon**2 * light * (np.exp(-np.abs(place[:, None] - every) / LOG_TIME) @ whole)
+                variance += epsilon**2 * float(whole @ np.exp(-np.abs(every[:, None] - every) / LOG_TIME) @ whole)
+        factor = scipy.linalg.cho_factor(covariance, lower=True)
+        inverse = scipy.linalg.cho_solve(factor, np.eye(n))
+        ones = inverse.sum(axis=1)
+        total = float(ones.sum())
+        level, level_variance = np.zeros(n), 0.0
+        if len(window.survey.bank.directions) == 1:
+            at = int(np.argmin(np.abs(window.middle - window.one.peak_s)))
+            toward = inverse @ window.process[at]
+            rest = 1.0 - float(window.process[at] @ ones)
+            level = (toward + rest * ones / total) / window.scale
+            known = float(window.process[at, at] - window.process[at] @ toward) + rest**2 / total
+            level_variance = max(known, 0.0) / window.scale**2
+        inverse = inverse - ones[:, None] * ones / total
+        log_factor = -float(np.log(np.diag(factor[0])).sum()) - 0.5 * float(np.log(total))
+        return cls(window, inverse, log_factor, shared, variance, level, level_variance)
+
+    def matched(self, parts: Float, weights: Float, values: Float) -> tuple[Float, Float]:
+        """Return the products of models and values, and of models with themselves, shape (n_shape, n_node).
+
+        Models are sums of parts, shape (n_part, n_node, n), with weights, shape (n_shape, n_part). The first product is
+        zero for models that are constant but for rounding errors, as bright in all bins as the level.
+        """
+
+        # A shape has few of the parts.
+        pairs = scipy.sparse.csr_array((weights[:, :, None] * weights[:, None]).reshape(len(weights), -1))
+
+        def norms(weighted: Float) -> Float:
+            gram = weighted.transpose(1, 0, 2) @ parts.transpose(1, 2, 0)
+            return np.asarray(pairs @ gram.reshape(len(gram), -1).T)
+
+        information = norms((parts.reshape(-1, values.size) @ self.inverse).reshape(parts.shape))
+        least = np.maximum(1e-9 * norms(parts * np.diag(self.inverse)), 1e-300)
+        slope = np.where(information > least, weights @ (parts @ (self.inverse @ values)), 0.0)
+        return slope, np.maximum(information, least)
+
+    def level_without(self, light: Float) -> Float:
+        """Return the level of the star at the peak once the light of flares, shape (n,) or (k, n), is subtracted.
+
+        The tail of a bright flare raises the level of the frames without events. That level is returned only where the
+        values are not the star's light, or where the fitted level is not above zero.
+        """
+        fitted = (self.window.values - light) @ self.level
+        return np.where(fitted > 0, fitted, self.window.quiet_level)
+
+    def chi2(self, model: Float) -> Float:
+        """Return chi-squared of the values with models, of shape (n,) or (k, n), added to the level."""
+        left = self.window.values - model
+        return np.asarray(np.einsum("...i,...i->...", left @ self.inverse, left))
+
+
+def _log_time(time_s: Float, one: FittedFlare) -> Float:
+    tau = (time_s - one.peak_s) / one.half_width_s
+    return np.asarray(np.sign(tau) * np.log1p(np.abs(tau)))
+
+
+def _floor(time_s: Float, one: FittedFlare) -> Float:
+    """Return the light of a flare that may be where its shape has none."""
+    return np.asarray(FLOOR * one.amplitude * np.exp(-np.abs(time_s - one.peak_s) / one.half_width_s))
+
+
+def _unobserved(window: Window, one: FittedFlare, shape: Profile) -> tuple[Float, Float]:
+    """Return middles of intervals without bins near a flare, and the light of the flare in them, in amplitude x s."""
+    tau = np.concatenate([-np.geomspace(REACH[0], 0.05, 12), [0.0], np.geomspace(0.05, REACH[1], 24)])
+    edges = np.unique(np.concatenate([one.peak_s + tau * one.half_width_s, window.edges.ravel()]))
+    edges = edges[(edges >= one.peak_s - REACH[0] * one.half_width_s)
+                  & (edges <= one.peak_s + REACH[1] * one.half_width_s)]  # fmt: skip
+    if edges.size < 2:
+        return np.zeros(0), np.zeros(0)
+    middle = (edges[:-1] + edges[1:]) / 2
+    place = np.searchsorted(window.edges[:, 0], middle, side="right") - 1
+    seen = (place >= 0) & (middle < window.edges[np.maximum(place, 0), 1])
+    integrals = consecutive_integrals(shape, (edges - one.peak_s) / one.half_width_s)
+    light = one.amplitude * one.half_width_s * integrals + _floor(middle, one) * np.diff(edges)
+    return middle[~seen], light[~seen]
