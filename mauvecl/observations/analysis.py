@@ -136,7 +136,7 @@ class Analysis:
                 f"Events take {100 * self.in_events:.2g} % of the searched frames, so that what the star does without "
                 "them is not known, and there are no verdicts: the light probably has eclipses, transits or pulsation, "
                 "or is another column than the flux; mark the frames to leave out in a column of quality, or name the "
-                "columns in a mapping (--mapping)."
+                "columns in a mapping."
             )
         reasons = self.level.reasons
         if (reasons != 0).any():

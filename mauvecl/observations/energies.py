@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -10,8 +11,9 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.lightcurve.flares.shapes import between, sides
-from mauvecl.observations.event_fits import Mixture, fit_event, joined, light_of
+from mauvecl.observations.event_fits import Fit, Mixture, fit_event, joined, light_of
 from mauvecl.observations.event_windows import FittedFlare, Likelihood, Window
+from mauvecl.observations.families import GENERAL
 from mauvecl.observations.search import MIN_BASELINE
 
 if TYPE_CHECKING:
@@ -37,7 +39,6 @@ class Energy:
 
     summed_s: float  # sum of the light above the level over the frames of the event
     summed_error_s: float
-    within_s: float  # light of the fitted flares in the same frames
     fitted_s: float  # of the whole flares; median of the posterior
     low_s: tuple[float, float]  # lower ends of the intervals of `LEVELS`
     high_s: tuple[float, float]
@@ -46,16 +47,12 @@ class Energy:
     chi2: float  # of these without departures from the shape
     dof: int
     departure: float  # mean of epsilon
-    step: bool  # a step of the level fits better than a flare
+    # Whether the frames lack the light of the best flares of the published shapes, since the level falls in them as by
+    # an eclipse, and whether a step of the level fits better than these: the general family can resemble both.
+    dips: bool
+    step: bool
     peak_observed: bool  # the peak lies in or next to an observed frame
     level: float  # of the star at the peak, in units of the survey's level
-
-    @property
-    def dips(self) -> bool:
-        """Whether the frames of the event lack the light of its flares: the level falls in them, as by an eclipse."""
-        error = np.hypot(self.summed_error_s, (self.high_s[0] - self.low_s[0]) / 2)
-        lacking = self.within_s - self.summed_s
-        return bool(lacking > LACKING_ERRORS * error and lacking > LACKING_SHARE * self.within_s)
 
     @property
     def unclear(self) -> bool:
@@ -85,31 +82,54 @@ def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: De
     totals = np.array([fit.mixture.log_total for fit in fits])
     share = np.exp(totals - mixture.log_total)
     best = fits[int(np.argmax(totals))]
-    shape, flares = best.shape, best.flares
+    published = [fit for fit in fits if fit.shape.name != GENERAL]
     if len(directions) > 1:
         # Flares of other temperatures have another light for the same sum.
         mixture = joined([Mixture(mixture.log_weight + weight, factor * mixture.mean, factor * mixture.sd)
                            for weight, factor in directions])  # fmt: skip
-    plain = Likelihood.of(window, flares, shape, 0.0)
-    model = light_of(window, shape, flares)
-    level = float(plain.level_without(model))
+    chi2, level = _without_departures(window, best)
     summed, error = _summed(survey, taken, flux_level, one)
-    frame_s = survey.stare.frame_s
-    start = survey.stare.start_s[one.first : one.last + 1]
-    within = sum(f.amplitude * f.half_width_s * float(between(
-        sides(shape, (start - f.peak_s) / f.half_width_s), sides(shape, (start + frame_s - f.peak_s) / f.half_width_s)
-    ).sum()) for f in flares)  # fmt: skip
     ends = [[mixture.quantile(0.5 + sign * width / 2) for width in LEVELS] for sign in (-1, 1)]
-    apart_s = np.abs(survey.stare.middle_s[one.first : one.last + 1] - flares[0].peak_s)
-    observed = bool((apart_s <= 1.5 * frame_s).any())
+    apart_s = np.abs(survey.stare.middle_s[one.first : one.last + 1] - best.flares[0].peak_s)
+    observed = bool((apart_s <= 1.5 * survey.stare.frame_s).any())
     return Energy(
-        summed / level, error / level, within / level, mixture.quantile(0.5), (ends[0][0], ends[0][1]),
-        (ends[1][0], ends[1][1]),
+        summed / level, error / level, mixture.quantile(0.5), (ends[0][0], ends[0][1]), (ends[1][0], ends[1][1]),
         tuple(replace(f, amplitude=f.amplitude / level, equivalent_duration_s=f.equivalent_duration_s / level)
-              for f in flares), shape.name, float(plain.chi2(model)), window.values.size - 1 - 3 * len(flares),
-        float(share @ np.array([fit.epsilon for fit in fits])),
-        _is_step(window, plain, float(plain.chi2(model)), len(flares)), observed, level,
+              for f in best.flares), best.shape.name, chi2, window.values.size - 1 - 3 * len(best.flares),
+        float(share @ np.array([fit.epsilon for fit in fits])), _dips(window, published, summed, error),
+        _is_step(window, published), observed, level,
     )  # fmt: skip
+
+
+def _without_departures(window: Window, fit: Fit) -> tuple[float, float]:
+    """Return chi-squared of a fit without departures from its shape, and the level of the star at the peak."""
+    plain = Likelihood.of(window, fit.flares, fit.shape, 0.0)
+    model = light_of(window, fit.shape, fit.flares)
+    return float(plain.chi2(model)), float(plain.level_without(model))
+
+
+def _dips(window: Window, fits: Sequence[Fit], summed: float, error: float) -> bool:
+    """Return whether the frames of an event lack the light of the best fit.
+
+    Parameters
+    ----------
+    fits : sequence of Fit
+    summed, error : float
+        Light of the frames above the level, amplitude x s.
+    """
+    best = max(fits, key=lambda fit: fit.mixture.log_total)
+    level = _without_departures(window, best)[1]
+    survey, one = window.survey, window.one
+    start = survey.stare.start_s[one.first : one.last + 1]
+    within = 0.0
+    for flare in best.flares:
+        edges = [(time - flare.peak_s) / flare.half_width_s for time in (start, start + survey.stare.frame_s)]
+        light = between(*(sides(best.shape, tau) for tau in edges))
+        within += flare.amplitude * flare.half_width_s * float(light.sum())
+    mixture = joined([fit.mixture for fit in fits])
+    low, high = (mixture.quantile(0.5 + sign * LEVELS[0] / 2) for sign in (-1, 1))
+    lacking, uncertain = (within - summed) / level, float(np.hypot(error / level, (high - low) / 2))
+    return lacking > LACKING_ERRORS * uncertain and lacking > LACKING_SHARE * within / level
 
 
 def _directions(survey: SeriesSurvey, taken: Bool, one: Detection) -> list[tuple[float, float]]:
@@ -182,20 +202,23 @@ def _level_variance(process: Process, time: Float, noise: Float, quiet: Bool, we
     return float(weights @ shared - towards @ solved) + rest**2 * constant
 
 
-def _is_step(window: Window, plain: Likelihood, chi2: float, n_flares: int) -> bool:
-    """Return whether a step of the level fits an event better than its flares do."""
+def _is_step(window: Window, fits: Sequence[Fit]) -> bool:
+    """Return whether a step of the level fits an event better than the flares of the best fit do."""
     inside = window.middle[window.inside]
     if inside.size < 3:
         return False
     starts = window.edges[(window.middle > inside[0] - np.ptp(inside)) & (window.middle < inside[-1]), 0]
     if not starts.size:
         return False
+    best = max(fits, key=lambda fit: fit.mixture.log_total)
+    plain = Likelihood.of(window, best.flares, best.shape, 0.0)
     models = (window.middle >= starts[:, None]).astype(np.float64)
     slope = models @ (plain.inverse @ window.values)
     information = np.einsum("ki,ki->k", models @ plain.inverse, models)
     fine = information > 1e-12
     gain = np.where(fine & (slope > 0), slope**2 / np.where(fine, information, 1.0), 0.0)
     whole = float(plain.chi2(np.zeros(window.values.size)))
+    chi2 = float(plain.chi2(light_of(window, best.shape, best.flares)))
     # Each further flare has three parameters more (Schwarz 1978).
-    further = 3 * (n_flares - 1) * float(np.log(window.values.size))
+    further = 3 * (len(best.flares) - 1) * float(np.log(window.values.size))
     return whole - float(gain.max()) < chi2 + further - STEP_GAIN

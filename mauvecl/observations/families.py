@@ -29,6 +29,8 @@ EPSILON, GENERAL_EPSILON = (0.0, 0.02, 0.06, 0.2), (0.04, 0.1, 0.2)
 GAUSSIAN_RISES, GAUSSIAN_DECAY = (0.15, 0.5, 1.5), 0.5
 #: Shares of slow exponentials in the decay, and their rates, per half-width (assumed; Davenport's are 0.30 and 0.28).
 SLOW_SHARES, SLOW_RATES = (0.08, 0.16, 0.3, 0.45), tuple(np.geomspace(0.1, 0.9, 24).tolist())
+#: Name of the general family.
+GENERAL = "general"
 #: Prior weight of the general family (assumed); published shapes share the rest.
 GENERAL_WEIGHT = 0.5
 
@@ -152,7 +154,7 @@ class Family:
             row[rise], row[len(rises) + start] = 1.0, 1.0 - share
             row[len(rises) + len(fast) + rate] = share
             rows.append(row)
-        return cls("general", (*rises, *fast, *slow), np.array(rows), GENERAL_EPSILON, GENERAL_WEIGHT)
+        return cls(GENERAL, (*rises, *fast, *slow), np.array(rows), GENERAL_EPSILON, GENERAL_WEIGHT)
 
     @property
     def durations(self) -> Float:

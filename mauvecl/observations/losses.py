@@ -45,6 +45,9 @@ BRIGHT, BEFORE, DECAY, MOST_BRIGHT = 4.0, 2, 3, 0.3
 SHORTEST_PERIOD_S, ECLIPSES, WIDENED = 17_280.0, np.array([0.03, 0.06, 0.12]), 1.6
 #: Largest number of values in which eclipses are guessed, and the shift of a box in its durations between two periods.
 MOST_BINNED, MOVED = 3000, 0.5
+#: Smallest number of eclipses, and smallest share of them that are at least half as deep as their median (assumed; a
+#: flare may fill some).
+LEAST_ECLIPSES, ALIKE = 3, 0.8
 #: Share of the period whose median is the light around an eclipse, and parameters of the times of eclipses.
 AROUND, EPHEMERIS = 0.3, 5
 #: Mean of consecutive frames, in standard deviations of a frame below the star, that belong to an eclipse.
@@ -93,20 +96,18 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
     rotates = any(term.kind == "rotation" for term in process.terms)
     slow_s = min(survey.stare.duration_s / 3, SLOW_S)
     fast = any(term.kind != "rotation" and term.scale_s < slow_s for term in process.terms)
-    restless = process.excess > MOST_EXCESS or fast
-    if survey.weighted or not (taken.mean() > MOST_FLARING or restless):
+    active = taken.mean() > MOST_ACTIVE
+    many = active or (taken.mean() > MOST_FLARING and not rotates)
+    if survey.weighted or not (many or process.excess > MOST_EXCESS or fast):
         return none
-    many = taken.mean() > (MOST_ACTIVE if rotates else MOST_FLARING)
     dark = ~_bright(survey)
     survey, fitted, taken = survey.frames(dark), fitted.frames(dark), taken[dark]
     down = replace(survey.inverted(), bank=bank_of(survey.stare, survey.bank.directions, Loss()))
     # Losses in independent noise are the first guess: a process that is fitted to losses would hide them.
     guessed = detect_events(down, PROVISIONAL, steps)[1]
     # Those of a star that varies are most of its frames; eclipses repeat.
-    if guessed.mean() >= MOST_LOST and (lost := _eclipses(survey, criterion(fitted, taken))).any():
+    if active and guessed.mean() >= MOST_LOST and (lost := _eclipses(survey, criterion(fitted, taken))).any():
         none[dark] = lost
-        return none
-    if not (many or restless):
         return none
     other, losses = alternate(down, guessed, None, steps)
     if 0 < losses.mean() < MOST_LOST and criterion(other, losses, shapeless=True) < criterion(fitted, taken):
@@ -184,14 +185,27 @@ def guess_eclipses(survey: SeriesSurvey) -> Bool:
         best = max(found, key=lambda one: float(one.power.max()))
         k = int(np.argmax(best.power))
         period, middle, length = (float(one[k]) for one in (best.period, best.transit_time, best.duration))
-        apart = np.abs((time - middle + period / 2) % period - period / 2)
-        inside |= apart < WIDENED * length / 2
+        size = max(3, round(AROUND * period / data.step_s))
+        turn, apart = _turns(data.time_s, period, middle)
+        dim = (apart < length / 2) & kept
+        around = data.values - median_filter(data.values, size, mode="nearest")
+        depths = np.array([np.median(around[dim & (turn == one)]) for one in np.unique(turn[dim])])
+        # A star that varies is also faint at some phase, but not as much each time.
+        if depths.size < LEAST_ECLIPSES or np.mean(depths < 0.5 * np.median(depths)) < ALIKE or np.median(depths) >= 0:
+            break
+        inside |= _turns(time, period, middle)[1] < WIDENED * length / 2
         grids = [np.array([period])]
         # The star may vary by more than the shallower eclipse.
         kept = ~inside[np.searchsorted(time, data.time_s)]
         values = data.values.copy()
-        values[kept] -= median_filter(values[kept], max(3, round(AROUND * period / data.step_s)), mode="nearest")
+        values[kept] -= median_filter(values[kept], size, mode="nearest")
     return inside
+
+
+def _turns(time: Float, period: float, middle: float) -> tuple[Float, Float]:
+    """Return the number of the nearest eclipse, and the time from its middle."""
+    turn = np.rint((time - middle) / period)
+    return turn, np.abs(time - middle - turn * period)
 
 
 def _bright(survey: SeriesSurvey) -> Bool:

@@ -110,7 +110,7 @@ def test_dips_at_random_are_no_flares(seed: int) -> None:
     flux += 1e-3 * rng.standard_normal(time.size)
     answer = analyse(Study(), frames=Frames.of(time, flux, np.full(time.size, 1e-3), exposure_s=frame_s))
     assert "detected" not in set(answer.events["verdict"])
-    messages = [one for one in answer.messages if "no verdicts" in one and "--mapping" in one]
+    messages = [one for one in answer.messages if "no verdicts" in one and "mapping" in one]
     assert len(messages) == int(answer.analysis.in_events > 0.5)
     if messages:
         assert set(answer.events["verdict"]) == {"undecided"}
