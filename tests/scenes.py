@@ -5,15 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mauvecl.host.expectation import Expectation, expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.neighbours import Neighbour, Neighbours
 from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.host.stars.source import Source
+from mauvecl.lightcurve.flares.shapes import SHAPES, Shape
 from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.stares.stare_requests import StaresRequest
+
+Float = NDArray[np.float64]
 
 #: Of `flaring_stares`: around the boundary of the counter's first word.
 N_STARES, FIRST_STARE = 200, 2**32 - 70
@@ -55,3 +59,11 @@ def flaring_stares(method: Any = "cumulants", **more: Any) -> StaresRequest:
     rng = np.random.default_rng(1)
     flares = {"flare": rng.random((N_STARES, 6, 1)), "amplitudes": rng.random((2, N_STARES))}
     return StaresRequest(components, stare, N_STARES, 5, **({**flares, "start": FIRST_STARE, "method": method} | more))
+
+
+def flare(
+    time_s: Float, frame_s: float, peak_s: float, half_width_s: float, shape: Shape = SHAPES["davenport2014"]
+) -> Float:
+    """Return the mean of a flare of unit amplitude over each frame."""
+    edges = np.column_stack([time_s - frame_s / 2, time_s + frame_s / 2])
+    return shape.mean_over(edges, peak_s, half_width_s)
