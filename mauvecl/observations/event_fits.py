@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
+#: Logarithm of the weight of a part of a mixture that is neglected.
+LEAST_LOG_WEIGHT = -18.5
 #: Nodes of the grid along peak and half-width for a shape and for many, and the fall of the log posterior beyond
 #: which nodes are neglected.
 NODES, NODES_OF_MANY, NEGLIGIBLE = 25, 17, 14.0
@@ -58,17 +60,17 @@ class Mixture:
 
     def quantile(self, probability: float) -> float:
         """Return a quantile of the part above zero."""
-        weight = np.exp(self.log_weight - self.log_weight.max())
-        kept = weight > 1e-8
-        weight, mean, sd = weight[kept] / weight[kept].sum(), self.mean[kept], np.maximum(self.sd[kept], 1e-300)
-        below = float(weight @ scipy.special.ndtr(-mean / sd))
-        goal = below + probability * (1.0 - below)
-        low, high = max(0.0, float((mean - 10 * sd).min())), float((mean + 10 * sd).max())
-        return float(
-            scipy.optimize.brentq(
-                lambda x: float(weight @ scipy.special.ndtr((x - mean) / sd)) - goal, low, high, xtol=1e-9 * abs(high)
-            )
-        ) if high > low else low  # fmt: skip
+        log = self.log_weight - self.log_total
+        kept = log > LEAST_LOG_WEIGHT
+        log, mean, sd = log[kept], self.mean[kept], np.maximum(self.sd[kept], 1e-300)
+
+        def above(x: float) -> float:
+            """Return the logarithm of the probability above x, exact where all is far below zero."""
+            return float(scipy.special.logsumexp(log + scipy.special.log_ndtr((mean - x) / sd)))
+
+        goal = above(0.0) + float(np.log1p(-probability))
+        high = max(float((mean + 10 * sd).max()), float(sd.max()))
+        return float(scipy.optimize.brentq(lambda x: above(x) - goal, 0.0, high, xtol=1e-9 * high))
 
 
 def joined(parts: Sequence[Mixture]) -> Mixture:

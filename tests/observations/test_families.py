@@ -6,8 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from mauvecl.lightcurve.flares.shapes import SHAPES
+from mauvecl.observations.event_fits import Mixture
 from mauvecl.observations.event_windows import Likelihood
 from mauvecl.observations.families import Family, families
 
@@ -49,3 +51,23 @@ def test_fits_of_all_shapes_are_those_of_each() -> None:
             model = GENERAL.weights[k] @ parts[:, node]
             assert information[k, node] == pytest.approx(model @ likelihood.inverse @ model, rel=1e-10)
             assert slope[k, node] == pytest.approx(model @ likelihood.inverse @ values, rel=1e-8, abs=1e-8)
+
+
+@pytest.mark.parametrize("mean", [-40.0, -5.0, 0.0, 3.0, 1e4])
+def test_quantiles_are_those_of_a_truncated_normal_distribution(mean: float) -> None:
+    mixture = Mixture(np.log([0.2, 0.8]), np.full(2, mean), np.full(2, 2.0))
+    expected = stats.truncnorm(-mean / 2, np.inf, mean, 2.0)
+    for probability in (0.025, 0.16, 0.5, 0.84, 0.975):
+        assert mixture.quantile(probability) == pytest.approx(float(expected.ppf(probability)), rel=1e-5)
+
+
+def test_quantiles_of_a_mixture_are_those_of_its_draws() -> None:
+    """The allowed errors are five standard errors of the draws."""
+    log_weight, mean, sd = np.log([1.0, 2.0, 3.0]), np.array([-1.0, 2.0, 6.0]), np.array([1.0, 3.0, 0.5])
+    rng = np.random.default_rng(5)
+    which = rng.choice(3, 400_000, p=np.exp(log_weight) / 6)
+    drawn = mean[which] + sd[which] * rng.standard_normal(which.size)
+    drawn = drawn[drawn > 0]
+    for probability in (0.025, 0.16, 0.5, 0.84, 0.975):
+        below = np.mean(drawn < Mixture(log_weight + 3.0, mean, sd).quantile(probability))
+        assert abs(below - probability) < 5 * np.sqrt(probability * (1 - probability) / drawn.size)
