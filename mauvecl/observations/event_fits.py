@@ -206,16 +206,19 @@ def _wider(boxes: Float) -> Float:
 def _ranges(window: Window) -> Float:
     """Return the largest ranges of the peak and of the logarithm of the half-width of a single flare, shape (2, 2).
 
-    A gap before the event may hold the peak.
+    A gap before the event may hold the peak, at most as long before as the event lasts. The half-width of a flare whose
+    peak is not seen does not follow from the best template.
     """
     one, survey = window.one, window.survey
     frame_s = survey.stare.frame_s
     first_s, last_s = survey.stare.start_s[one.first], survey.stare.start_s[one.last] + frame_s
     low, high = one.peak_s - PEAK_RANGE * one.half_width_s, one.peak_s + PEAK_RANGE * one.half_width_s
-    earlier = survey.stare.start_s[: one.first]
-    low = min(low, max(first_s - 4 * one.half_width_s, (float(earlier[-1]) + frame_s) if earlier.size else -np.inf))
+    before_s = float(survey.stare.start_s[one.first - 1]) + frame_s if one.first else -np.inf
+    low = min(low, max(first_s - max(4 * one.half_width_s, last_s - first_s), before_s))
     high = min(max(high, low + frame_s), last_s)
     widest = max(survey.bank.half_widths_s[-1], one.half_width_s) * 3
+    if low < first_s - frame_s:
+        widest = max(widest, last_s - first_s)
     width = (max(one.half_width_s / WIDTH_RANGE, 0.2 * frame_s), min(one.half_width_s * WIDTH_RANGE, widest))
     return np.array([[low, high], np.log(width)])
 
