@@ -264,9 +264,7 @@ def _merged(found: list[Detection]) -> list[Detection]:
     return kept
 
 
-def _light_of(
-    survey: SeriesSurvey, peak_s: float, half_width_s: float, amplitude: float
-) -> tuple[slice, Float]:  # fmt: skip
+def _light_of(survey: SeriesSurvey, peak_s: float, half_width_s: float, amplitude: float) -> tuple[slice, Float]:
     """Return the frames in which a flare is not negligible, and its mean in each, in the unit of the amplitude."""
     start = survey.stare.start_s
     rows = slice(*np.searchsorted(start, [peak_s - REACH[0] * half_width_s, peak_s + REACH[1] * half_width_s]))

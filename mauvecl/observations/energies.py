@@ -56,7 +56,7 @@ class Energy:
 
     @property
     def unclear(self) -> bool:
-        """Whether the frames of the event do not show its light: they are together not brighter than the level."""
+        """True if the sum of the frames is not above the level, so that they do not show the light of a flare."""
         return self.summed_s <= 0
 
     @property
@@ -87,7 +87,8 @@ def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: De
         # Flares of other temperatures have another light for the same sum.
         mixture = joined([Mixture(mixture.log_weight + weight, factor * mixture.mean, factor * mixture.sd)
                            for weight, factor in directions])  # fmt: skip
-    chi2, level = _without_departures(window, best)
+    plain, model = _without_departures(window, best)
+    level = float(plain.level_without(model))
     summed, error = _summed(survey, taken, flux_level, one)
     ends = [[mixture.quantile(0.5 + sign * width / 2) for width in LEVELS] for sign in (-1, 1)]
     apart_s = np.abs(survey.stare.middle_s[one.first : one.last + 1] - best.flares[0].peak_s)
@@ -95,17 +96,15 @@ def measure_energy(survey: SeriesSurvey, taken: Bool, flux_level: Float, one: De
     return Energy(
         summed / level, error / level, mixture.quantile(0.5), (ends[0][0], ends[0][1]), (ends[1][0], ends[1][1]),
         tuple(replace(f, amplitude=f.amplitude / level, equivalent_duration_s=f.equivalent_duration_s / level)
-              for f in best.flares), best.shape.name, chi2, window.values.size - 1 - 3 * len(best.flares),
-        float(share @ np.array([fit.epsilon for fit in fits])), _dips(window, published, summed, error),
-        _is_step(window, published), observed, level,
+              for f in best.flares), best.shape.name, float(plain.chi2(model)),
+        window.values.size - 1 - 3 * len(best.flares), float(share @ np.array([fit.epsilon for fit in fits])),
+        _dips(window, published, summed, error), _is_step(window, published), observed, level,
     )  # fmt: skip
 
 
-def _without_departures(window: Window, fit: Fit) -> tuple[float, float]:
-    """Return chi-squared of a fit without departures from its shape, and the level of the star at the peak."""
-    plain = Likelihood.of(window, fit.flares, fit.shape, 0.0)
-    model = light_of(window, fit.shape, fit.flares)
-    return float(plain.chi2(model)), float(plain.level_without(model))
+def _without_departures(window: Window, fit: Fit) -> tuple[Likelihood, Float]:
+    """Return the likelihood of flares without departures from their shape, and their light in the bins, shape (n,)."""
+    return Likelihood.of(window, fit.flares, fit.shape, 0.0), light_of(window, fit.shape, fit.flares)
 
 
 def _dips(window: Window, fits: Sequence[Fit], summed: float, error: float) -> bool:
@@ -118,7 +117,8 @@ def _dips(window: Window, fits: Sequence[Fit], summed: float, error: float) -> b
         Light of the frames above the level, amplitude x s.
     """
     best = max(fits, key=lambda fit: fit.mixture.log_total)
-    level = _without_departures(window, best)[1]
+    plain, model = _without_departures(window, best)
+    level = float(plain.level_without(model))
     survey, one = window.survey, window.one
     start = survey.stare.start_s[one.first : one.last + 1]
     within = 0.0
@@ -211,14 +211,13 @@ def _is_step(window: Window, fits: Sequence[Fit]) -> bool:
     if not starts.size:
         return False
     best = max(fits, key=lambda fit: fit.mixture.log_total)
-    plain = Likelihood.of(window, best.flares, best.shape, 0.0)
+    plain, model = _without_departures(window, best)
     models = (window.middle >= starts[:, None]).astype(np.float64)
     slope = models @ (plain.inverse @ window.values)
     information = np.einsum("ki,ki->k", models @ plain.inverse, models)
     fine = information > 1e-12
     gain = np.where(fine & (slope > 0), slope**2 / np.where(fine, information, 1.0), 0.0)
     whole = float(plain.chi2(np.zeros(window.values.size)))
-    chi2 = float(plain.chi2(light_of(window, best.shape, best.flares)))
     # Each further flare has three parameters more (Schwarz 1978).
     further = 3 * (len(best.flares) - 1) * float(np.log(window.values.size))
-    return whole - float(gain.max()) < chi2 + further - STEP_GAIN
+    return whole - float(gain.max()) < float(plain.chi2(model)) + further - STEP_GAIN

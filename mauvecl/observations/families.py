@@ -142,8 +142,9 @@ class Family:
         return cls(shape.name, (shape,), np.ones((1, 1)), EPSILON, prior)
 
     @classmethod
+    @cache
     def general(cls) -> Family:
-        """Return the general family: rises and decays in all combinations."""
+        """Return the general family, the same object in all calls: rises and decays in all combinations."""
         rises: list[Integrable] = [PublishedRise(), *(GaussianRise(width) for width in GAUSSIAN_RISES)]
         fast: list[Integrable] = [Exponential(Davenport2014.DECAY[0][1]), GaussianDecay(GAUSSIAN_DECAY)]
         slow = [Exponential(rate) for rate in SLOW_RATES]
@@ -171,9 +172,4 @@ def families(searched: Shape) -> Sequence[Family]:
     """Return the families that are averaged for a search with some shape, that of many shapes last."""
     published = {shape.name: shape for shape in (searched, *(SHAPES[name] for name in AVERAGED))}
     prior = (1 - GENERAL_WEIGHT) / len(published)
-    return [*(Family.of(shape, prior) for shape in published.values()), _general()]
-
-
-@cache
-def _general() -> Family:
-    return Family.general()
+    return [*(Family.of(shape, prior) for shape in published.values()), Family.general()]

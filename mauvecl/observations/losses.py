@@ -190,7 +190,7 @@ def guess_eclipses(survey: SeriesSurvey) -> Bool:
         dim = (apart < length / 2) & kept
         around = data.values - median_filter(data.values, size, mode="nearest")
         depths = np.array([np.median(around[dim & (turn == one)]) for one in np.unique(turn[dim])])
-        # A star that varies is also faint at some phase, but not as much each time.
+        # Losses that are seen once or twice, or that differ in depth, are no eclipses.
         if depths.size < LEAST_ECLIPSES or np.mean(depths < 0.5 * np.median(depths)) < ALIKE or np.median(depths) >= 0:
             break
         inside |= _turns(time, period, middle)[1] < WIDENED * length / 2

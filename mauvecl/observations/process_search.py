@@ -258,9 +258,7 @@ class ProcessSearch:
             norm, full = one.norm, np.full(peaks.size, one.unit)
         return np.maximum(norm - shared**2 / level.sum(), 0.0), full
 
-    def _solved(
-        self, k: int, variance: Float, shape: Float, first: int, peaks: NDArray[np.int64]
-    ) -> SolvedNorms:  # fmt: skip
+    def _solved(self, k: int, variance: Float, shape: Float, first: int, peaks: NDArray[np.int64]) -> SolvedNorms:
         """Compute s^T C^-1 s of a sum at peaks."""
         process = self.processes[k]
         margin = int(np.clip(MARGIN * shape.size, LEAST_MARGIN, MOST_MARGIN))

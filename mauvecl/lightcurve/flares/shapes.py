@@ -25,7 +25,7 @@ Float = NDArray[np.float64]
 
 
 class Integrable(Protocol):
-    """What has an integral over time; see `Shape`."""
+    """Time profile that can be integrated, as a `Shape`."""
 
     def before(self, tau: ArrayLike) -> Float:
         """Return the integral up to tau."""
