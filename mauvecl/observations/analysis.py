@@ -14,7 +14,7 @@ from mauvecl.lightcurve.defaults import RANK, Per, per_day
 from mauvecl.lightcurve.flares.shapes import shape_of
 from mauvecl.observations.colour import Colour, event_colour
 from mauvecl.observations.completeness import Completeness, inject
-from mauvecl.observations.detection import detect_events
+from mauvecl.observations.detection import detect_events, most_events
 from mauvecl.observations.event_spectrum import EventSpectrum, event_spectrum, measure_flare
 from mauvecl.observations.events import ObservedEvent, measure_events
 from mauvecl.observations.false_alarms import CHANCE_DIP, SimulatedRate, innovations, largest_dip, simulated_rates
@@ -137,6 +137,11 @@ class Analysis:
                 "them is not known, and there are no verdicts: the light probably has eclipses, transits or pulsation, "
                 "or is another column than the flux; mark the frames to leave out in a column of quality, or name the "
                 "columns in a mapping."
+            )
+        if len(self.events) >= most_events(self.survey.stare.n_frames):
+            lines.append(
+                f"The search ended at {len(self.events)} events: there may be smaller ones, which are taken for "
+                "quiescent light; a light curve of fewer frames may show them."
             )
         reasons = self.level.reasons
         if (reasons != 0).any():

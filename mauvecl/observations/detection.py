@@ -24,8 +24,10 @@ Bool = NDArray[np.bool_]
 
 #: Statistic of events whose frames take no part in fits of the process.
 PROVISIONAL = 5.0
-#: Largest number of alternations of process and events, of searches, and of events.
-ROUNDS, MAX_PASSES, MAX_EVENTS = 6, 40, 500
+#: Largest number of alternations of process and events, and of searches.
+ROUNDS, MAX_PASSES = 6, 40
+#: Number of events after which no further ones are searched, and the same for each frame of a long light curve.
+MOST_EVENTS, MOST_PER_FRAME = 500, 1 / 500
 #: Largest number of events in independent noise that are compared with a process, and parameters of a flare.
 MAX_COMPARED, PARAMETERS = 8, 3
 #: Departures of flares from their shape that are tried for the criterion.
@@ -223,7 +225,7 @@ def detect_events(survey: SeriesSurvey, threshold: float, steps: Steps | None = 
     search = survey.search
     for _ in range(MAX_PASSES):
         left = ~taken
-        if left.sum() < MIN_QUIET or len(found) >= MAX_EVENTS:
+        if left.sum() < MIN_QUIET or len(_merged(found)) >= most_events(n):
             break
         part = survey.frames(left)
         if taken.any():
@@ -249,13 +251,18 @@ def detect_events(survey: SeriesSurvey, threshold: float, steps: Steps | None = 
         for (first, last), one in zip(mine, new, strict=True):
             taken[first : last + 1] = True
             found.append(replace(one, first=first, last=last))
-    return _merged(sorted(found, key=lambda one: one.first)), taken
+    return _merged(found), taken
+
+
+def most_events(n_frames: int) -> int:
+    """Return the number of events at which a search of some frames ends, although there may be more."""
+    return max(MOST_EVENTS, int(MOST_PER_FRAME * n_frames))
 
 
 def _merged(found: list[Detection]) -> list[Detection]:
-    """Return the events without those that lie inside the frames of a larger one."""
+    """Return the events in order of time, without those that lie inside the frames of a larger one."""
     kept: list[Detection] = []
-    for one in found:
+    for one in sorted(found, key=lambda each: each.first):
         if kept and one.first <= kept[-1].last:
             other = kept.pop()
             larger = max(one, other, key=lambda each: each.value)
@@ -277,7 +284,7 @@ def _search_once(part: SeriesSurvey, search: ProcessSearch, light: Float, thresh
     both = np.stack([part.sums, UNCERTAIN * light]) if light.any() else part.sums[None]
     # Local maxima above the threshold, of which there are many where the process does not describe the light.
     found: list[tuple[FilterRow, NDArray[np.intp], NDArray[np.intp], Float, Float]] = []
-    for row, rho in search.values(both):
+    for row, rho in search.values(both, threshold):
         excess = rho[0] - np.abs(np.where(np.isfinite(rho[1]), rho[1], 0.0)) if len(rho) > 1 else rho[0]
         direction = excess.argmax(axis=0)
         best = excess[direction, np.arange(excess.shape[1])]
@@ -287,7 +294,7 @@ def _search_once(part: SeriesSurvey, search: ProcessSearch, light: Float, thresh
         found.append((row, onset, direction[onset], rho[0, direction[onset], onset], best[onset]))
     which = np.repeat(np.arange(len(found)), [onset.size for _, onset, *_ in found])
     onsets, directions, values, bests = (np.concatenate([one[k] for one in found]) for k in range(1, 5))
-    order = np.argsort(bests)[::-1][: 4 * MAX_EVENTS]
+    order = np.argsort(bests)[::-1][: 4 * most_events(part.stare.n_frames)]
     scales = min(one.shortest_s for one in part.processes)
     scale = NEAR_SCALES * scales if np.isfinite(scales) else 0.0
     accepted: list[Detection] = []

@@ -37,6 +37,8 @@ MAX_LOG_AMPLITUDE = 5.0
 REFINEMENTS = 6
 #: First range of the peak, in half-widths of the template, and factor on the half-width.
 PEAK_RANGE, WIDTH_RANGE = 2.5, 6.0
+#: Standard deviations below zero of a whole mixture from which logarithms of its probabilities are computed.
+FAR_BELOW = 10.0
 #: Departure with which further flares of an event are searched, the fall of chi-squared that they need, and the
 #: largest number.
 FURTHER_EPSILON, FURTHER_GAIN, MAX_FLARES = 0.2, 36.0, 6
@@ -64,11 +66,16 @@ class Mixture:
         kept = log > LEAST_LOG_WEIGHT
         log, mean, sd = log[kept], self.mean[kept], np.maximum(self.sd[kept], 1e-300)
 
-        def above(x: float) -> float:
-            """Return the logarithm of the probability above x, exact where all is far below zero."""
-            return float(scipy.special.logsumexp(log + scipy.special.log_ndtr((mean - x) / sd)))
+        weight, near = np.exp(log), bool((mean / sd).max() > -FAR_BELOW)
 
-        goal = above(0.0) + float(np.log1p(-probability))
+        def above(x: float) -> float:
+            """Return the probability above x, or its logarithm where all is far below zero."""
+            z = (mean - x) / sd
+            if near:
+                return float(weight @ scipy.special.ndtr(z))
+            return float(scipy.special.logsumexp(log + scipy.special.log_ndtr(z)))
+
+        goal = above(0.0) * (1 - probability) if near else above(0.0) + float(np.log1p(-probability))
         high = max(float((mean + 10 * sd).max()), float(sd.max()))
         return float(scipy.optimize.brentq(lambda x: above(x) - goal, 0.0, high, xtol=1e-9 * high))
 

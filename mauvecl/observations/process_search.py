@@ -8,7 +8,8 @@ generalised least squares,
 which is normal with unit variance without a flare, and the S/N of the template with one. Numerators of all onsets are
 correlations of the template with C^-1 (y - level), zero in missing frames, and exact over gaps. Denominators are exact
 near gaps, ends and large changes of the noise; elsewhere they follow from one solution, to first order in changes of
-the noise and in single missing frames, to some per cent.
+the noise and in single missing frames, to some per cent. Those near gaps take long to solve, and a search above a
+threshold solves only those that can exceed it.
 """
 
 from __future__ import annotations
@@ -71,6 +72,7 @@ class SolvedNorms:
     squares: Float  # squared solution C^-1 s without gaps, from `margin` frames before the template to as many after it
     margin: int
     frames: NDArray[np.int64]  # shape (n_onset,); frame of the peak on the grid with shortened gaps
+    unsolved: Bool  # shape (n_onset,); whether the norm of an onset is still that without gaps
 
     @property
     def irregular(self) -> Float:
@@ -79,6 +81,37 @@ class SolvedNorms:
         A single frame contributes its square over the diagonal of C^-1.
         """
         return IRREGULAR * self.diagonal * np.maximum(self.norm, IRREGULAR * self.unit)
+
+
+@dataclass(frozen=True, eq=False)
+class Filter:
+    """Templates of one half-width and phase, with the denominators of each sum at all onsets."""
+
+    template: Template
+    phase: int
+    shape: Float  # flux of the template above `NEGLECTED`, shape (n,)
+    first: int  # its first frame, relative to the frame of the peak
+    peaks: NDArray[np.int64]  # shape (n_onset,); frames of the peaks
+    norms: tuple[SolvedNorms, ...]  # of each sum
+    lost: Float  # shape (n_sum, n_onset); what the unknown level takes from the norms
+    weights: Float  # shape (n_direction, n_sum); squared directions of the bank
+
+    @property
+    def without_gaps(self) -> Float:
+        """Squared denominator along each direction without gaps, shape (n_direction, 1)."""
+        return np.asarray(self.weights @ np.array([[one.unit] for one in self.norms]))
+
+    @property
+    def unsolved(self) -> Bool:
+        """Whether the norm of any sum is not solved, shape (n_onset,)."""
+        return np.asarray(np.any([one.unsolved for one in self.norms], axis=0))
+
+    def row(self) -> FilterRow:
+        """Return the denominators as they are solved by now; they are zero where they are not."""
+        norm = self.weights @ np.maximum(np.array([one.norm for one in self.norms]) - self.lost, 0.0)
+        tried = (norm >= LEAST_SHARE * self.without_gaps) & ~self.unsolved
+        denominators = np.sqrt(np.where(tried, norm, 0.0))
+        return FilterRow(self.template, self.phase, self.shape, self.first, self.peaks, denominators)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,13 +184,22 @@ class ProcessSearch:
         return tuple(one.solve(np.ones(self.stare.n_frames)) for one in self.covariances)
 
     @cached_property
+    def filters(self) -> list[Filter]:
+        """Templates with the denominators that were solved by now."""
+        if self._before is not None:
+            _ = self._before.filters
+        filters = [
+            self._filter(template, phase) for template in self.bank.templates for phase in range(len(template.phases))
+        ]
+        self._before = None
+        return filters
+
+    @cached_property
     def rows(self) -> list[FilterRow]:
         """Templates with everything that does not depend on data."""
-        if self._before is not None:
-            _ = self._before.rows
-        rows = [self._row(template, phase) for template in self.bank.templates for phase in range(len(template.phases))]
-        self._before = None
-        return rows
+        for one in self.filters:
+            self._solve(one, one.unsolved)
+        return [one.row() for one in self.filters]
 
     @property
     def n_filters(self) -> int:
@@ -178,13 +220,28 @@ class ProcessSearch:
             scores[:, k, self.at] = covariance.solve(values.T).T - mean[:, None] * level
         return scores
 
-    def values(self, sums: NDArray[Any]) -> Iterator[tuple[FilterRow, Float]]:
-        """Yield each row with rho, shape (n_stare, n_direction, n_onset); minus infinity if not searched."""
+    def values(self, sums: NDArray[Any], above: float | None = None) -> Iterator[tuple[FilterRow, Float]]:
+        """Yield each row with rho, shape (n_stare, n_direction, n_onset); minus infinity if not searched.
+
+        Parameters
+        ----------
+        sums : ndarray, shape (n_stare, n_frame, n_sum)
+        above : float, optional
+            Positive threshold. Onsets next to gaps, at which rho of the first light curve cannot exceed it, are not
+            searched.
+        """
         scores = self.scores(sums)
-        for row in self.rows:
-            tried = row.per_amplitude > 0
-            correlated = _correlated(scores, row.shape, row.first)[..., row.peaks]
+        for k, one in enumerate(self.filters):
+            correlated = _correlated(scores, one.shape, one.first)[..., one.peaks]
             rho = np.einsum("dk,sko->sdo", self.bank.directions, correlated)
+            if above is None:
+                row = self.rows[k]
+            else:
+                # A template of which a smaller share lies in frames is not searched.
+                least = np.sqrt(LEAST_SHARE * one.without_gaps)
+                self._solve(one, one.unsolved & (rho[0] > above * least).any(axis=0))
+                row = one.row()
+            tried = row.per_amplitude > 0
             yield row, np.where(tried, rho / np.where(tried, row.per_amplitude, 1.0), -np.inf)
 
     def largest(self, sums: NDArray[Any]) -> LargestValue:
@@ -221,46 +278,43 @@ class ProcessSearch:
         frames = self.grid.numbers(self.frames[0] + row.peaks[onset]) + row.template.phases[row.phase]
         return np.asarray(frames * self.bank.frame_s)
 
-    def _row(self, template: Template, phase: int) -> FilterRow:
+    def _filter(self, template: Template, phase: int) -> Filter:
+        """Prepare the templates of a half-width and phase."""
         whole = template.shapes[phase]
         bright = np.flatnonzero(whole > NEGLECTED * whole.max())
         shape = whole[bright[0] : bright[-1] + 1]
         first = template.first + int(bright[0])
         peaks = np.arange(-int(self.frames[0]) % template.stride, self.n_grid, template.stride)
-        norms, full = np.zeros((2, len(self.processes), peaks.size))
-        for k in range(len(self.processes)):
-            norms[k], full[k] = self._norms(k, template, phase, shape, first, peaks)
-        weights = self.bank.directions**2
-        norm, known = weights @ norms, weights @ full
-        tried = norm >= LEAST_SHARE * known
-        return FilterRow(template, phase, shape, first, peaks, np.sqrt(np.where(tried, norm, 0.0)))
-
-    def _norms(
-        self, k: int, template: Template, phase: int, shape: Float, first: int, peaks: NDArray[np.int64]
-    ) -> tuple[Float, Float]:
-        """Return the squared denominators of rho at peaks, and those without gaps, shape (n_onset,)."""
-        variance = self.variance * self.processes[k].excess ** 2
-        process, level = self.processes[k], self._levels[k]
-        held = np.zeros(self.n_grid)
-        held[self.at] = level
-        shared = _correlated(held, shape, first)[peaks]
-        if not process.terms:
-            held[self.at] = 1.0 / variance
-            norm = _correlated(held, shape**2, first)[peaks]
-            full = np.full(peaks.size, float((shape**2).sum() / np.median(variance)))
-        else:
+        norms, lost = list[SolvedNorms](), np.zeros((len(self.processes), peaks.size))
+        for k, level in enumerate(self._levels):
             key = (template.half_width_s, phase, k)
             earlier = None if self._before is None else self._before._norms_of[key]
-            one = self._solved(k, variance, shape, first, peaks) if earlier is None else self._updated(
-                earlier, k, shape, first, peaks
-            )  # fmt: skip
+            if not self.processes[k].terms:
+                one = self._independent(k, shape, first, peaks)
+            elif earlier is None:
+                one = self._norms(k, shape, first, peaks)
+            else:
+                one = self._updated(earlier, shape, first, peaks)
             self._norms_of[key] = one
-            norm, full = one.norm, np.full(peaks.size, one.unit)
-        return np.maximum(norm - shared**2 / level.sum(), 0.0), full
+            norms.append(one)
+            held = np.zeros(self.n_grid)
+            held[self.at] = level
+            lost[k] = _correlated(held, shape, first)[peaks] ** 2 / level.sum()
+        return Filter(template, phase, shape, first, peaks, tuple(norms), lost, self.bank.directions**2)
 
-    def _solved(self, k: int, variance: Float, shape: Float, first: int, peaks: NDArray[np.int64]) -> SolvedNorms:
-        """Compute s^T C^-1 s of a sum at peaks."""
+    def _independent(self, k: int, shape: Float, first: int, peaks: NDArray[np.int64]) -> SolvedNorms:
+        """Compute s^T C^-1 s of a sum with independent noise."""
+        variance = self.variance * self.processes[k].excess ** 2
+        held = np.zeros(self.n_grid)
+        held[self.at] = 1.0 / variance
+        norm, typical = _correlated(held, shape**2, first)[peaks], float(np.median(variance))
+        unit, solved = float((shape**2).sum() / typical), np.zeros(peaks.size, np.bool_)
+        return SolvedNorms(norm, unit, 1.0 / typical, (shape / typical) ** 2, 0, self.frames[0] + peaks, solved)
+
+    def _norms(self, k: int, shape: Float, first: int, peaks: NDArray[np.int64]) -> SolvedNorms:
+        """Compute s^T C^-1 s of a sum at peaks that are not next to gaps or ends."""
         process = self.processes[k]
+        variance = self.variance * process.excess**2
         margin = int(np.clip(MARGIN * shape.size, LEAST_MARGIN, MOST_MARGIN))
         typical, frame_s = float(np.median(variance)), self.bank.frame_s
         size = shape.size + 2 * margin
@@ -286,12 +340,11 @@ class ProcessSearch:
         missing = _correlated(single.astype(np.float64), squares, start)[peaks] / centre
         norm = np.maximum(unit - missing, 0.0)
         norm = norm / np.maximum(1.0 + _correlated(moved, squares, start)[peaks] / unit, 0.1)
-        one = SolvedNorms(norm, unit, centre, squares, margin, self.frames[0] + peaks)
-        self._solve(one, share[size + peaks] > one.irregular, k, shape, first, peaks)
-        return one
+        one = SolvedNorms(norm, unit, centre, squares, margin, self.frames[0] + peaks, np.zeros(peaks.size, np.bool_))
+        return replace(one, unsolved=share[size + peaks] > one.irregular)
 
-    def _updated(self, earlier: SolvedNorms, k: int, shape: Float, first: int, peaks: NDArray[np.int64]) -> SolvedNorms:
-        """Return earlier norms at peaks, solved anew where frames that are missing now contribute to them."""
+    def _updated(self, earlier: SolvedNorms, shape: Float, first: int, peaks: NDArray[np.int64]) -> SolvedNorms:
+        """Return earlier norms at peaks, to be solved anew where frames that are missing now contribute to them."""
         assert self._before is not None
         before = self._before
         gone = np.zeros(before.n_grid)
@@ -299,22 +352,21 @@ class ProcessSearch:
         origin = int(self.frames[0] - before.frames[0])
         gone[origin + self.at] = 0.0
         part = np.searchsorted(earlier.frames, self.frames[0] + peaks)
-        one = replace(earlier, norm=earlier.norm[part], frames=earlier.frames[part])
+        one = replace(earlier, norm=earlier.norm[part], frames=earlier.frames[part], unsolved=earlier.unsolved[part])
         share = _correlated(gone, earlier.squares, first - earlier.margin)[origin + peaks]
-        self._solve(one, share > CHANGED * one.irregular, k, shape, first, peaks)
-        return one
+        return replace(one, unsolved=one.unsolved | (share > CHANGED * one.irregular))
 
-    def _solve(
-        self, one: SolvedNorms, chosen: Bool, k: int, shape: Float, first: int, peaks: NDArray[np.int64]
-    ) -> None:
-        """Replace norms by exact ones at chosen onsets."""
-        left = np.flatnonzero(chosen)
-        starts = peaks[left] + first
-        while left.size:
-            stop = int(np.searchsorted(starts, starts[0] + max(CHUNK_FRAMES, shape.size), side="right"))
-            stop = min(stop, CHUNK_TEMPLATES)
-            one.norm[left[:stop]] = self._exact(k, shape, starts[:stop])
-            left, starts = left[stop:], starts[stop:]
+    def _solve(self, one: Filter, chosen: Bool) -> None:
+        """Replace the norms of all sums by exact ones at chosen onsets, if they are not solved."""
+        for k, norms in enumerate(one.norms):
+            left = np.flatnonzero(chosen & norms.unsolved)
+            norms.unsolved[left] = False
+            starts = one.peaks[left] + one.first
+            while left.size:
+                stop = int(np.searchsorted(starts, starts[0] + max(CHUNK_FRAMES, one.shape.size), side="right"))
+                stop = min(stop, CHUNK_TEMPLATES)
+                norms.norm[left[:stop]] = self._exact(k, one.shape, starts[:stop])
+                left, starts = left[stop:], starts[stop:]
 
     def _exact(self, k: int, shape: Float, starts: NDArray[np.int64]) -> Float:
         """Return s^T C^-1 s of a shape that starts at some frames of the grid, shape (n_start,).

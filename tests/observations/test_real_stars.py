@@ -112,6 +112,32 @@ def test_statistics_have_unit_variance_over_gaps_and_changing_noise(
             assert row.per_amplitude[0, onset] == pytest.approx(np.sqrt(shape @ dense @ shape), rel=tolerance)
 
 
+@pytest.mark.parametrize("threshold", [0.5, 2.0, 4.0])
+def test_values_above_a_threshold_are_those_of_all_solved_denominators(threshold: float) -> None:
+    """Search frames with gaps, of which some are taken away, above a threshold and in full: the same exceed it."""
+    rng = np.random.default_rng(402)
+    number = np.flatnonzero((rng.random(2500) > 0.03) & (np.abs(np.arange(2500) - 900) > 20))
+    frames = Frames.of(number * 120.0, np.ones(number.size), exposure_s=120.0)
+    stare = stare_of(frames, np.ones(number.size, np.bool_))
+    bank = bank_of(stare, np.ones((1, 1)), DAVENPORT)
+    left = np.abs(number - 1500) > 40
+    unsolved = 0
+    searches = []
+    for above in (None, threshold):
+        whole = ProcessSearch(bank, stare, (ROTATOR,), np.ones(number.size))
+        list(whole.values(np.zeros((1, number.size, 1)), above))
+        searches.append(ProcessSearch(bank, select_frames(stare, left), (ROTATOR,), np.ones(left.sum()), whole))
+    sums = rng.standard_normal((2, int(left.sum()), 1))
+    exact, quick = (list(one.values(sums, above)) for one, above in zip(searches, (None, threshold), strict=True))
+    for (_, values), (_, found) in zip(exact, quick, strict=True):
+        higher = values[0] > threshold
+        # Innovations that are neglected depend on which templates are solved together.
+        np.testing.assert_allclose(found[:, higher], values[:, higher], rtol=1e-7)
+        assert (found[0][~higher] <= threshold).all()
+        unsolved += int(np.count_nonzero(np.isinf(found[0]) & np.isfinite(values[0])))
+    assert unsolved
+
+
 @pytest.mark.long
 def test_losses_of_light_are_not_searched_and_flares_between_them_are_found() -> None:
     """Light curves of 5 h with twelve losses of 0.5 to 5 %, with and without flares of S/N 30 between them.

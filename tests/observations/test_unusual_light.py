@@ -56,6 +56,19 @@ def test_tail_of_a_bright_flare_without_its_peak_is_an_event(
     assert abs(event.energy.fitted_s - truth) < 2.5 * (high - low)
 
 
+def test_end_of_a_search_at_its_largest_number_of_events_is_stated(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(503)
+    time = np.arange(3000) * 20.0
+    flux = 1 + 1e-3 * rng.standard_normal(time.size)
+    for peak in np.linspace(5e3, 55e3, 6):
+        flux += 0.1 * flare(time, 20.0, peak, 60.0)
+    frames = Frames.of(time, flux, np.full(time.size, 1e-3))
+    assert not any("ended at" in line for line in analyse_frames(frames).messages)
+    monkeypatch.setattr("mauvecl.observations.detection.MOST_EVENTS", 5)
+    ended = analyse_frames(frames)
+    assert any(f"ended at {len(ended.events)} events" in line for line in ended.messages)
+
+
 def spotted_binary(rng: np.random.Generator, days: float, frame_s: float) -> tuple[Float, Float, Float, list[float]]:
     """Draw times, light, depth of the eclipses and peaks of five flares of 0.8 to 15 %, with noise of 5e-4."""
     time = np.arange(int(days * 86_400 / frame_s)) * frame_s
