@@ -134,6 +134,7 @@ class Trial:
     flux: Float = field(default_factory=lambda: np.zeros(0))
     level: Float | float = 1.0  # quiescent light of each frame, in the unit of the flux
     noise: float = np.nan  # standard deviation of the white noise, likewise
+    lost: NDArray[np.bool_] | None = None  # frames that have lost more light than the noise of a frame
     flares: list[Flare] = field(default_factory=list)
     wavelength_nm: Float | None = None
     star: tuple[str, float] | None = None  # library name and V magnitude, for spectra
@@ -218,7 +219,7 @@ def quiet(number: int, seed: int) -> Iterator[Trial]:
             cadences = [20.0, 60.0, 120.0, 600.0, 1800.0] if kind in ("rotator", "red", "white") else [5.0, 20.0, 60.0]
             cadence, noise = float(rng.choice(cadences)), between(rng, 1e-4, 5e-3)
             time_s = np.arange(n) * cadence
-            level = np.ones(n)
+            level, loss = np.ones(n), np.zeros(n)
             if kind == "rotator":
                 level += rotation(rng, time_s, between(rng, 0.2, 12) * DAY_S, between(rng, 1e-3, 0.05),
                                   rng.uniform(0, 0.7))  # fmt: skip
@@ -227,9 +228,12 @@ def quiet(number: int, seed: int) -> Iterator[Trial]:
             elif kind == "thermal":
                 level += between(rng, 1e-3, 0.02) * thermal_cycle(rng, time_s)
             elif kind == "pointing":
-                level *= 1 - pointing_loss(rng, time_s)
+                loss = pointing_loss(rng, time_s)
+                level *= 1 - loss
             flux, kept = level + noise * rng.normal(size=n), gapped(rng, n)
-            yield Trial("quiet", kind, k, time_s[kept], cadence, flux[kept], level[kept], noise)
+            yield Trial(
+                "quiet", kind, k, time_s[kept], cadence, flux[kept], level[kept], noise, lost=loss[kept] > noise
+            )
 
 
 #: Kinds of flares in short windows, with the shape of each.
@@ -549,6 +553,7 @@ def record_of(trial: Trial, answer: Answer) -> dict[str, Any]:
     if answer.code:
         return record
     searched = np.array([not str(reason) for reason in answer.frames["reason"]])
+    good = ~trial.lost if trial.lost is not None and trial.lost.size == searched.size else np.ones_like(searched)
     time_d, level, error = (
         np.asarray(getattr(answer.frames[name], "value", answer.frames[name]), float)
         for name in ("time", "level", "error")
@@ -556,7 +561,8 @@ def record_of(trial: Trial, answer: Answer) -> dict[str, Any]:
     cadence = trial.exposure_s or float(np.median(np.diff(time_d))) * DAY_S
     same = trial.wavelength_nm is None and level.size == trial.time_s.size
     record |= {
-        "searched": float(searched.mean()), "days": float(searched.sum()) * cadence / DAY_S,
+        "searched": float(searched.mean()), "searched_good": float(searched[good].mean()),
+        "days": float(searched.sum()) * cadence / DAY_S,
         "noise": float(np.nanmedian(error)) / trial.noise,
         "level": float(np.nanmedian(level / trial.level)) if same else np.nan,
         "no_verdict": "no verdict" in answer.message.lower()
@@ -649,6 +655,7 @@ def rows_of(part: str, kind: str, records: list[dict[str, Any]], promise_per_d: 
         return
     yield from spread("seconds", "seconds")
     yield from spread("share searched", "searched")
+    yield from spread("share of frames without losses searched", "searched_good")
     yield from spread("noise / truth", "noise")
     yield from spread("level / truth", "level")
     yield row("without a verdict", sum(one["no_verdict"] for one in done), len(done))

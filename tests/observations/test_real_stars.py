@@ -131,8 +131,8 @@ def test_values_above_a_threshold_are_those_of_all_solved_denominators(threshold
     exact, quick = (list(one.values(sums, above)) for one, above in zip(searches, (None, threshold), strict=True))
     for (_, values), (_, found) in zip(exact, quick, strict=True):
         higher = values[0] > threshold
-        # A denominator is kept where frames that are taken away contribute less than about a millionth to it.
-        np.testing.assert_allclose(found[:, higher], values[:, higher], rtol=5e-6)
+        # Denominators are kept where frames that are taken away hardly contribute: exact to `IRREGULAR`.
+        np.testing.assert_allclose(found[:, higher], values[:, higher], rtol=1e-4)
         assert (found[0][~higher] <= threshold).all()
         unsolved += int(np.count_nonzero(np.isinf(found[0]) & np.isfinite(values[0])))
     assert unsolved
