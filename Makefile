@@ -5,7 +5,7 @@ BIN := .venv/bin
 # Compiled files are kept whatever the shell says: the tests start Python some hundred times.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo check quick test lowest lint page docs dist try-wheel coverage mutants clean
+.PHONY: demo check quick test test-long lowest lint page docs dist try-wheel coverage mutants clean
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "mauvecl needs Python 3.11 or newer, found " + sys.version.split()[0])'
@@ -24,8 +24,13 @@ demo: .venv/plot.stamp
 # as cores and more: threads of OpenBLAS would only wait for each other.
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
 
+# What must hold of every change, in minutes.
 test: .venv/test.stamp
-	$(PYTEST) -n 3
+	$(PYTEST) -n 3 -m 'not long'
+
+# Coverage studies, attacks, executed documentation and whatever else takes long.
+test-long: .venv/test.stamp
+	$(PYTEST) -n 3 -m long
 
 lint: .venv/test.stamp .venv/lint.stamp
 	$(BIN)/ruff check .

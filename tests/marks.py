@@ -1,4 +1,4 @@
-"""Which cases of a test `make check` leaves to `make test`."""
+"""Which cases of a test `make test` leaves to `make test-long`."""
 
 from __future__ import annotations
 

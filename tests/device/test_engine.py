@@ -97,7 +97,7 @@ COMPARED = (
     "jitter, cold",
     "jitter, one frame, rays",
 )
-#: Cases of `make check`: a joint draw, and separate draws frame by frame.
+#: Cases of `make test`: a joint draw, and separate draws frame by frame.
 SHORT = ("stack", "apart, electrons, frames")
 
 

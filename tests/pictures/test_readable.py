@@ -78,7 +78,7 @@ def shown_ticks(axis: Any) -> list[Text]:
     return [tick.label1 for tick in inside if tick.label1.get_visible() and tick.label1.get_text()]
 
 
-#: What `make check` looks at.
+#: What `make test` looks at.
 SHORT = ("detect, one statistic", "limit of exposure", "map", "snr", "exposure")
 
 
