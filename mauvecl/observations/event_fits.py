@@ -66,18 +66,24 @@ class Mixture:
         kept = log > LEAST_LOG_WEIGHT
         log, mean, sd = log[kept], self.mean[kept], np.maximum(self.sd[kept], 1e-300)
 
-        weight, near = np.exp(log), bool((mean / sd).max() > -FAR_BELOW)
-
-        def above(x: float) -> float:
-            """Return the probability above x, or its logarithm where all is far below zero."""
-            z = (mean - x) / sd
-            if near:
-                return float(weight @ scipy.special.ndtr(z))
-            return float(scipy.special.logsumexp(log + scipy.special.log_ndtr(z)))
-
-        goal = above(0.0) * (1 - probability) if near else above(0.0) + float(np.log1p(-probability))
+        # Logarithms only where all is far below zero: they take longer.
+        above = _log_above if (mean / sd).max() < -FAR_BELOW else _above
+        held = (log if above is _log_above else np.exp(log), mean, sd)
+        goal = above(0.0, *held, 0.0)
+        goal = goal + float(np.log1p(-probability)) if above is _log_above else goal * (1 - probability)
         high = max(float((mean + 10 * sd).max()), float(sd.max()))
-        return float(scipy.optimize.brentq(lambda x: above(x) - goal, 0.0, high, xtol=1e-9 * high))
+        # `brentq` keeps its function until the next collection of garbage, but not the arrays.
+        return float(scipy.optimize.brentq(above, 0.0, high, args=(*held, goal), xtol=1e-9 * high))
+
+
+def _above(x: float, weight: Float, mean: Float, sd: Float, goal: float) -> float:
+    """Return the probability of a mixture above x, less a goal."""
+    return float(weight @ scipy.special.ndtr((mean - x) / sd)) - goal
+
+
+def _log_above(x: float, log_weight: Float, mean: Float, sd: Float, goal: float) -> float:
+    """Return the logarithm of the probability of a mixture above x, less a goal."""
+    return float(scipy.special.logsumexp(log_weight + scipy.special.log_ndtr((mean - x) / sd))) - goal
 
 
 def joined(parts: Sequence[Mixture]) -> Mixture:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -63,8 +64,11 @@ def measure_events(
     steps = steps or Steps()
     known: Sequence[Kind] = causes or ["flare"] * len(found)
     level = survey.flux_level(~taken)
-    each = steps.each(zip(found, known, strict=True), len(found))
-    events = [measure_event(survey, taken, level, *one) for one in each]
+    events = []
+    for one in steps.each(zip(found, known, strict=True), len(found)):
+        events.append(measure_event(survey, taken, level, *one))
+        # Fits of scipy leave circular references to arrays of some 20 MB, which are few objects and would be kept long.
+        gc.collect()
     for k, event in enumerate(events):
         ends = (event.first - 1, event.last + 1)
         sides = [each for each in events[max(0, k - 1) : k + 2] if each.last == ends[0] or each.first == ends[1]]
