@@ -14,7 +14,8 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
 from ..tables.medium import medium_of
-from ..tables.text_table import MISSING_WORDS, keywords_of, number_in
+from ..tables.missing import is_missing
+from ..tables.text_table import keywords_of, number_in
 from .column_choice import AXES
 from .column_roles import Role
 from .file_table import Column, FileTable
@@ -129,7 +130,7 @@ def _first_of_data(lines: Sequence[tuple[int, str]]) -> float:
         cells = re.split(r"[\s;|]+", line.strip())
         cells = line.split(",") if len(cells) == 1 else cells
         # A line of a preamble, such as "2 columns" or "912 s", has no second number.
-        if sum(bool(_NUMBER.match(cell)) or cell.lower() in {*MISSING_WORDS} | _NOT_FINITE for cell in cells) > 1:
+        if sum(bool(_NUMBER.match(cell)) or is_missing(cell) or cell.lower() in _NOT_FINITE for cell in cells) > 1:
             return number
     return starting[0][0] if starting else float("inf")
 

@@ -13,8 +13,8 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import printable, shortened
 
 from .coordinates import angle, angle_unit, unit_in_name
+from .missing import is_missing
 from .names import divided_unit, first_of
-from .text_table import MISSING
 from .times import time_unit
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class Rows:
                 (cell.decode("utf-8", "replace") if isinstance(cell, bytes) else str(cell)).strip()
                 for cell in (values.tolist() if values.dtype.kind in "SUO" else values)
             ]  # fmt: skip
-            self._texts[name] = ["" if text in MISSING or text.lower() == "nan" else text for text in cells]
+            self._texts[name] = ["" if is_missing(text) else text for text in cells]
         return self._texts[name]
 
     def _numbers(self, name: str) -> list[float] | None:

@@ -11,6 +11,7 @@ from mauvecl.schema.errors import InputError
 
 from ..files.parsing import parsing
 from .ecsv import check_cells, parse_ecsv
+from .missing import SPELT, is_missing
 from .times import is_dated, time_unit
 
 if TYPE_CHECKING:
@@ -18,9 +19,6 @@ if TYPE_CHECKING:
 
 #: Separators of cells in CSV; the one that is most frequent in the first line counts.
 SEPARATORS = (",", ";", "\t")
-#: Words of cells without a value, as archives and programs write them; an empty cell has none in any case.
-MISSING_WORDS = ("", "null", "none", "n/a", "na", "--", "---", "-", "...", "masked", "indef", "<na>")
-MISSING = tuple(dict.fromkeys(how(word) for word in MISSING_WORDS for how in (str, str.upper, str.capitalize)))
 _ZERO = re.compile(r"0\d+")
 _LEADING_ZERO = re.compile(r"(?m)(?:^|[,;\t\s])\"?0\d+\"?\s*(?:$|[,;\t\s])")
 #: Largest number of characters of a table of known format, and of one for which astropy tries about twenty formats.
@@ -56,7 +54,7 @@ def number_in(cell: str) -> float:
     try:
         return float(cell)
     except ValueError:
-        if cell.lower() in MISSING_WORDS:
+        if is_missing(cell):
             return float("nan")
         # Exponents of Fortran's double precision.
         return float(re.sub(r"(?<=[\d.])[dD](?=[+-]?\d)", "e", cell))
@@ -104,7 +102,7 @@ def text_table(
         how["converters"] = dict.fromkeys(kept, str)
     with parsing(named, expected), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        table = Table.read([*lines, ""], fill_values=[(word, "0") for word in MISSING], **how)
+        table = Table.read([*lines, ""], fill_values=[(word, "0") for word in SPELT], **how)
         for name, unit in zip(table.colnames, units, strict=False):
             table[name].unit = unit.strip('"') or None
         return table
@@ -165,7 +163,7 @@ def _cells(line: str, separator: str) -> list[str]:
 
 def is_number(cell: str) -> bool:
     """Return whether a cell is a number or a missing one."""
-    if cell in MISSING or cell.lower() in ("nan", "inf", "-inf"):
+    if is_missing(cell) or cell.lower() in ("inf", "-inf"):
         return True
     try:
         float(cell)

@@ -17,6 +17,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
 from mauvecl.schema.text import shortened
 
+from .missing import is_missing
 from .names import divided_unit
 
 Float = NDArray[np.float64]
@@ -243,7 +244,7 @@ def mjd_of(texts: Sequence[str], scale: str, name: str, what: str) -> Float:
     from astropy.time import Time
 
     found = np.full(len(texts), np.nan)
-    filled = [k for k, text in enumerate(texts) if text and text not in ("--", "nan", "NaT")]
+    filled = [k for k, text in enumerate(texts) if not is_missing(text)]
     cleaned = [texts[k].removesuffix("Z") for k in filled]
     with offline():
         try:

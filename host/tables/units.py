@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mauvecl.schema.errors import InputError
 
+from .missing import MISSING_WORDS
+
 if TYPE_CHECKING:
     import astropy.units as u
 
@@ -48,7 +50,8 @@ _ST = re.compile(r"(?:m(?:ag)?s?[_ (]*)?st[) ]*(?:[_ ]?mag(?:nitude)?s?)?", re.I
 _NANOMAGGIES = re.compile(r"n(?:ano)?m(?:ag)?g(?:y|ies|ys)", re.IGNORECASE)
 _LOGARITHM = re.compile(r"(?:log(?:_?10)?|dex)(?:\s*[\s_(\[]\s*(.*?)\s*\]?)?", re.IGNORECASE)
 _NO_FLUX = re.compile(r"mag|^(counts?|cts|adu|dn|fn|electrons?)\b", re.IGNORECASE)
-_NO_UNIT = {"", "none", "null", "n/a", "-", "--", "---"}
+# "na" is a nanoyear.
+_NO_UNIT = {*MISSING_WORDS} - {"na"}
 
 
 def is_stated(text: object) -> bool:
