@@ -31,6 +31,8 @@ LACKING_ERRORS, LACKING_SHARE = 5.0, 0.5
 LEVELS = (0.6826894921370859, 0.95)
 #: Number of frames on each side of an event from which the error of its level follows.
 NEARBY = 10_000
+#: Errors of the sum of an event's frames by which they are fainter than the level, from which they show no flare.
+FAINTER_ERRORS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +58,11 @@ class Energy:
 
     @property
     def unclear(self) -> bool:
-        """True if the sum of the frames is not above the level, so that they do not show the light of a flare."""
-        return self.summed_s <= 0
+        """True if the frames are together fainter than the level by more than its error: they show no light of a flare.
+
+        Where the level is uncertain, as in a gap of hours of a star that rotates, the sum says nothing.
+        """
+        return self.summed_s < -FAINTER_ERRORS * self.summed_error_s
 
     @property
     def p_value(self) -> float:

@@ -132,7 +132,7 @@ class EventRow:
 
     @property
     def unclear(self) -> bool:
-        """True if the frames of an event in a light curve are together not brighter than the star."""
+        """True if the frames of an event in a light curve are together fainter than the star."""
         return self.event.energy.unclear and not self.analysis.survey.weighted
 
     @property
@@ -183,7 +183,7 @@ class EventRow:
         if event.kind == "flare" and event.energy.p_value < 1e-3:
             notes.append("the shapes of the templates do not fit it, which its interval includes")
         if event.kind == "flare" and self.unclear:
-            notes.append("the sum of its frames is not brighter than the level, which is uncertain in them")
+            notes.append("its frames are together fainter than the level by more than its error")
         if event.kind == "flare" and not event.energy.peak_observed:
             notes.append("no frame shows its peak")
         return "; ".join(notes)
