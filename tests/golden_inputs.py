@@ -21,7 +21,7 @@ Float = NDArray[np.float64]
 #: equivalent duration of 1.827 s.
 FLARES = {
     "rotating.csv": ((216_000.0, 2400.0, 0.02),),
-    "flares.csv": ((1000.0, 60.0, 0.1), (2600.0, 100.0, 0.03)),
+    "flares.csv": ((1000.0, 60.0, 0.1), (2200.0, 100.0, 0.03)),
     "counts.csv": ((1200.0, 60.0, 8.0),),
 }
 #: What the instrument of the calibration has in place of nominal values.
@@ -68,8 +68,8 @@ def rotating(path: Path, seed: int) -> None:
     """
     time, error, rng = np.arange(200) * 1800.0, 5e-4, np.random.Generator(np.random.PCG64(seed))
     light = np.zeros(time.size)
-    for period_d, damping_d, sd in ((0.5, 10.0, 0.01), (0.25, 10.0, 0.004)):
-        turn = np.exp(1800 / 86_400 * (2j * np.pi / period_d - 1 / damping_d))
+    for period_d, sd in ((0.5, 0.01), (0.25, 0.004)):
+        turn = np.exp(1800 / 86_400 * (2j * np.pi / period_d - 1 / 10.0))
         kicks = sd * rng.standard_normal((time.size, 2)) @ [1, 1j]
         kicks[1:] *= np.sqrt(1 - abs(turn) ** 2)
         state = 0j
@@ -81,8 +81,8 @@ def rotating(path: Path, seed: int) -> None:
 
 
 def flares(path: Path, seed: int) -> None:
-    """Write an hour of a constant star with two flares."""
-    time, error = np.arange(180) * 20.0, 0.002
+    """Write 50 minutes of a constant star with two flares."""
+    time, error = np.arange(150) * 20.0, 0.002
     noise = error * np.random.Generator(np.random.PCG64(seed)).standard_normal(time.size)
     _rows(path, time=time / 86_400, flux=1 + _flares(path.name, time) + noise, error=np.full(time.size, error))
 

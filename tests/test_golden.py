@@ -52,7 +52,7 @@ TOLERANCES = [
     ("analyse", "rate_|probability", 0.02, 1e-9),
     ("analyse", "bic", 1e-2, 1e-2),
     ("analyse-rotating", "", 1e-2, 0.0),
-    ("analyse", "low|high", 1e-3, 0.0),
+    ("analyse", "low|high", 5e-3, 0.0),
     ("analyse", "", 1e-4, 0.0),
     ("calibrate", "mode_", 1e-4, 1e-4),
     ("calibrate", "", 1e-4, 1e-9),
@@ -60,7 +60,7 @@ TOLERANCES = [
 ]
 # What is compared of stars of the library, and of keys of studies.
 LIBRARY = ("name", "spectral_type", "level", "temperature_k")
-LIMITS = "default minimum maximum exclusiveMinimum exclusiveMaximum enum const minItems maxItems".split()
+LIMITS = re.compile("default|enum|const|(m|M)(in|ax)(imum|Items)")
 
 # Each is a command, or several after one another, of which the last one is the question.
 QUESTIONS = {
@@ -75,7 +75,7 @@ QUESTIONS = {
     " --neighbour-share 0.5 --tails sampled",
     "limit": "limit -n 10000 --fap 0.01",
     "limit-of-amplitude": "limit -n 10000 --fap 0.01 --star M3V -m 9 --of amplitude",
-    "limit-of-exposure": "limit -n 10000 --fap 0.01 --star M3V -m 9 --of exposure -a 0.1 --statistic matched",
+    "limit-of-exposure": "limit -n 10000 --fap 0.01 --star M3V -m 9 --of exposure -a 0.01 --statistic matched",
     "map": "map -n 10000 --fap 0.01 --star G2V --x magnitude:6:9:4 --y amplitude:0.01:0.3:4:log",
     "map-of-exposure": "map -n 10000 --fap 0.01 --star M3V -m 9 -a 0.1 --x exposure:5:300:4:log"
     " --y flare_temperature:6000:20000:3 --statistic chi2_element --instrument mauve-electrons",
@@ -90,8 +90,8 @@ QUESTIONS = {
     "exposure-of-element": "exposure --snr 5 --at 450 --star M3V -m 9 --per element --instrument mauve-electrons",
     "stare": "stare --star G2V -m 7.4",
     "stare-with-unknowns": "stare --star M3V -m 9 -a 0.3 --orbit-gap 2100 --thermal 0.5 --with-unknowns",
-    "stare-pointing": "stare --star M3V -m 9 -a 1 --pointing-drifts 20 --duration 1500 --half-width 30 --distance 5"
-    " --shape tovarmendoza2022 --flare-temperature 14000",
+    "stare-pointing": "stare --star M3V -m 9 -a 1 --pointing-drifts 4 --duration 1500 --half-width 30 --distance 5"
+    " --shape tovarmendoza2022 --set search.shape=tovarmendoza2022 --flare-temperature 14000",
     "inject": "inject --star M3V --magnitude 9 --distance 5 --duration 20000 -n 200"
     " --set injections.sizes=4 --set injections.widths=3",
     "inject-durations": "inject --star G2V -m 7.4 --duration 4000 --size duration -n 50 --instrument mauve-electrons"
@@ -111,14 +111,14 @@ QUESTIONS = {
     "analyse-rotating": "analyse rotating.csv --mapping curve.toml --alarms-per day",
     "analyse-flares": "analyse flares.csv --mapping curve.toml --false-alarms 10 --alarms-per day",
     "analyse-counts": "analyse counts.csv --mapping ct.toml --false-alarms 10 --alarms-per day",
-    "analyse-spectra": "stare --star M3V -m 9 -a 0.5 --duration 800 --set stare.half_width_s=40 --distance 5"
+    "analyse-spectra": "stare --star M3V -m 9 -a 0.5 --duration 500 --half-width 25 --distance 5"
     " --output drawn --no-pictures && analyse drawn/light-curve-1.fits --star M3V -m 9 --distance 5 --false-alarms 10"
     " --alarms-per day",
     "change": "change --star M3V -m 9",
     "change-with-unknowns": "change --star M3V -m 9 --change spectrum --change-file vb8.fits --change 'Mg II'"
     " --change colour --change 200-320 --visits 30 --fap 0.01 --power 0.8 --nuisance dark=0.1 --nuisance light=0.02",
     "change-periods": "change --star K5V -m 8 -t 300 --change 320-700 --visits 8 --periods --look-at 'eps Eri'"
-    " --days 10 --longest-period 8 --trials 10",
+    " --days 6 --longest-period 5 --trials 10",
     "calibrate": "calibrate standards.toml --knots 40",
     "calibrate-one-star": 'calibrate --light-error 0.01 --set \'calibrate.observations=[{frames="a0v.fits",'
     ' mapping="raw.toml", library="A0V", magnitude=5}]\'',
@@ -209,7 +209,7 @@ def keys(schema: dict[str, Any]) -> Iterator[dict[str, str]]:
     for section, about in {"study": schema, **schema["$defs"]}.items():
         found = {}
         for key, field in about.get("properties", {}).items():
-            found[key] = {k: v for one in (*field.get("anyOf", ()), field) for k, v in one.items() if k in LIMITS}
+            found[key] = {k: v for one in (*field.get("anyOf", ()), field) for k, v in one.items() if LIMITS.search(k)}
         yield {"section": section, "keys": json.dumps(found, sort_keys=True)}
 
 
@@ -245,10 +245,10 @@ def test_tables_of_default_questions_are_unchanged(name: str, tmp_path: Path) ->
 
 @pytest.mark.parametrize("name", [name for name, asked in QUESTIONS.items() if asked.split()[0] not in PLAIN])
 def test_old_study_files_are_read(name: str) -> None:
-    # Files that a study names were next to it when it was written.
+    # Files that a study names were next to it when it was written; a study states their whole paths.
     text = (GOLDEN / name / "study.toml").read_text(encoding="utf-8")
     study = Study.build(tomllib.loads(text), name)
-    assert Study.build(tomllib.loads(study.toml()), name) == study
+    assert Study.build(tomllib.loads(study.toml()), name).toml() == study.toml()
 
 
 def test_old_stores_are_read_and_drawn_again(tmp_path: Path) -> None:
@@ -275,8 +275,10 @@ if __name__ == "__main__":
             (GOLDEN / question).mkdir(parents=True)
             for each in written.glob("*.ecsv"):
                 table = thinned(each)
-                # The study is kept once, next to the tables.
-                table.meta.pop("study", None)
+                # The study is kept once, next to the tables; descriptions are not compared.
+                table.meta.clear()
+                for column in table.itercols():
+                    column.info.description = None
                 table.write(GOLDEN / question / each.name)
             if (written / "study.toml").exists():
                 text = (written / "study.toml").read_text(encoding="utf-8").replace(f"{temporary}/", "")
