@@ -86,6 +86,8 @@ class Frames:
         Name of the star or the file.
     instrument : str
         Name of the instrument; empty if unknown.
+    net : bool
+        Whether dark current and bias are known to be subtracted, as from raw spectra that `mauvecl realise` wrote.
     remarks : tuple of str
         What was done while reading, such as sorting.
     """
@@ -106,6 +108,7 @@ class Frames:
     direction_deg: tuple[float, float] | None = None
     name: str = "frames"
     instrument: str = ""
+    net: bool = False
     remarks: tuple[str, ...] = ()
 
     @classmethod

@@ -75,6 +75,7 @@ def read_frames(
     *,
     quality_bits: str | int | None = None,
     ignore_checksum: bool = False,
+    raw: bool = False,
 ) -> Frames:
     """Read frames from a file or a folder.
 
@@ -92,8 +93,13 @@ def read_frames(
         Bits of the quality that exclude a frame, as in the mapping, over which they have precedence.
     ignore_checksum : bool
         Whether FITS files are read that their CHECKSUM or DATASUM contradicts.
+    raw : bool
+        Whether spectra of `mauvecl realise` keep bias and dark current, which are subtracted otherwise. Others are as
+        their file has them.
     """
     with _parsing(path), _frame_file(path, mapping, check=not ignore_checksum) as (file, how, stem):
+        if raw and mapping is None and isinstance(file, StoredFile):
+            how = file.raw_mapping
         if quality_bits is not None:
             how = how.model_copy(update={"quality_bits": quality_bits})
         return _frames_in(file, how, stem)
@@ -402,6 +408,7 @@ def _frames_in(
         scale=dates.scale,
         position=dates.position,
         direction_deg=dates.direction_deg,
+        net=isinstance(file, StoredFile) and mapping.flux != "raw",
     )
     if dates.at != 0.5:
         made = made.shifted((0.5 - dates.at) * made.exposure_s)

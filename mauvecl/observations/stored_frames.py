@@ -45,7 +45,7 @@ class StoredScene:
 
 
 class StoredFile(TableFile):
-    """A scene of a store as frames without dark and bias, one exposure after the other."""
+    """A scene of a store as frames, one exposure after the other, with and without dark and bias."""
 
     def __init__(self, scene: StoredScene, what: str) -> None:
         of = scene.attributes
@@ -72,6 +72,7 @@ class StoredFile(TableFile):
         }
         shape = (n, scene.calibration["wavelength_nm"].size)
         self.parts["flux"] = Values("flux", shape, self._flux, "adu", what)
+        self.parts["raw"] = Values("raw", shape, self._raw, "adu", what)
         self.parts["error"] = Values("error", shape, self._error, "adu", what)
         if "temperature_c" in of:
             self.parts["temperature"] = Values.of("temperature", each * float(of["temperature_c"]), "deg_C", what)
@@ -91,6 +92,14 @@ class StoredFile(TableFile):
         """Paths of the quantities in the store."""
         more = {"temperature": "temperature"} if "temperature" in self.parts else {}
         return FrameMapping(**MAPPING, **more)
+
+    @property
+    def raw_mapping(self) -> FrameMapping:
+        """Paths of the quantities, with counts that have bias and dark current; only those of single frames."""
+        if self.stacked > 1:
+            raise InputError(f"{self.what} holds sums of {self.stacked} frames", "single frames: `mauvecl realise "
+                             "--frames all`", key="frames", value=self.stacked)  # fmt: skip
+        return self.mapping.model_copy(update={"flux": "raw", "error": None})
 
     def _raw(self, start: int, stop: int) -> Float:
         first, last = start // self.per_row, -(-stop // self.per_row)

@@ -12,9 +12,11 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+from astropy.table import Table
+from commands import run
 from refusals import refused
 
-from mauvecl import Frames, Instrument, Sky, Source, Study, calibrate, expect, plan
+from mauvecl import Frames, Instrument, Sky, Source, Study, calibrate, expect, plan, read_frames
 from mauvecl.answers.limits.assumptions import assumptions
 from mauvecl.answers.measurements.expected import expected_measurements
 from mauvecl.answers.observations.calibrate import MODE_BANDS, CalibrateAnswer
@@ -289,12 +291,29 @@ def test_unknowns_of_a_calibrated_instrument_are_its_modes(answer: CalibrateAnsw
         ({"unit": "electron"}, "unit"),
         ({"temperature_c": None}, "temperature_c"),
         ({"wavelength_nm": NOMINAL.wavelength_nm + 50}, "wavelength"),
+        ({"net": True}, "frames"),
     ],
 )
 def test_frames_that_cannot_be_calibrated_raise(change: dict[str, Any], key: str) -> None:
     frames = frames_of(truth(), star("A0V", 5.0), [16.0], 20, np.random.default_rng(6))
     with refused(key):
         calibrate(study_of((("A0V", 5.0),), dark=False), frames=(replace(frames, **change),))
+
+
+def test_stored_spectra_are_calibrated_as_raw_counts(tmp_path: Path) -> None:
+    """Throughput of a stored star within four of its errors of the nominal one, with which it was drawn."""
+    run("realise", "--star", "A0V", "-m", 5, "-a", 0.1, "-n", 40, "-t", 5, "-o", "single.zarr", folder=tmp_path)
+    run("realise", "--star", "A0V", "-m", 5, "-a", 0.1, "-n", 4, "-t", 50, "-o", "sums.zarr", folder=tmp_path)
+    study = "calibrate.observations = [{{ frames = '{}[star-1/quiescent]', library = 'A0V', magnitude = 5.0 }}]"
+    (tmp_path / "single.toml").write_text(study.format("single.zarr"))
+    (tmp_path / "sums.toml").write_text(study.format("sums.zarr"))
+    run("calibrate", "single.toml", "--no-pictures", folder=tmp_path)
+    table = Table.read(tmp_path / "mauvecl-calibrate" / "throughput.ecsv")
+    assert (np.abs(table["ratio"] - 1) < FAR * table["relative_error"]).all()
+    assert "single frames" in run("calibrate", "sums.toml", folder=tmp_path, code=2).stderr
+    net = read_frames(tmp_path / "single.zarr[star-1/quiescent]")
+    with refused("frames"):
+        calibrate(study_of((("A0V", 5.0),), dark=False), frames=(net,))
 
 
 def test_frames_that_say_nothing_raise() -> None:

@@ -507,7 +507,7 @@ def calibrate(
         if given is not None and len(given) != len(asked.observations):
             raise InputError.of(name, len(given), f"{len(asked.observations)}, one for each observation")
     nominal = study.observation.load_instrument()
-    read = frames or tuple(read_frames(one.frames, one.mapping) for one in asked.observations)
+    read = frames or tuple(read_frames(one.frames, one.mapping, raw=True) for one in asked.observations)
     sources = stars or tuple(one.source() for one in asked.observations)
     observations = tuple(
         CalibrationFrames.of(given, nominal, star, one.temperature_c)

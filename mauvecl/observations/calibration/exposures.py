@@ -55,6 +55,11 @@ class CalibrationFrames:
         unit = frames.unit.strip().casefold()
         if unit not in ("dn", "adu", "ct", "count"):
             raise InputError.of("unit", frames.unit or "none", "raw DN, with bias and dark", where=frames.name)
+        if frames.net:
+            raise InputError(
+                f"{frames.name}: dark current and bias are subtracted",
+                "raw DN: read_frames(..., raw=True)", key="frames",
+            )  # fmt: skip
         temperatures = frames.temperature_c
         if temperatures is None:
             if temperature_c is None:
