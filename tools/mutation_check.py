@@ -34,6 +34,7 @@ SWAPPED = (
 SHAPE = "    g1, g2, g3 = c.shape()\n    sd ="
 
 MUTATIONS: dict[str, Mutation] = {
+    # Draws, statistics, stores and runs.
     "one unknown's row dropped": (
         "test_marginalised_statistics_keep_false_alarms_and_power[0.1]",
         ("nuisances.names if nuisances else ()))", "nuisances.names[1:] if nuisances else ()))"),
@@ -238,6 +239,294 @@ MUTATIONS: dict[str, Mutation] = {
         "test_null_follows_its_closed_form",
         ("[k][s + 3u] = d;", "[k][s + 3u] = 0.0f;"),
         ("for centre, row in enumerate(self.rows):", "for centre, row in enumerate([]):"),
+    ),
+    # Fits of spectra.
+    "fluxes per Angstrom": (
+        "test_correct_model_covers_and_simple_model_is_rejected",
+        ("10.0 * np.trapezoid(fluxes[:, inside]", "np.trapezoid(fluxes[:, inside]"),
+    ),
+    "errors of fluxes at a known temperature": (
+        "test_correct_model_covers_and_simple_model_is_rejected",
+        ('gradient[:, which, m] = np.einsum("nql,nl->nq", spline(log_k, 1), linear)', "gradient[:, which, m] = 0.0"),
+    ),
+    "errors of jumps at a known temperature": (
+        "test_forecasts_of_balmer_jumps_and_of_wrong_blackbodies[jump-2.5]",
+        ("ratio(log_k, 1) * linear[:, 1] / amplitude", "0.0 * amplitude"),
+    ),
+    "intervals clipped at a standard deviation": (
+        "test_intervals_agree_with_minos_and_emcee",
+        (
+            "sign * np.sqrt(np.maximum(room, 0.0) * spread[rows])",
+            "sign * np.sqrt(np.minimum(np.maximum(room, 0.0), 1.0) * spread[rows])",
+        ),
+    ),
+    "intervals beyond their bounds": (
+        "test_bounded_intervals_agree_with_brute_force",
+        ("reaches = (low <= np.array(model.bounds)) & np.isfinite(model.bounds)", "reaches = low < -np.inf"),
+    ),
+    "the noise of a star for that of its flare": (
+        "test_forecasts_of_blackbodies[M3V-0.5-50s-30000K]",
+        (
+            "return light, constant + quiet.gain_dn_per_electron * light",
+            "return light, constant + quiet.gain_dn_per_electron * quiet.light_dn",
+        ),
+    ),
+    "saturated pixels in use": (
+        "test_rows_with_saturated_pixels_are_marked[0.75-none1-marked1]",
+        (
+            "NEAR_SIGMA * np.sqrt(scatter / quiet.n_frames) < quiet.ceiling_dn",
+            "NEAR_SIGMA * np.sqrt(scatter / quiet.n_frames) < np.inf",
+        ),
+    ),
+    "flare and factor on light correlated with the wrong sign": (
+        "test_intervals_agree_with_brute_force[0.5-prior]",
+        ("bottom_variance, -covariance(own, dims)", "bottom_variance, covariance(own, dims)"),
+    ),
+    "a factor on light without its own error": (
+        "test_intervals_agree_with_brute_force[0.5-free]",
+        ("covariance(dims, dims) + light.scale**-2.0", "covariance(dims, dims)"),
+    ),
+    # Fits of events.
+    "intervals of events that are not truncated at zero": (
+        "test_quantiles_are_those_of_a_truncated_normal_distribution[0.0]",
+        ("goal = above(0.0) * (1 - probability)", "goal = (1 - probability)"),
+    ),
+    "a flare added to the level of its star": (
+        "test_flare_brighter_than_its_window_has_its_energy",
+        (
+            "float(window.values @ likelihood.level) - grid.amplitude * in_level",
+            "float(window.values @ likelihood.level) + grid.amplitude * in_level",
+        ),
+    ),
+    "durations without the error of their level": (
+        "test_error_of_a_fitted_duration_is_that_of_least_squares",
+        ("grid.information + left + mean**2 * likelihood.level_variance) / level", "grid.information + left) / level"),
+    ),
+    "brighter flares on a higher level": (
+        "test_error_of_a_fitted_duration_is_that_of_least_squares",
+        ("along = per_amplitude + mean * in_level", "along = per_amplitude - mean * in_level"),
+    ),
+    "light summed above a known level": (
+        "test_error_of_a_summed_duration_includes_that_of_its_level",
+        ("variance += _level_variance(process, time, noise, quiet, near)", "pass"),
+    ),
+    "a slow decay on top of the fast one": (
+        "test_shapes_have_a_peak_of_one_and_the_integral_of_their_values[74]",
+        ("row[rise], row[len(rises) + start] = 1.0, 1.0 - share", "row[rise], row[len(rises) + start] = 1.0, 1.0"),
+    ),
+    "published shapes that do not share their weight": (
+        "test_prior_weights_add_up_to_one",
+        ("(1 - GENERAL_WEIGHT) / len(published)", "(1 - GENERAL_WEIGHT)"),
+    ),
+    "likelihood without the information on the level": (
+        "test_covariance_is_that_of_dense_matrices",
+        ("covariance.log_determinant + np.log(information)", "covariance.log_determinant"),
+    ),
+    "steps taken for flares": (
+        "test_a_flare_is_found_at_its_time_and_a_step_is_a_step",
+        (
+            "return whole - float(gain.max()) < float(plain.chi2(model))",
+            "return whole - float(gain.max()) > float(plain.chi2(model))",
+        ),
+    ),
+    # The level of observed light curves, and the search.
+    "norms that end with their template": (
+        "test_level_norms_and_covariances_are_those_of_the_matrices",
+        ('total = np.einsum("jo,jo->o", state, form @ state)', "total = 0.0"),
+    ),
+    "statistics of a known level": (
+        "test_statistics_have_unit_variance_over_gaps_and_changing_noise[process0-300-0.05-0.02-0-at-once]",
+        ("_correlated(held, shape, first)[peaks] ** 2 / level.sum()", "0.0 * _correlated(held, shape, first)[peaks]"),
+    ),
+    "a level without its process": (
+        "test_level_norms_and_covariances_are_those_of_the_matrices",
+        ("held - self._noise[:, None] * self._covariance.solve(held) + mean", "0.0 * held + mean"),
+    ),
+    "a level with the stated errors": (
+        "test_level_norms_and_covariances_are_those_of_the_matrices",
+        ("noise = variance * process.excess**2\n        self._weights", "noise = variance\n        self._weights"),
+    ),
+    "noise that falls with the counts": (
+        "test_noise_at_the_level_is_that_of_its_counts",
+        ("squared - slope * (flux - level)", "squared + slope * (flux - level)"),
+    ),
+    "flares of three frames taken for rays": (
+        "test_single_frames_and_dips_are_flagged_and_a_flare_of_three_frames_is_not",
+        (" & (np.abs(sigmas[after]) < NEAR)", ""),
+    ),
+    "means that scatter like frames": (
+        "test_correlated_frames_are_red_and_gaps_are_not_bridged",
+        ("scipy.stats.chi2.ppf(p, dof) / dof / size", "scipy.stats.chi2.ppf(p, dof) / dof"),
+    ),
+    "means over gaps": (
+        "test_correlated_frames_are_red_and_gaps_are_not_bridged",
+        ("(place % size == 0) & (place + size <= length)", "place % size == 0"),
+    ),
+    "correlations over gaps": (
+        "test_correlations_do_not_bridge_gaps",
+        ("pairs = numbers[lag:] - numbers[:-lag] == lag", "pairs = numbers[lag:] > numbers[:-lag]"),
+    ),
+    "losses that are never searched": (
+        "test_losses_are_found_at_their_frames_and_a_flare_is_none",
+        (
+            "if survey.weighted or not (many or process.excess > MOST_EXCESS or fast):",
+            "if survey.weighted or many is many:",
+        ),
+    ),
+    "losses searched upright": (
+        "test_losses_are_found_at_their_frames_and_a_flare_is_none",
+        ("sums=-self.sums, flux=-self.flux", "sums=self.sums, flux=self.flux"),
+    ),
+    # Readers.
+    "dates of TESS from noon": (
+        "test_csv_ecsv_and_fits_give_the_same_frames",
+        ('"btjd": 56_999.5,\n    "bkjd"', '"btjd": 57_000.0,\n    "bkjd"'),
+    ),
+    "starts of frames taken for their ends": (
+        "test_time_keywords_of_fits_are_read[keywords9-61000.0-utc--15.0]",
+        ("made.shifted((0.5 - dates.at) * made.exposure_s)", "made.shifted((dates.at - 0.5) * made.exposure_s)"),
+    ),
+    "days taken for seconds": (
+        "test_csv_ecsv_and_fits_give_the_same_frames",
+        ("np.asarray(((time - first) * unit).to_value(u.s)), ", "np.asarray(time - first), "),
+    ),
+    "light that reaches the barycentre earlier": (
+        "test_barycentric_times_of_the_geocentre_are_those_of_erfa[2026-09-16T03:00:00]",
+        ("(when.tdb - first).to_value(u.s) + late", "(when.tdb - first).to_value(u.s) - late"),
+    ),
+    "wavelengths shorter in vacuum": (
+        "test_air_becomes_vacuum_where_the_file_says_air",
+        ("vacuum[there] = air_nm[there] * index", "vacuum[there] = air_nm[there] / index"),
+    ),
+    "air in a unit overlooked": (
+        "test_air_becomes_vacuum_where_the_file_says_air",
+        (
+            'return match[1] or None, "air" if match[2].lower() == "air" else "vacuum"',
+            'return match[1] or None, "vacuum"',
+        ),
+    ),
+    "fluxes in the order of frequencies": (
+        "test_frequencies_may_rise_or_fall[order1]",
+        ("_in_flam(kept, nm, flux)[order]", "_in_flam(kept, nm, flux)"),
+    ),
+    "fluxes per nm": (
+        "test_flux_units_as_archives_spell_them[FLAM]",
+        ("flam = u.erg / (u.s * u.cm**2 * u.AA)\n    with", "flam = u.erg / (u.s * u.cm**2 * u.nm)\n    with"),
+    ),
+    "errors of another flux": (
+        "test_the_errors_are_those_of_the_chosen_flux",
+        ('flux = divided_unit(columns["flux"] or "")[0]', 'flux = "pdcsap_flux"'),
+    ),
+    "errors in a unit of their own": (
+        "test_time_series_of_astropy_are_frames",
+        ("error.mapped(lambda values: values * factor, unit)", "error.mapped(lambda values: values, unit)"),
+    ),
+    "inverse variances taken for errors": (
+        "test_spectra_of_specutils_are_frames[InverseVariance]",
+        ("uncertainty.represent_as(StdDevUncertainty).array", "uncertainty.array"),
+    ),
+    "quality flags without effect": (
+        "test_light_curves_of_tess_and_kepler_need_no_mapping",
+        ("np.asarray(quality, np.int64) & self.mask) != 0", "np.asarray(quality, np.int64) & self.mask) < 0"),
+    ),
+    # Calibration, changes of throughput and colour.
+    "steps of two frames that scatter like one": (
+        "test_photon_transfer_ignores_jitter_of_light",
+        (
+            "np.mean(white**2, axis=0) / kept * scale**2 / 2, light",
+            "np.mean(white**2, axis=0) / kept * scale**2, light",
+        ),
+    ),
+    "a dark current without noise": (
+        "test_dark_fit_determines_bias_of_pixels_from_exposure_times",
+        (
+            "noise.read_variance * hat @ hat.T + noise.dark_factor * level[",
+            "noise.read_variance * hat @ hat.T + 0.0 * level[",
+        ),
+    ),
+    "one star without errors of its spectrum": (
+        "test_one_star_determines_throughput_alone",
+        ("curve += error**2 * _linear_basis(nm) @ _linear_basis(nm).T", "pass"),
+    ),
+    "a wider line that is narrower": (
+        "test_light_through_a_wider_line_is_that_of_such_an_instrument[0.1-0.0001-paper]",
+        ("slope, bend = (wide - narrow) / (2 * step)", "slope, bend = (narrow - wide) / (2 * step)"),
+    ),
+    "the light of a second for that of a frame": (
+        "test_fit_recovers_throughput",
+        ("self.transfer.noise.gain * electrons * one.exposure_s", "self.transfer.noise.gain * electrons"),
+    ),
+    "a colour relative to a known star": (
+        "test_an_event_without_colour_has_uniform_p_values",
+        ("/ count**2 + (error[quiet] ** 2).sum(axis=0) / base**2", "/ count**2"),
+    ),
+    "light lost taken for light gained": (
+        "test_loss_and_return_are_found_at_their_frames_with_their_size",
+        (
+            "((total[k + width] - 2 * total[k] + total[k - width]) / width)[whole]",
+            "(-(total[k + width] - 2 * total[k] + total[k - width]) / width)[whole]",
+        ),
+    ),
+    # Answers.
+    "unknowns that tell of a change": (
+        "test_error_of_change_is_the_scatter_of_fits",
+        ("information -= float(np.sum((unknown.rows(variance", "information += float(np.sum((unknown.rows(variance"),
+    ),
+    "errors of changes with everything known": (
+        "test_columns_of_a_change_are_its_errors_and_smallest_sizes",
+        (
+            "error_of_change(one.counts_dn, quiet, unknown), error_of_change",
+            "error_of_change(one.counts_dn, quiet, None), error_of_change",
+        ),
+    ),
+    "one visit against a known mean": (
+        "test_two_visits_are_the_two_sided_test_of_a_difference[0.001-0.9]",
+        ("error * np.sqrt(centre * visits / dof)", "error * np.sqrt(centre)"),
+    ),
+    "scatter in the column of differences": (
+        "test_columns_of_a_change_are_its_errors_and_smallest_sizes",
+        ('Column("smallest", "smallest.one"', 'Column("smallest", "smallest.scatter"'),
+    ),
+    "periods of other cells": (
+        "test_rows_of_periods_are_those_of_their_cells",
+        (
+            "np.tile(row.recovery.periods_d, row.recovery.amplitudes.size)",
+            "np.repeat(row.recovery.periods_d, row.recovery.amplitudes.size)",
+        ),
+    ),
+    "indices per Angstrom": (
+        "test_indices_of_au_mic_are_those_of_a_direct_integration[lp02123.txt]",
+        ("np.divide(10.0, per_flam", "np.divide(1.0, per_flam"),
+    ),
+    "indices of known light": (
+        "test_unknowns_of_finite_spread_add_to_the_error_of_an_index",
+        ("variance += float(np.sum((moved[~free] * unknown.sd[~free]) ** 2))", "pass"),
+    ),
+    "coverage of upper ends alone": (
+        "test_intervals_on_either_side_of_the_truth_do_not_cover[low-inf]",
+        ("(found.low[level] <= truth) & (truth <= found.high[level])", "truth <= found.high[level]"),
+    ),
+    "whole ranges for their halves": (
+        "test_correct_model_covers_and_simple_model_is_rejected",
+        ("return np.asarray((high - low) / 2)\n\n\ndef _not_m", "return np.asarray(high - low)\n\n\ndef _not_m"),
+    ),
+    "exposures of a frame": (
+        "test_exposure_inverts_snr[450.0-7-pixel]",
+        ("exposure_s=x.exposure_s,\n        frames", "exposure_s=x.exposure_s / x.n_frames,\n        frames"),
+    ),
+    "durations in days and seconds": (
+        "test_table_of_events_has_the_flare_in_its_units",
+        (
+            "return last - first + self.analysis.frames.cadence_s / DAY_S",
+            "return last - first + self.analysis.frames.cadence_s",
+        ),
+    ),
+    "ends of intervals of two levels": (
+        "test_table_of_events_has_the_flare_in_its_units",
+        (
+            "energy.low_s[0], energy.high_s[0], energy.low_s[1], energy.high_s[1]",
+            "energy.low_s[0], energy.high_s[1], energy.low_s[1], energy.high_s[0]",
+        ),
     ),
 }
 
