@@ -217,7 +217,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("return 1.0 + comparison.added_variance", "return 1.0"),
     ),
     "quiescent exposures with the observed draws": (
-        "test_null_follows_its_closed_form",
+        "test_nominal_payload_is_gaussian",
         ("REFERENCE = 64", "REFERENCE = 0"),
     ),
     "closed forms that follow a temperature by their means alone": (
@@ -236,7 +236,7 @@ MUTATIONS: dict[str, Mutation] = {
         ),
     ),
     "one smoothed value in four dropped": (
-        "test_null_follows_its_closed_form",
+        "test_nominal_payload_is_gaussian",
         ("[k][s + 3u] = d;", "[k][s + 3u] = 0.0f;"),
         ("for centre, row in enumerate(self.rows):", "for centre, row in enumerate([]):"),
     ),
