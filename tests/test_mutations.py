@@ -6,21 +6,35 @@ import importlib.util
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parent.parent
+SPEC = importlib.util.spec_from_file_location("mutation_check", ROOT / "tools" / "mutation_check.py")
+assert SPEC is not None
+assert SPEC.loader is not None
+check = importlib.util.module_from_spec(SPEC)
+sys.modules[SPEC.name] = check
+SPEC.loader.exec_module(check)
 
 
-def test_every_mutation_has_its_text_and_its_test() -> None:
-    place = ROOT / "tools" / "mutation_check.py"
-    spec = importlib.util.spec_from_file_location("mutation_check", place)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    assert len(module.MUTATIONS) > 40
-    for name, one in module.MUTATIONS.items():
-        for file, text, changed in one.edits:
-            assert text in (ROOT / file).read_text(), name
+def test_every_mutation_has_its_texts_and_its_test() -> None:
+    sources, tests = check.files_of(ROOT, *check.SOURCES), check.files_of(ROOT, "tests")
+    assert len(check.MUTATIONS) >= 70
+    for name, (test, *edits) in check.MUTATIONS.items():
+        assert edits, name
+        for text, changed in edits:
             assert text != changed, name
-        file, _, test = one.test.partition("::")
-        assert f"def {test.partition('[')[0]}(" in (ROOT / file).read_text(), name
+            check.place_of(text, sources)
+        check.node_of(test, tests)
+
+
+def test_texts_and_tests_that_are_missing_or_occur_twice_are_refused() -> None:
+    files = {Path("a.py"): "def test_a(\nx = 1\n", Path("b.py"): "def test_b(\ny = 1\nx = 1\n\ndef test_a(\n"}
+    assert check.place_of("y = 1", files) == Path("b.py")
+    assert check.node_of("test_b[0.1]", files) == "b.py::test_b[0.1]"
+    for text, words in (("z = 1", "occurs 0 times"), ("x = 1", r"occurs 2 times \(a.py, b.py\)")):
+        with pytest.raises(SystemExit, match=words):
+            check.place_of(text, files)
+    for test, number in (("test_c", 0), ("test_a", 2)):
+        with pytest.raises(SystemExit, match=f"in {number} files"):
+            check.node_of(test, files)

@@ -1,310 +1,559 @@
-"""Break the noise on purpose, in a copy, and see the named test fail.
+"""Break the code on purpose, in a copy, and see the named test fail.
 
     python tools/mutation_check.py [NAME ...]
 
-Most are made in the kernels and in their NumPy reference alike, so that a comparison of the two is not enough: known
-answers, exact distributions or tests of chance must fail. The exit code is 0 if every mutation makes its test fail.
+A mutation names a text of the code, wherever it stands, and a function of the tests, wherever it is defined. Those of
+the noise are made in the kernels and in their NumPy reference alike, so that a comparison of the two is not enough:
+known answers, exact distributions or tests of chance must fail. The exit code is 0 if every mutation makes its test
+fail.
 """
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
+#: Folders of the code, without the links in mauvecl to the first two.
+SOURCES = ("host", "kernels", "mauvecl")
 
-PHILOX, NORMAL, POISSON = (f"kernels/{name}.cl.mako" for name in ("philox", "normal", "poisson"))
-REFERENCE = "mauvecl/noise/reference.py"
-RANDOM_NUMBERS = "mauvecl/noise/random_numbers.py"
-
-
-@dataclass(frozen=True)
-class Mutation:
-    """Edits (file, from, to), and the test that must fail with them and passes without."""
-
-    edits: tuple[tuple[str, str, str], ...]
-    test: str
-
+#: A text of the code and the one that replaces it.
+Edit = tuple[str, str]
+#: The function of the test that must fail with the edits and passes without, with its parameters, and the edits.
+Mutation = tuple[str, *tuple[Edit, ...]]
 
 SWAPPED = (
-    PHILOX,
     "w[${4 * i}] = c0[${i}]; w[${4 * i + 1}] = c1[${i}]",
     "w[${4 * i}] = c1[${i}]; w[${4 * i + 1}] = c0[${i}]",
 )
-CUMULANTS = "mauvecl/noise/cumulants.py"
 SHAPE = "    g1, g2, g3 = c.shape()\n    sd ="
 
-MUTATIONS = {
-    "one unknown's row dropped": Mutation(
+MUTATIONS: dict[str, Mutation] = {
+    # Draws, statistics, stores and runs.
+    "one unknown's row dropped": (
+        "test_marginalised_statistics_keep_false_alarms_and_power[0.1]",
+        ("nuisances.names if nuisances else ()))", "nuisances.names[1:] if nuisances else ()))"),
+    ),
+    "a sky that follows no level": (
+        "test_sky_follows_its_level[level0]",
+        ("factors.light * factors.sky * share / light", "0.0 * share / light"),
+    ),
+    "unknowns marginalised without their prior": (
+        "test_subtracted_rows_give_the_inverse_covariance[chi2]",
+        ("np.diag(self.sd**-2.0) + ", "np.diag(0.0 * self.sd**-2.0) + "),
+    ),
+    "sums of stares without their skewness": (
+        "test_sums_by_cumulants_are_distributed_as_by_pixels[cold]",
+        ("x${a} = FMA(s${name(a, b, c)}, q${b}${c}, x${a});", ";"),
+        ("total = fma(of(skew, a, b, d), q, total)", "pass"),
+    ),
+    "jitter that a stare keeps": (
+        "test_moments_equal_those_of_the_recipe[cumulants]",
         (
-            (
-                "mauvecl/results/requests/channels.py",
-                "nuisances.names if nuisances else ()))",
-                "nuisances.names[1:] if nuisances else ()))",
-            ),
+            "const uintv number = LOAD(numbers + frame);\n        /* Normals",
+            "const uintv number = LOAD(numbers + frame) & (uintv)0u;\n        /* Normals",
         ),
-        "tests/device/test_marginal.py::test_marginalised_statistics_keep_false_alarms_and_power[0.1]",
+        ('int(scene.numbers[frame]), "stare_frame"', '0, "stare_frame"'),
+        ('int(scene.numbers[frame]), "stare_sums"', '0, "stare_sums"'),
     ),
-    "a sky that follows no level": Mutation(
-        (("mauvecl/noise/pixel_tables.py", "factors.light * factors.sky * share / light", "0.0 * share / light"),),
-        "tests/noise/test_processes.py::test_sky_follows_its_level[level0]",
+    "jitter and sums of stares from one stream": (
+        "test_moments_equal_those_of_the_recipe[cumulants]",
+        ('"stare_sums": 18', '"stare_sums": 17'),
     ),
-    "unknowns marginalised without their prior": Mutation(
-        (("mauvecl/statistics/nuisances.py", "np.diag(self.sd**-2.0) + ", "np.diag(0.0 * self.sd**-2.0) + "),),
-        "tests/statistics/test_nuisances.py::test_subtracted_rows_give_the_inverse_covariance[chi2]",
-    ),
-    "sums of stares without their skewness": Mutation(
+    "a flare without photon noise": (
+        "test_sums_by_cumulants_are_distributed_as_by_pixels[cold]",
         (
-            ("kernels/stare_sums.cl.mako", "x${a} = FMA(s${name(a, b, c)}, q${b}${c}, x${a});", ";"),
-            ("mauvecl/lightcurve/stares/stare_reference.py", "total = fma(of(skew, a, b, d), q, total)", "pass"),
+            "FMA(light, (floatv)m->photon_variance, FMA(strengths.dark",
+            "FMA(0.0f * light, (floatv)m->photon_variance, FMA(strengths.dark",
         ),
-        "tests/lightcurve/test_draws.py::test_sums_by_cumulants_are_distributed_as_by_pixels[cold]",
+        ('fma(light, m["photon_variance"], fma(', 'fma(0 * light, m["photon_variance"], fma('),
     ),
-    "jitter that a stare keeps": Mutation(
+    "frames counted without their gaps": (
+        "test_splitting_changes_no_bit[cumulants]",
+        ("_padded(stare.numbers, np.uint32)", "_padded(np.arange(stare.n_frames), np.uint32)"),
+    ),
+    "a shard's flares from the first": (
+        "test_shards_of_stares_join_to_the_same_bits[None-cumulants]",
+        ("request.flares.part(first - request.start,", "request.flares.part(done,"),
+    ),
+    "a shard under another's name": (
+        "test_misplaced_shard_is_found",
+        ('name.encode() + b"\\0" + body', "body"),
+    ),
+    "foreign chunks unseen": (
+        "test_damage_is_found_and_repaired_to_the_bit",
+        ('return "good" if digest(data) == known else "foreign"', 'return "good"'),
+    ),
+    "half a failed shard kept": (
+        "test_failed_launch_is_repeated",
         (
-            ("kernels/stare_sums.cl.mako", "(uintv)first_high, number,", "(uintv)first_high, number & (uintv)0u,"),
-            (
-                "mauvecl/lightcurve/stares/stare_reference.py",
-                'words_at(numbers, int(scene.numbers[frame]), "stare_',
-                'words_at(numbers, 0, "stare_',
-            ),
+            "        tally, samples = Tally(plan.grids), plan.tails()\n",
+            "        tally, samples = vars(request).setdefault('_kept', (Tally(plan.grids), plan.tails()))\n",
         ),
-        "tests/lightcurve/test_draws.py::test_moments_equal_those_of_the_recipe[cumulants]",
     ),
-    "jitter and sums of stares from one stream": Mutation(
-        (("mauvecl/noise/layout.py", '"stare_sums": 18', '"stare_sums": 17'),),
-        "tests/lightcurve/test_draws.py::test_moments_equal_those_of_the_recipe[cumulants]",
+    "far values lost": (
+        "test_numbers_equal_those_of_sorting[0]",
+        ("        self._add_far(tile, tally)\n", ""),
     ),
-    "a flare without photon noise": Mutation(
+    "far S/N lost": (
+        "test_snr_equals_that_of_sorting[16-0]",
+        ("            self._add_far_snr(tile, counts, np.flatnonzero(outside))\n", ""),
+    ),
+    "7 rounds": (
+        "test_philox_gives_the_known_answers",
+        ("range(3, 10):\n    PHILOX_ROUND", "range(3, 7):\n    PHILOX_ROUND"),
+        ("range(3, 10):\n% for i", "range(3, 7):\n% for i"),
+        ("for r in range(10):", "for r in range(7):"),
+    ),
+    "swapped words": (
+        "test_philox_gives_the_known_answers",
+        ("Words out = {c0, c1, c2, c3};", "Words out = {c1, c0, c2, c3};"),
+        SWAPPED,
+        ("return (c0.astype(np.uint32), c1.astype", "return (c1.astype(np.uint32), c0.astype"),
+    ),
+    "swapped words, production kernel alone": (
+        "test_extreme_words_in_production_kernel_equal_reference",
+        SWAPPED,
+    ),
+    "rounded normal for the dark": (
+        "test_pearson_of_the_expansion",
+        ("nearest(FMA(z, FMA(z, curve, (floatv)slope), (floatv)offset))", "nearest(z * slope + offset)"),
+        ("nearest(fma(z, fma(z, curve, slope), offset))", "nearest(z * slope + offset)"),
+    ),
+    "rounded normal for the joint draw": (
+        "test_pearson_of_raw_counts",
+        (SHAPE, SHAPE.replace("c.shape()", "(0.0 * g for g in c.shape())")),
+    ),
+    "skew-only expansion of the dark": (
+        "test_expansion_cannot_be_distinguished_from_exact_draws",
+        ("= -1 / (72 * root)", "= 0.0"),
+    ),
+    "joint draw allowed by its skew alone": (
+        "test_worst_draws_that_the_region_allows",
+        (" & ~is_noticeable(truncation_distance(c, fourth_power=True), c.variance)", ""),
+    ),
+    "fourth power left out too early": (
+        "test_worst_draws_that_the_region_allows",
+        ("345 * fourth**2", "34.5 * fourth**2"),
+    ),
+    "rounding taken for noise everywhere": (
+        "test_auto_mode_stacks_only_where_moments_agree",
+        ("return ~is_noticeable(loss, n * frame)", "return frame > 0"),
+    ),
+    "fifth cumulants of varying dark forgotten": (
+        "test_factors_follow_the_cumulants",
+        ("dark * r->dark_fifth", "factors->dark * 0.0f"),
+        ('dark * r["dark_fifth"]', "dark * np.float32(0)"),
+    ),
+    "pairs of two ways": (
+        "test_draws_are_uncorrelated",
+        ("_both_of_a_pair(mean >= SMALLEST_EXPANDED)", "mean >= SMALLEST_EXPANDED"),
+    ),
+    "skew-only expansion of the joint draw": (
+        "test_joint_draws_cannot_be_distinguished_from_exact_ones",
+        (SHAPE, SHAPE.replace("    sd =", "    g2, g3 = 0 * g2, 0 * g3\n    sd =")),
+    ),
+    "24-bit uniforms": (
+        "test_thousand_million_draws",
+        ("TO_FLOAT(w[${2 * i}]) + 0.5f", "TO_FLOAT(w[${2 * i}] & (uintv)0xffffff00u) + 0.5f"),
+        ("t = radius_word.astype", "t = (radius_word & np.uint32(0xFFFFFF00)).astype"),
+    ),
+    "the sky counted as signal": (
+        "test_snr_includes_photon_noise_of_sky",
+        ("        signal -= (floatv)element.sky;\n", ""),
+        ('        signal = signal - element["sky"]\n', ""),
+    ),
+    "carry of the index dropped between launches": (
+        "test_draws_at_counter_boundaries_equal_reference",
+        ("np.uint32(self.first >> 32)", "np.uint32(0)"),
+    ),
+    "carry of the index dropped within a launch": (
+        "test_draws_at_counter_boundaries_equal_reference",
+        ("first = index - index % size", "first = index - index % self._step"),
+    ),
+    "carry of the product dropped in odd lanes": (
+        "test_philox_gives_the_known_answers",
         (
-            (
-                "kernels/stare_pixels.cl.mako",
-                "FMA(light, (floatv)m->photon_variance, FMA(strengths.dark",
-                "FMA(0.0f * light, (floatv)m->photon_variance, FMA(strengths.dark",
-            ),
-            (
-                "mauvecl/lightcurve/stares/stare_reference.py",
-                'fma(light, m["photon_variance"], fma(',
-                'fma(0 * light, m["photon_variance"], fma(',
-            ),
+            ">> (ulong${half})32UL) * (ulong${half})factor;",
+            ">> (ulong${half})32UL) * (ulong${half})(factor & 0xffff0000u);",
         ),
-        "tests/lightcurve/test_draws.py::test_sums_by_cumulants_are_distributed_as_by_pixels[cold]",
     ),
-    "frames counted without their gaps": Mutation(
+    "alias table off by one word": (
+        "test_alias_table_has_the_probabilities_of_scipy",
+        ("rich << shift | left[poor]", "rich << shift | max(left[poor] - 1, 0)"),
+    ),
+    "alias table off by one count": (
+        "test_pearson_of_raw_counts",
+        ("low + int(inside[0]))", "low + int(inside[0]) + 1)"),
+    ),
+    "two streams alike": (
+        "test_streams_are_distinct_bytes",
+        ('\n    "dark": 1,', '\n    "dark": 0,'),
+    ),
+    "priors' tables too coarse at their ends": (
+        "test_drawn_factors_have_the_moments_of_the_prior",
+        ("PRIOR_BITS = 7", "PRIOR_BITS = 4"),
+    ),
+    "priors' finer digits dropped": (
+        "test_drawn_factors_have_the_tails_of_the_prior",
+        ("finer & (uintv)0x7fffffu", "finer & (uintv)0u"),
+        ("finer & np.uint32(0x7FFFFF)", "finer & np.uint32(0)"),
+    ),
+    "saturation at the ADC's end alone": (
+        "test_closed_forms_follow_simulation",
+        ("min(self.saturation_dn, float(self.adc_max_dn))", "float(self.adc_max_dn)"),
+    ),
+    "reference of what is not recorded": (
+        "test_closed_forms_follow_simulation",
+        ("mean_sum = reference.recorded_dn", "mean_sum = reference.n_frames * reference.mean_raw_dn"),
+    ),
+    "noise of what is subtracted forgotten": (
+        "test_sampled_tail_agrees_for_every_comparison",
+        ("return 1.0 + comparison.added_variance", "return 1.0"),
+    ),
+    "quiescent exposures with the observed draws": (
+        "test_nominal_payload_is_gaussian",
+        ("REFERENCE = 64", "REFERENCE = 0"),
+    ),
+    "closed forms that follow a temperature by their means alone": (
+        "test_closed_forms_integrate_over_drawn_unknowns[half a degree]",
+        (", seen.variance + each @ variances)", ", seen.variance)"),
+    ),
+    "moved scores that count like others": (
+        "test_sampled_tail_with_unknowns_agrees_with_brute_force[half a degree]",
+        ("np.log(2.0) - np.logaddexp(0.0, ratio)", "np.zeros(BLOCK)"),
+    ),
+    "shifts forgotten in the closed form's phase": (
+        "test_equal_weights_are_a_scaled_non_central_chi_squared",
         (
-            (
-                "mauvecl/lightcurve/stares/stare_scene.py",
-                "_padded(stare.numbers, np.uint32)",
-                "_padded(np.arange(stare.n_frames), np.uint32)",
-            ),
+            "(np.arctan(turn) * count).sum(axis=1) + (u[:, None] * pull / spread).sum(axis=1)",
+            "(np.arctan(turn) * count).sum(axis=1) + 0.0 * u",
         ),
-        "tests/lightcurve/test_stare_reference.py::test_splitting_changes_no_bit[cumulants]",
     ),
-    "a shard's flares from the first": Mutation(
+    "one smoothed value in four dropped": (
+        "test_nominal_payload_is_gaussian",
+        ("[k][s + 3u] = d;", "[k][s + 3u] = 0.0f;"),
+        ("for centre, row in enumerate(self.rows):", "for centre, row in enumerate([]):"),
+    ),
+    # Fits of spectra.
+    "fluxes per Angstrom": (
+        "test_correct_model_covers_and_simple_model_is_rejected",
+        ("10.0 * np.trapezoid(fluxes[:, inside]", "np.trapezoid(fluxes[:, inside]"),
+    ),
+    "errors of fluxes at a known temperature": (
+        "test_correct_model_covers_and_simple_model_is_rejected",
+        ('gradient[:, which, m] = np.einsum("nql,nl->nq", spline(log_k, 1), linear)', "gradient[:, which, m] = 0.0"),
+    ),
+    "errors of jumps at a known temperature": (
+        "test_forecasts_of_balmer_jumps_and_of_wrong_blackbodies[jump-2.5]",
+        ("ratio(log_k, 1) * linear[:, 1] / amplitude", "0.0 * amplitude"),
+    ),
+    "intervals clipped at a standard deviation": (
+        "test_intervals_agree_with_minos_and_emcee",
         (
-            (
-                "mauvecl/device/stare_engine.py",
-                "request.flares.part(first - request.start,",
-                "request.flares.part(done,",
-            ),
+            "sign * np.sqrt(np.maximum(room, 0.0) * spread[rows])",
+            "sign * np.sqrt(np.minimum(np.maximum(room, 0.0), 1.0) * spread[rows])",
         ),
-        "tests/runs/test_stares.py::test_shards_of_stares_join_to_the_same_bits[None-cumulants]",
     ),
-    "a shard under another's name": Mutation(
-        (("mauvecl/runs/checkpoint.py", 'name.encode() + b"\\0" + body', "body"),),
-        "tests/runs/test_pool.py::test_misplaced_shard_is_found",
+    "intervals beyond their bounds": (
+        "test_bounded_intervals_agree_with_brute_force",
+        ("reaches = (low <= np.array(model.bounds)) & np.isfinite(model.bounds)", "reaches = low < -np.inf"),
     ),
-    "foreign chunks unseen": Mutation(
-        (("mauvecl/store/bulk.py", 'return "good" if digest(data) == known else "foreign"', 'return "good"'),),
-        "tests/store/test_bulk.py::test_damage_is_found_and_repaired_to_the_bit",
-    ),
-    "half a failed shard kept": Mutation(
+    "the noise of a star for that of its flare": (
+        "test_forecasts_of_blackbodies[M3V-0.5-50s-30000K]",
         (
-            (
-                "mauvecl/device/engine.py",
-                "        tally, samples = Tally(plan.grids), plan.tails()\n",
-                "        tally, samples = vars(request).setdefault('_kept', (Tally(plan.grids), plan.tails()))\n",
-            ),
+            "return light, constant + quiet.gain_dn_per_electron * light",
+            "return light, constant + quiet.gain_dn_per_electron * quiet.light_dn",
         ),
-        "tests/runs/test_pool.py::test_failed_launch_is_repeated",
     ),
-    "far values lost": Mutation(
-        (("mauvecl/device/launches.py", "        self._add_far(tile, tally)\n", ""),),
-        "tests/results/test_ends.py::test_numbers_equal_those_of_sorting[0]",
-    ),
-    "far S/N lost": Mutation(
-        (("mauvecl/device/launches.py", "            self._add_far_snr(tile, counts, np.flatnonzero(outside))\n", ""),),
-        "tests/results/test_ends.py::test_snr_equals_that_of_sorting[16-0]",
-    ),
-    "7 rounds": Mutation(
-        ((PHILOX, "range(3, 10)", "range(3, 7)"), (RANDOM_NUMBERS, "for r in range(10):", "for r in range(7):")),
-        "tests/kernels/test_philox.py::test_philox_gives_the_known_answers",
-    ),
-    "swapped words": Mutation(
+    "saturated pixels in use": (
+        "test_rows_with_saturated_pixels_are_marked[0.75-none1-marked1]",
         (
-            (PHILOX, "Words out = {c0, c1, c2, c3};", "Words out = {c1, c0, c2, c3};"),
-            SWAPPED,
-            (RANDOM_NUMBERS, "return (c0.astype(np.uint32), c1.astype", "return (c1.astype(np.uint32), c0.astype"),
+            "NEAR_SIGMA * np.sqrt(scatter / quiet.n_frames) < quiet.ceiling_dn",
+            "NEAR_SIGMA * np.sqrt(scatter / quiet.n_frames) < np.inf",
         ),
-        "tests/kernels/test_philox.py::test_philox_gives_the_known_answers",
     ),
-    "swapped words, production kernel alone": Mutation(
-        (SWAPPED,), "tests/noise/test_extremes.py::test_extreme_words_in_production_kernel_equal_reference"
+    "flare and factor on light correlated with the wrong sign": (
+        "test_intervals_agree_with_brute_force[0.5-prior]",
+        ("bottom_variance, -covariance(own, dims)", "bottom_variance, covariance(own, dims)"),
     ),
-    "rounded normal for the dark": Mutation(
+    "a factor on light without its own error": (
+        "test_intervals_agree_with_brute_force[0.5-free]",
+        ("covariance(dims, dims) + light.scale**-2.0", "covariance(dims, dims)"),
+    ),
+    # Fits of events.
+    "intervals of events that are not truncated at zero": (
+        "test_quantiles_are_those_of_a_truncated_normal_distribution[0.0]",
+        ("goal = above(0.0) * (1 - probability)", "goal = (1 - probability)"),
+    ),
+    "a flare added to the level of its star": (
+        "test_flare_brighter_than_its_window_has_its_energy",
         (
-            (POISSON, "nearest(FMA(z, FMA(z, curve, (floatv)slope), (floatv)offset))", "nearest(z * slope + offset)"),
-            (REFERENCE, "nearest(fma(z, fma(z, curve, slope), offset))", "nearest(z * slope + offset)"),
+            "float(window.values @ likelihood.level) - grid.amplitude * in_level",
+            "float(window.values @ likelihood.level) + grid.amplitude * in_level",
         ),
-        "tests/kernels/test_poisson.py::test_pearson_of_the_expansion",
     ),
-    "rounded normal for the joint draw": Mutation(
-        ((CUMULANTS, SHAPE, SHAPE.replace("c.shape()", "(0.0 * g for g in c.shape())")),),
-        "tests/kernels/test_joint.py::test_pearson_of_raw_counts",
+    "durations without the error of their level": (
+        "test_error_of_a_fitted_duration_is_that_of_least_squares",
+        ("grid.information + left + mean**2 * likelihood.level_variance) / level", "grid.information + left) / level"),
     ),
-    "skew-only expansion of the dark": Mutation(
-        (("mauvecl/noise/pixel_tables.py", "= -1 / (72 * root)", "= 0.0"),),
-        "tests/kernels/test_poisson.py::test_expansion_cannot_be_distinguished_from_exact_draws",
+    "brighter flares on a higher level": (
+        "test_error_of_a_fitted_duration_is_that_of_least_squares",
+        ("along = per_amplitude + mean * in_level", "along = per_amplitude - mean * in_level"),
     ),
-    "joint draw allowed by its skew alone": Mutation(
-        ((CUMULANTS, " & ~is_noticeable(truncation_distance(c, fourth_power=True), c.variance)", ""),),
-        "tests/kernels/test_joint_bound.py::test_worst_draws_that_the_region_allows",
+    "light summed above a known level": (
+        "test_error_of_a_summed_duration_includes_that_of_its_level",
+        ("variance += _level_variance(process, time, noise, quiet, near)", "pass"),
     ),
-    "fourth power left out too early": Mutation(
-        ((CUMULANTS, "345 * fourth**2", "34.5 * fourth**2"),),
-        "tests/kernels/test_joint_bound.py::test_worst_draws_that_the_region_allows",
+    "a slow decay on top of the fast one": (
+        "test_shapes_have_a_peak_of_one_and_the_integral_of_their_values[74]",
+        ("row[rise], row[len(rises) + start] = 1.0, 1.0 - share", "row[rise], row[len(rises) + start] = 1.0, 1.0"),
     ),
-    "rounding taken for noise everywhere": Mutation(
-        ((CUMULANTS, "return ~is_noticeable(loss, n * frame)", "return frame > 0"),),
-        "tests/noise/test_stacks.py::test_auto_mode_stacks_only_where_moments_agree",
+    "published shapes that do not share their weight": (
+        "test_prior_weights_add_up_to_one",
+        ("(1 - GENERAL_WEIGHT) / len(published)", "(1 - GENERAL_WEIGHT)"),
     ),
-    "fifth cumulants of varying dark forgotten": Mutation(
+    "likelihood without the information on the level": (
+        "test_covariance_is_that_of_dense_matrices",
+        ("covariance.log_determinant + np.log(information)", "covariance.log_determinant"),
+    ),
+    "steps taken for flares": (
+        "test_a_flare_is_found_at_its_time_and_a_step_is_a_step",
         (
-            ("kernels/detector.cl.mako", "dark * r->dark_fifth", "factors->dark * 0.0f"),
-            (REFERENCE, 'dark * r["dark_fifth"]', "dark * np.float32(0)"),
+            "return whole - float(gain.max()) < float(plain.chi2(model))",
+            "return whole - float(gain.max()) > float(plain.chi2(model))",
         ),
-        "tests/kernels/test_joint_bound.py::test_factors_follow_the_cumulants",
     ),
-    "pairs of two ways": Mutation(
-        (("mauvecl/noise/pixel_tables.py", "_both_of_a_pair(mean >= SMALLEST_EXPANDED)", "mean >= SMALLEST_EXPANDED"),),
-        "tests/noise/test_correlations.py::test_draws_are_uncorrelated",
+    # The level of observed light curves, and the search.
+    "norms that end with their template": (
+        "test_level_norms_and_covariances_are_those_of_the_matrices",
+        ('total = np.einsum("jo,jo->o", state, form @ state)', "total = 0.0"),
     ),
-    "skew-only expansion of the joint draw": Mutation(
-        ((CUMULANTS, SHAPE, SHAPE.replace("    sd =", "    g2, g3 = 0 * g2, 0 * g3\n    sd =")),),
-        "tests/kernels/test_joint.py::test_joint_draws_cannot_be_distinguished_from_exact_ones",
+    "statistics of a known level": (
+        "test_statistics_have_unit_variance_over_gaps_and_changing_noise[process0-300-0.05-0.02-0-at-once]",
+        ("_correlated(held, shape, first)[peaks] ** 2 / level.sum()", "0.0 * _correlated(held, shape, first)[peaks]"),
     ),
-    "24-bit uniforms": Mutation(
+    "a level without its process": (
+        "test_level_norms_and_covariances_are_those_of_the_matrices",
+        ("held - self._noise[:, None] * self._covariance.solve(held) + mean", "0.0 * held + mean"),
+    ),
+    "a level with the stated errors": (
+        "test_level_norms_and_covariances_are_those_of_the_matrices",
+        ("noise = variance * process.excess**2\n        self._weights", "noise = variance\n        self._weights"),
+    ),
+    "noise that falls with the counts": (
+        "test_noise_at_the_level_is_that_of_its_counts",
+        ("squared - slope * (flux - level)", "squared + slope * (flux - level)"),
+    ),
+    "flares of three frames taken for rays": (
+        "test_single_frames_and_dips_are_flagged_and_a_flare_of_three_frames_is_not",
+        (" & (np.abs(sigmas[after]) < NEAR)", ""),
+    ),
+    "means that scatter like frames": (
+        "test_correlated_frames_are_red_and_gaps_are_not_bridged",
+        ("scipy.stats.chi2.ppf(p, dof) / dof / size", "scipy.stats.chi2.ppf(p, dof) / dof"),
+    ),
+    "means over gaps": (
+        "test_correlated_frames_are_red_and_gaps_are_not_bridged",
+        ("(place % size == 0) & (place + size <= length)", "place % size == 0"),
+    ),
+    "correlations over gaps": (
+        "test_correlations_do_not_bridge_gaps",
+        ("pairs = numbers[lag:] - numbers[:-lag] == lag", "pairs = numbers[lag:] > numbers[:-lag]"),
+    ),
+    "losses that are never searched": (
+        "test_losses_are_found_at_their_frames_and_a_flare_is_none",
         (
-            (NORMAL, "TO_FLOAT(w[${2 * i}]) + 0.5f", "TO_FLOAT(w[${2 * i}] & (uintv)0xffffff00u) + 0.5f"),
-            (RANDOM_NUMBERS, "t = radius_word.astype", "t = (radius_word & np.uint32(0xFFFFFF00)).astype"),
+            "if survey.weighted or not (many or process.excess > MOST_EXCESS or fast):",
+            "if survey.weighted or many is many:",
         ),
-        "tests/kernels/test_normal.py::test_thousand_million_draws",
     ),
-    "the sky counted as signal": Mutation(
+    "losses searched upright": (
+        "test_losses_are_found_at_their_frames_and_a_flare_is_none",
+        ("sums=-self.sums, flux=-self.flux", "sums=self.sums, flux=self.flux"),
+    ),
+    # Readers.
+    "dates of TESS from noon": (
+        "test_csv_ecsv_and_fits_give_the_same_frames",
+        ('"btjd": 56_999.5,\n    "bkjd"', '"btjd": 57_000.0,\n    "bkjd"'),
+    ),
+    "starts of frames taken for their ends": (
+        "test_time_keywords_of_fits_are_read[keywords9-61000.0-utc--15.0]",
+        ("made.shifted((0.5 - dates.at) * made.exposure_s)", "made.shifted((dates.at - 0.5) * made.exposure_s)"),
+    ),
+    "days taken for seconds": (
+        "test_csv_ecsv_and_fits_give_the_same_frames",
+        ("np.asarray(((time - first) * unit).to_value(u.s)), ", "np.asarray(time - first), "),
+    ),
+    "light that reaches the barycentre earlier": (
+        "test_barycentric_times_of_the_geocentre_are_those_of_erfa[2026-09-16T03:00:00]",
+        ("(when.tdb - first).to_value(u.s) + late", "(when.tdb - first).to_value(u.s) - late"),
+    ),
+    "wavelengths shorter in vacuum": (
+        "test_air_becomes_vacuum_where_the_file_says_air",
+        ("vacuum[there] = air_nm[there] * index", "vacuum[there] = air_nm[there] / index"),
+    ),
+    "air in a unit overlooked": (
+        "test_air_becomes_vacuum_where_the_file_says_air",
         (
-            ("kernels/histogram.cl.mako", "        signal -= (floatv)element.sky;\n", ""),
-            ("mauvecl/results/numpy_kernels.py", '        signal = signal - element["sky"]\n', ""),
+            'return match[1] or None, "air" if match[2].lower() == "air" else "vacuum"',
+            'return match[1] or None, "vacuum"',
         ),
-        "tests/device/test_engine.py::test_snr_includes_photon_noise_of_sky",
     ),
-    "carry of the index dropped between launches": Mutation(
-        (("mauvecl/device/tiles.py", "np.uint32(self.first >> 32)", "np.uint32(0)"),),
-        "tests/noise/test_extremes.py::test_draws_at_counter_boundaries_equal_reference",
+    "fluxes in the order of frequencies": (
+        "test_frequencies_may_rise_or_fall[order1]",
+        ("_in_flam(kept, nm, flux)[order]", "_in_flam(kept, nm, flux)"),
     ),
-    "carry of the index dropped within a launch": Mutation(
-        (("mauvecl/device/tiles.py", "first = index - index % size", "first = index - index % self._step"),),
-        "tests/noise/test_extremes.py::test_draws_at_counter_boundaries_equal_reference",
+    "fluxes per nm": (
+        "test_flux_units_as_archives_spell_them[FLAM]",
+        ("flam = u.erg / (u.s * u.cm**2 * u.AA)\n    with", "flam = u.erg / (u.s * u.cm**2 * u.nm)\n    with"),
     ),
-    "carry of the product dropped in odd lanes": Mutation(
+    "errors of another flux": (
+        "test_the_errors_are_those_of_the_chosen_flux",
+        ('flux = divided_unit(columns["flux"] or "")[0]', 'flux = "pdcsap_flux"'),
+    ),
+    "errors in a unit of their own": (
+        "test_time_series_of_astropy_are_frames",
+        ("error.mapped(lambda values: values * factor, unit)", "error.mapped(lambda values: values, unit)"),
+    ),
+    "inverse variances taken for errors": (
+        "test_spectra_of_specutils_are_frames[InverseVariance]",
+        ("uncertainty.represent_as(StdDevUncertainty).array", "uncertainty.array"),
+    ),
+    "quality flags without effect": (
+        "test_light_curves_of_tess_and_kepler_need_no_mapping",
+        ("np.asarray(quality, np.int64) & self.mask) != 0", "np.asarray(quality, np.int64) & self.mask) < 0"),
+    ),
+    # Calibration, changes of throughput and colour.
+    "steps of two frames that scatter like one": (
+        "test_photon_transfer_ignores_jitter_of_light",
         (
-            (
-                "kernels/portable.cl.mako",
-                ">> (ulong${half})32UL) * (ulong${half})factor;",
-                ">> (ulong${half})32UL) * (ulong${half})(factor & 0xffff0000u);",
-            ),
+            "np.mean(white**2, axis=0) / kept * scale**2 / 2, light",
+            "np.mean(white**2, axis=0) / kept * scale**2, light",
         ),
-        "tests/kernels/test_philox.py::test_philox_gives_the_known_answers",
     ),
-    "alias table off by one word": Mutation(
-        (("mauvecl/noise/poisson.py", "rich << shift | left[poor]", "rich << shift | max(left[poor] - 1, 0)"),),
-        "tests/kernels/test_poisson.py::test_alias_table_has_the_probabilities_of_scipy",
-    ),
-    "alias table off by one count": Mutation(
-        (("mauvecl/noise/poisson.py", "low + int(inside[0]))", "low + int(inside[0]) + 1)"),),
-        "tests/kernels/test_joint.py::test_pearson_of_raw_counts",
-    ),
-    "two streams alike": Mutation(
-        (("mauvecl/noise/layout.py", '"dark": 1', '"dark": 0'),),
-        "tests/kernels/test_layout.py::test_streams_are_distinct_bytes",
-    ),
-    "priors' tables too coarse at their ends": Mutation(
-        (("mauvecl/noise/layout.py", "PRIOR_BITS = 7", "PRIOR_BITS = 4"),),
-        "tests/kernels/test_prior.py::test_drawn_factors_have_the_moments_of_the_prior",
-    ),
-    "priors' finer digits dropped": Mutation(
+    "a dark current without noise": (
+        "test_dark_fit_determines_bias_of_pixels_from_exposure_times",
         (
-            ("kernels/prior.cl.mako", "finer & (uintv)0x7fffffu", "finer & (uintv)0u"),
-            ("mauvecl/noise/reference.py", "finer & np.uint32(0x7FFFFF)", "finer & np.uint32(0)"),
+            "noise.read_variance * hat @ hat.T + noise.dark_factor * level[",
+            "noise.read_variance * hat @ hat.T + 0.0 * level[",
         ),
-        "tests/kernels/test_prior.py::test_drawn_factors_have_the_tails_of_the_prior",
     ),
-    "saturation at the ADC's end alone": Mutation(
-        (("host/expectation.py", "min(self.saturation_dn, float(self.adc_max_dn))", "float(self.adc_max_dn)"),),
-        "tests/noise/test_saturation.py::test_closed_forms_follow_simulation",
+    "one star without errors of its spectrum": (
+        "test_one_star_determines_throughput_alone",
+        ("curve += error**2 * _linear_basis(nm) @ _linear_basis(nm).T", "pass"),
     ),
-    "reference of what is not recorded": Mutation(
+    "a wider line that is narrower": (
+        "test_light_through_a_wider_line_is_that_of_such_an_instrument[0.1-0.0001-paper]",
+        ("slope, bend = (wide - narrow) / (2 * step)", "slope, bend = (narrow - wide) / (2 * step)"),
+    ),
+    "the light of a second for that of a frame": (
+        "test_fit_recovers_throughput",
+        ("self.transfer.noise.gain * electrons * one.exposure_s", "self.transfer.noise.gain * electrons"),
+    ),
+    "a colour relative to a known star": (
+        "test_an_event_without_colour_has_uniform_p_values",
+        ("/ count**2 + (error[quiet] ** 2).sum(axis=0) / base**2", "/ count**2"),
+    ),
+    "light lost taken for light gained": (
+        "test_loss_and_return_are_found_at_their_frames_with_their_size",
         (
-            (
-                "mauvecl/noise/scene.py",
-                "mean_sum = reference.recorded_dn",
-                "mean_sum = reference.n_frames * reference.mean_raw_dn",
-            ),
+            "((total[k + width] - 2 * total[k] + total[k - width]) / width)[whole]",
+            "(-(total[k + width] - 2 * total[k] + total[k - width]) / width)[whole]",
         ),
-        "tests/noise/test_saturation.py::test_closed_forms_follow_simulation",
     ),
-    "noise of what is subtracted forgotten": Mutation(
-        (("mauvecl/noise/scene.py", "return 1.0 + comparison.added_variance", "return 1.0"),),
-        "tests/results/test_tails.py::test_sampled_tail_agrees_for_every_comparison",
+    # Answers.
+    "unknowns that tell of a change": (
+        "test_error_of_change_is_the_scatter_of_fits",
+        ("information -= float(np.sum((unknown.rows(variance", "information += float(np.sum((unknown.rows(variance"),
     ),
-    "quiescent exposures with the observed draws": Mutation(
-        (("mauvecl/noise/layout.py", "REFERENCE = 64", "REFERENCE = 0"),),
-        "tests/results/test_detection.py::test_null_follows_its_closed_form",
-    ),
-    "closed forms that follow a temperature by their means alone": Mutation(
-        (("mauvecl/statistics/statistic.py", ", seen.variance + each @ variances)", ", seen.variance)"),),
-        "tests/device/test_marginal.py::test_closed_forms_integrate_over_drawn_unknowns[half a degree]",
-    ),
-    "moved scores that count like others": Mutation(
-        (("mauvecl/results/detection/tails.py", "np.log(2.0) - np.logaddexp(0.0, ratio)", "np.zeros(BLOCK)"),),
-        "tests/results/test_tails.py::test_sampled_tail_with_unknowns_agrees_with_brute_force[half a degree]",
-    ),
-    "shifts forgotten in the closed form's phase": Mutation(
+    "errors of changes with everything known": (
+        "test_columns_of_a_change_are_its_errors_and_smallest_sizes",
         (
-            (
-                "mauvecl/statistics/distributions.py",
-                "(np.arctan(turn) * count).sum(axis=1) + (u[:, None] * pull / spread).sum(axis=1)",
-                "(np.arctan(turn) * count).sum(axis=1) + 0.0 * u",
-            ),
+            "error_of_change(one.counts_dn, quiet, unknown), error_of_change",
+            "error_of_change(one.counts_dn, quiet, None), error_of_change",
         ),
-        "tests/statistics/test_statistics.py::test_equal_weights_are_a_scaled_non_central_chi_squared",
     ),
-    "one smoothed value in four dropped": Mutation(
+    "one visit against a known mean": (
+        "test_two_visits_are_the_two_sided_test_of_a_difference[0.001-0.9]",
+        ("error * np.sqrt(centre * visits / dof)", "error * np.sqrt(centre)"),
+    ),
+    "scatter in the column of differences": (
+        "test_columns_of_a_change_are_its_errors_and_smallest_sizes",
+        ('Column("smallest", "smallest.one"', 'Column("smallest", "smallest.scatter"'),
+    ),
+    "periods of other cells": (
+        "test_rows_of_periods_are_those_of_their_cells",
         (
-            ("kernels/comparison.cl.mako", "[k][s + 3u] = d;", "[k][s + 3u] = 0.0f;"),
-            (
-                "mauvecl/results/numpy_kernels.py",
-                "for centre, row in enumerate(self.rows):",
-                "for centre, row in enumerate([]):",
-            ),
+            "np.tile(row.recovery.periods_d, row.recovery.amplitudes.size)",
+            "np.repeat(row.recovery.periods_d, row.recovery.amplitudes.size)",
         ),
-        "tests/results/test_detection.py::test_null_follows_its_closed_form",
+    ),
+    "indices per Angstrom": (
+        "test_indices_of_au_mic_are_those_of_a_direct_integration[lp02123.txt]",
+        ("np.divide(10.0, per_flam", "np.divide(1.0, per_flam"),
+    ),
+    "indices of known light": (
+        "test_unknowns_of_finite_spread_add_to_the_error_of_an_index",
+        ("variance += float(np.sum((moved[~free] * unknown.sd[~free]) ** 2))", "pass"),
+    ),
+    "coverage of upper ends alone": (
+        "test_intervals_on_either_side_of_the_truth_do_not_cover[low-inf]",
+        ("(found.low[level] <= truth) & (truth <= found.high[level])", "truth <= found.high[level]"),
+    ),
+    "whole ranges for their halves": (
+        "test_correct_model_covers_and_simple_model_is_rejected",
+        ("return np.asarray((high - low) / 2)\n\n\ndef _not_m", "return np.asarray(high - low)\n\n\ndef _not_m"),
+    ),
+    "exposures of a frame": (
+        "test_exposure_inverts_snr[450.0-7-pixel]",
+        ("exposure_s=x.exposure_s,\n        frames", "exposure_s=x.exposure_s / x.n_frames,\n        frames"),
+    ),
+    "durations in days and seconds": (
+        "test_table_of_events_has_the_flare_in_its_units",
+        (
+            "return last - first + self.analysis.frames.cadence_s / DAY_S",
+            "return last - first + self.analysis.frames.cadence_s",
+        ),
+    ),
+    "ends of intervals of two levels": (
+        "test_table_of_events_has_the_flare_in_its_units",
+        (
+            "energy.low_s[0], energy.high_s[0], energy.low_s[1], energy.high_s[1]",
+            "energy.low_s[0], energy.high_s[1], energy.low_s[1], energy.high_s[0]",
+        ),
     ),
 }
+
+
+def files_of(folder: Path, *names: str) -> dict[Path, str]:
+    """Return the texts of Python files and kernels in some folders of a project."""
+    places = (place for name in names for ending in ("py", "mako") for place in (folder / name).rglob(f"*.{ending}"))
+    # Links in mauvecl show some files twice.
+    return {place: place.read_text(encoding="utf-8") for place in sorted({one.resolve() for one in places})}
+
+
+def place_of(text: str, files: dict[Path, str]) -> Path:
+    """Return the file that holds a text once; raises SystemExit if there is none, or if the text occurs again."""
+    found = [place for place, content in files.items() for _ in range(content.count(text))]
+    if len(found) != 1:
+        where = ", ".join(sorted({place.name for place in found}))
+        raise SystemExit(f"{text!r} occurs {len(found)} times{f' ({where})' if where else ''}, expected once")
+    return found[0]
+
+
+def node_of(test: str, files: dict[Path, str]) -> str:
+    """Return the test for pytest; raises SystemExit unless one file defines its function."""
+    name = re.escape(test.partition("[")[0])
+    found = [place for place, content in files.items() if re.search(rf"^def {name}\(", content, re.MULTILINE)]
+    if len(found) != 1:
+        raise SystemExit(f"the test {test} is defined in {len(found)} files, expected one")
+    return f"{found[0]}::{test}"
 
 
 def fails(folder: Path, test: str) -> tuple[bool, str]:
@@ -323,7 +572,7 @@ def fails(folder: Path, test: str) -> tuple[bool, str]:
 
 def copy(folder: Path) -> None:
     """Copy the project's own files, with links kept as links."""
-    for name in ("host", "kernels", "mauvecl", "tests", "pyproject.toml"):
+    for name in (*SOURCES, "tests", "pyproject.toml"):
         source = ROOT / name
         if source.is_dir():
             shutil.copytree(source, folder / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
@@ -338,19 +587,19 @@ def main() -> int:
     for name in wanted:
         if name not in MUTATIONS:
             raise SystemExit(f"mutation {name!r} is unknown, expected one of: {', '.join(MUTATIONS)}")
-        mutation, started = MUTATIONS[name], time.perf_counter()
+        (test, *edits), started = MUTATIONS[name], time.perf_counter()
         with tempfile.TemporaryDirectory(prefix="mauvecl-mutant-") as temporary:
             folder = Path(temporary)
             copy(folder)
-            for file, old, new in mutation.edits:
-                text = (folder / file).read_text(encoding="utf-8")
-                if old not in text:
-                    raise SystemExit(f"mutation {name!r} is out of date: {file} no longer holds {old!r}")
-                (folder / file).write_text(text.replace(old, new), encoding="utf-8")
-            noticed, line = fails(folder, mutation.test)
+            files = files_of(folder, *SOURCES)
+            for old, new in edits:
+                place = place_of(old, files)
+                files[place] = files[place].replace(old, new)
+                place.write_text(files[place], encoding="utf-8")
+            noticed, line = fails(folder, node_of(test, files_of(folder, "tests")))
         unnoticed += not noticed
         verdict = "noticed" if noticed else "NOT NOTICED"
-        print(f"{verdict:12s} {name}: {mutation.test} ({time.perf_counter() - started:.0f} s: {line})", flush=True)
+        print(f"{verdict:12s} {name}: {test} ({time.perf_counter() - started:.0f} s: {line})", flush=True)
     print(f"{len(wanted) - unnoticed} of {len(wanted)} mutations noticed")
     return 1 if unnoticed else 0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +70,13 @@ def test_true_values_equal_those_of_the_added_light(jump: MeasureAnswer) -> None
     assert truth["amplitude"] == pytest.approx(0.5, rel=1e-3)
     assert truth["filling factor"] == pytest.approx(truth["area"] / (np.pi * (0.4 * 6.957e10) ** 2), rel=1e-12)
     assert photons(lit.wavelength_nm, lit.flux_flam, "Kepler") > 0
+
+
+@pytest.mark.parametrize(("end", "value"), [("low", np.inf), ("high", -np.inf)])
+def test_intervals_on_either_side_of_the_truth_do_not_cover(end: str, value: float, jump: MeasureAnswer) -> None:
+    one = jump.flares[1]
+    found = replace(one.found, **{end: np.full_like(one.found.low, value)})
+    assert (np.array(replace(one, found=found).rows()["coverage_95"]) == 0.0).all()
 
 
 @pytest.mark.long

@@ -9,12 +9,15 @@ import pytest
 import scipy
 
 from mauvecl import Instrument, Sky, Source, Study, change, expect
+from mauvecl.answers.observations.change import PERIOD_COLUMNS, PeriodRow
 from mauvecl.device.engine import Engine
 from mauvecl.host.expectation import Expectation
 from mauvecl.observations.changes.indices import INDICES, Change, IndexValue
-from mauvecl.observations.changes.periods import recover_periods, visit_times_d
+from mauvecl.observations.changes.periods import Recovery, recover_periods, visit_times_d
 from mauvecl.observations.changes.smallest import error_of_change, error_of_index, smallest_change
 from mauvecl.observations.line_index import line_index
+from mauvecl.schema.tables import table_of
+from mauvecl.statistics.intervals import Interval
 from mauvecl.statistics.nuisances import Nuisances
 from tests.refusals import refused
 
@@ -222,6 +225,36 @@ def test_answer_holds_every_change_and_magnitude() -> None:
     assert np.all(np.asarray(short["smallest"]) > np.asarray(long["smallest"]))
     assert len(answer.magnitude_table) == len(answer.table) * 17
     assert np.all(answer.table["error"] >= answer.table["error_known"])
+
+
+def test_columns_of_a_change_are_its_errors_and_smallest_sizes(quiet: Expectation) -> None:
+    """Two visits: the difference as of normal values, the scatter by the variance of one degree of freedom."""
+    settings = ["star=[{library='M3V', magnitude=9}]", "change.of=['320-700']", "nuisances.light=0.02"]
+    study = Study().with_settings(settings)
+    assert (study.change.visits, study.observation.exposure_s) == (2, 50.0)
+    (row,) = change(study).table
+    fap, power = study.run.fap, study.limit.power
+    delta = counts("320-700", quiet)
+    errors = [error_of_change(delta, quiet, one) for one in (Nuisances.of(quiet, {"light": 0.02}), None)]
+    assert errors[0] > 1.2 * errors[1]
+    assert [row["error"], row["error_known"]] == pytest.approx(errors, rel=0.01)
+    normal, chi2 = scipy.stats.norm, scipy.stats.chi2
+    one = np.sqrt(2.0) * (normal.isf(fap / 2) + normal.ppf(power))
+    scatter = np.sqrt(chi2.isf(fap, 1) / chi2.isf(power, 1) - 1)
+    assert [row["smallest"], row["smallest_scatter"]] == pytest.approx(
+        row["error"] * np.array([one, scatter]), rel=1e-4
+    )
+
+
+def test_rows_of_periods_are_those_of_their_cells() -> None:
+    """Shares that state their amplitude and period in their digits."""
+    periods, amplitudes = np.array([1.0, 2.0, 3.0]), np.array([0.4, 0.8])
+    cells = [[Interval(a + p / 100, 0.0, 1.0) for p in periods] for a in amplitudes]
+    star = Change("320-700", "", "", np.ones(3))
+    row = PeriodRow("star", {}, star, 5.0, Recovery(periods, 0.5, periods, amplitudes, cells))
+    table = table_of(PERIOD_COLUMNS, [row])
+    np.testing.assert_allclose(table["recovered"], table["amplitude_errors"] + table["period"].value / 100)
+    np.testing.assert_allclose(table["amplitude"], 5.0 * table["amplitude_errors"])
 
 
 FLAT = Source(np.linspace(150.0, 760.0, 611), np.full(611, 1e-12), "flat", "test")

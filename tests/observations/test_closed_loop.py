@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -10,12 +12,16 @@ from scipy import stats
 from mauvecl.lightcurve.flares.shapes import shape_of
 from mauvecl.observations.analysis import analyse_frames
 from mauvecl.observations.detection import detect_events
+from mauvecl.observations.event_fits import _ranges, _single
+from mauvecl.observations.event_windows import FittedFlare, Window
 from mauvecl.observations.events import measure_event, measure_events
 from mauvecl.observations.false_alarms import simulated_rates
+from mauvecl.observations.families import Family
 from mauvecl.observations.frames import Frames, Reason
+from mauvecl.observations.level import quiet_variance
 from mauvecl.observations.light_curve import survey_light_curve
-from mauvecl.observations.noise import binned_scatter
-from mauvecl.observations.search import SeriesSurvey
+from mauvecl.observations.noise import binned_scatter, likeness
+from mauvecl.observations.search import Detection, SeriesSurvey
 
 SHAPE = shape_of("davenport2014")
 FRAMES, CADENCE_S, LEVEL, SD = 600, 60.0, 1000.0, 5.0
@@ -89,6 +95,54 @@ def test_long_flares_are_fitted_in_bins_with_the_same_result(threshold: float, m
     assert binned.high_s[0] - binned.low_s[0] == pytest.approx(width, rel=0.5)
 
 
+def faint_star() -> tuple[SeriesSurvey, NDArray[np.bool_], Detection]:
+    """Return a star whose level is known to 0.3 % alone, the frames of a flare of an amplitude of 4, and the flare."""
+    flux = 100.0 * (1 + 4.0 * flare(15_000, 300.0)) + np.random.default_rng(299).normal(0.0, SD, FRAMES)
+    frames = Frames.of(TIME, flux, np.full(FRAMES, SD))
+    survey = SeriesSurvey.of(frames, flux, np.full(FRAMES, SD**2), np.ones(FRAMES, np.bool_), 100.0, 0.0, SHAPE)
+    taken = (np.arange(FRAMES) >= 240) & (np.arange(FRAMES) < 340)
+    return survey, taken, Detection(100.0, 300.0, 15_030.0, 0, 80.0, 240, 339)
+
+
+def test_error_of_a_fitted_duration_is_that_of_least_squares() -> None:
+    """Compare the part of the posterior at the best peak and half-width with the fit of amplitude and level there."""
+    survey, taken, one = faint_star()
+    window = Window.of(survey, taken, one)
+    start = FittedFlare(one.peak_s, 4.0, one.half_width_s, 4.0 * one.half_width_s * SHAPE.equivalent_duration)
+    (fit,) = _single(window, replace(Family.of(SHAPE, 1.0), epsilon=(0.0,)), SHAPE, start, _ranges(window))
+    (best,), part = fit.flares, int(np.argmax(fit.mixture.log_weight))
+    peak, half_width = np.array([best.peak_s]), np.array([best.half_width_s])
+    columns = np.column_stack([window.model(SHAPE, peak, half_width)[0] / window.scale, np.ones(window.values.size)])
+    covariance = np.linalg.inv(columns.T / window.noise @ columns)
+    light, level = covariance @ (columns.T / window.noise @ window.values)
+    duration = light / level * best.half_width_s * SHAPE.equivalent_duration
+    along = duration * np.array([1 / light, -1 / level])
+    assert fit.mixture.mean[part] == pytest.approx(duration, rel=1e-6)
+    assert fit.mixture.sd[part] == pytest.approx(np.sqrt(along @ covariance @ along), rel=1e-6)
+
+
+def test_error_of_a_summed_duration_includes_that_of_its_level() -> None:
+    """Both the light above the level and the unit of the duration follow from the mean of the other 500 frames."""
+    survey, taken, one = faint_star()
+    energy = measure_event(survey, taken, survey.flux_level(~taken), one).energy
+    level = survey.flux[~taken].mean() * SD
+    frames = energy.summed_s * energy.level * 100.0 / level / CADENCE_S
+    expected = SD / level * CADENCE_S * np.sqrt(100 + (100 + frames) ** 2 / 500)
+    assert energy.summed_error_s * energy.level * 100.0 / level == pytest.approx(expected, rel=1e-6)
+
+
+def test_noise_at_the_level_is_that_of_its_counts() -> None:
+    """Stated errors are those of the counts of each frame, of which a flare has more than the level."""
+    rng = np.random.default_rng(300)
+    mean = LEVEL * (1 + 0.5 * flare(15_000, 400))
+    flux = rng.normal(mean, np.sqrt(mean + 25))
+    quiet = mean < 1.001 * LEVEL
+    level = flux[quiet].mean()
+    variance, slope = quiet_variance(flux, np.sqrt(flux + 25), np.full(FRAMES, level), quiet)
+    assert slope == pytest.approx(1.0, rel=1e-9)
+    np.testing.assert_allclose(variance, level + 25, rtol=1e-9)
+
+
 def test_a_flare_is_found_at_its_time_and_a_step_is_a_step(threshold: float) -> None:
     rng = np.random.default_rng(292)
     survey = survey_of(light_curve(rng, LEVEL * (1 + 0.1 * flare(15_000, 400))))
@@ -144,6 +198,14 @@ def test_correlated_frames_are_red_and_gaps_are_not_bridged() -> None:
     # With a gap after every second frame there are no means of four.
     pairs = np.arange(20_000) + np.arange(20_000) // 2 * 5
     assert [one.frames for one in binned_scatter(pairs, slow)] == [1, 2]
+
+
+def test_correlations_do_not_bridge_gaps() -> None:
+    """Pairs of frames in which the second is like the first are correlated; those like the pair before are not."""
+    first, other = np.random.default_rng(301).normal(0, 1, (2, 2000))
+    pairs = np.arange(4000) + np.arange(4000) // 2 * 50
+    for second, alike in ((first, False), (np.roll(first, -1), True), (other, True)):
+        assert likeness(pairs, np.column_stack([first, second]).reshape(-1, 1)).alike == alike
 
 
 @pytest.mark.long

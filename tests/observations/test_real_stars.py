@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,10 @@ import pytest
 from numpy.typing import NDArray
 from scenes import flare
 from scipy import stats
+from scipy.linalg import null_space
 
+from mauvecl import Study
+from mauvecl.answers.observations.analyse import AnalyseAnswer
 from mauvecl.lightcurve.flares.shapes import SHAPES
 from mauvecl.lightcurve.search.survey import select_frames
 from mauvecl.observations.analysis import Analysis, analyse_frames
@@ -63,6 +67,11 @@ def test_covariance_is_that_of_dense_matrices() -> None:
     fit = level_fit(made, values[:, 0])
     assert fit.mean == pytest.approx(float(ones @ values[:, 0] / ones.sum()))
     assert fit.mean_variance == pytest.approx(1 / float(ones.sum()))
+    # A constant of any size leaves the sums of values whose weights add up to zero.
+    sums = null_space(np.ones((1, 200))).T
+    within = stats.multivariate_normal(np.zeros(199), sums @ dense @ sums.T).logpdf(sums @ values[:, 0])
+    expected = within + 199 / 2 * np.log(2 * np.pi) - np.log(200) / 2
+    assert fit.log_likelihood == pytest.approx(expected, rel=1e-10)
 
 
 @pytest.mark.parametrize("taken", [False, True], ids=["at-once", "after-an-event"])
@@ -174,20 +183,40 @@ def test_losses_of_light_are_not_searched_and_flares_between_them_are_found() ->
     assert found == 6
 
 
-def test_flare_brighter_than_its_window_has_its_energy() -> None:
-    """264 frames of 5 s, of which 93 show the quiescent star: the interval of 95 % and the level, at one seed."""
+@cache
+def short_window() -> tuple[Analysis, float, float]:
+    """Return 264 frames of 5 s, of which 93 show the quiescent star, and a flare's durations: whole and in frames."""
     rng = np.random.default_rng(402)
     time = (np.arange(264) + 0.5) * 5.0
-    frames = Frames.of(time, 1e6 * (1 + 10 * flare(time, 5.0, 528.0, 60.0)) + 2500 * rng.standard_normal(264),
-                       np.full(264, 2500.0))  # fmt: skip
-    analysis = analyse_frames(frames)
+    light = 10 * flare(time, 5.0, 528.0, 60.0)
+    frames = Frames.of(time, 1e6 * (1 + light) + 2500 * rng.standard_normal(264), np.full(264, 2500.0))
+    return analyse_frames(frames), 10 * 60 * DAVENPORT.equivalent_duration, float(light.sum()) * 5.0
+
+
+def test_flare_brighter_than_its_window_has_its_energy() -> None:
+    """Check the interval of 95 % and the level, at one seed."""
+    analysis, truth, inside = short_window()
     (event,) = analysis.events
-    truth = 10 * 60 * DAVENPORT.equivalent_duration
     assert event.energy.fitted_s == pytest.approx(truth, rel=2e-3)
     assert event.energy.low_s[1] - 1.0 < truth < event.energy.high_s[1] + 1.0
-    inside = 10 * float(flare(time, 5.0, 528.0, 60.0).sum()) * 5.0
     assert event.energy.summed_s == pytest.approx(inside, rel=2e-3)
     assert np.median(analysis.level.level) == pytest.approx(1e6, rel=2e-3)
+
+
+def test_table_of_events_has_the_flare_in_its_units() -> None:
+    """Check times within a frame, sizes within two per mille, and the order of the ends of intervals."""
+    analysis, truth, inside = short_window()
+    (row,) = AnalyseAnswer(Study(), analysis).events
+    assert row["tpeak"].to_value("s") == pytest.approx(528.0, abs=5.0)
+    assert row["tstart"] < row["tpeak"] < row["tstop"]
+    assert row["dur"].to_value("s") == pytest.approx((row["tstop"] - row["tstart"]).to_value("s") + 5.0)
+    assert row["ampl_rec"] == pytest.approx(10 * flare(np.array([527.5]), 5.0, 528.0, 60.0)[0], rel=5e-3)
+    assert row["half_width"].to_value("s") == pytest.approx(60.0, rel=0.01)
+    for name, expected in (("ed", truth), ("ed_fit", truth), ("ed_rec", inside)):
+        assert row[name].to_value("s") == pytest.approx(expected, rel=2e-3)
+    ends = [row[name].to_value("s") for name in ("ed_low_95", "ed_low", "ed", "ed_high", "ed_high_95")]
+    assert (np.diff(ends) > 0).all()
+    assert [row["ed_fit_low"], row["ed_fit_high"]] == [row["ed_low"], row["ed_high"]]
 
 
 @pytest.mark.parametrize(("after_s", "half_width_s", "seed"), [(60.0, 40.0, 1), (40.0, 40.0, 2), (50.0, 30.0, 3)])

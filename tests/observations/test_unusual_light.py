@@ -7,7 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from mauvecl import Frames, Study, analyse
+from mauvecl.lightcurve.flares.shapes import shape_of
 from mauvecl.observations.analysis import analyse_frames
+from mauvecl.observations.detection import fit_quiet_light
+from mauvecl.observations.level import guess_flares
+from mauvecl.observations.losses import sudden_losses
+from mauvecl.observations.search import SeriesSurvey
 
 Float = NDArray[np.float64]
 #: Equivalent duration of a flare of unit amplitude and half-width in the shape of `flare`.
@@ -67,6 +72,23 @@ def test_end_of_a_search_at_its_largest_number_of_events_is_stated(monkeypatch: 
     monkeypatch.setattr("mauvecl.observations.detection.MOST_EVENTS", 5)
     ended = analyse_frames(frames)
     assert any(f"ended at {len(ended.events)} events" in line for line in ended.messages)
+
+
+def test_losses_are_found_at_their_frames_and_a_flare_is_none() -> None:
+    """Three losses of 3 %, of 30 standard deviations, and a flare between them; ends are known to a few frames."""
+    rng = np.random.default_rng(504)
+    time, noise = np.arange(900) * 20.0, 1e-3
+    lost = np.zeros(time.size, np.bool_)
+    for first in (150, 400, 700):
+        lost[first : first + 40] = True
+    flux = 1 - 0.03 * lost + 0.02 * flare(time, 20.0, 11_000.0, 60.0) + noise * rng.standard_normal(time.size)
+    frames = Frames.of(time, flux, np.full(time.size, noise))
+    used = np.ones(time.size, np.bool_)
+    survey = SeriesSurvey.of(frames, flux, np.full(time.size, noise**2), used, 1.0, 0.0, shape_of("davenport2014"))
+    found = sudden_losses(survey, *fit_quiet_light(survey, guess_flares(frames.numbers, flux)))
+    assert found[lost].mean() > 0.9
+    assert found[~lost].mean() < 0.05
+    assert not found[550:560].any()
 
 
 def spotted_binary(rng: np.random.Generator, days: float, frame_s: float) -> tuple[Float, Float, Float, list[float]]:
