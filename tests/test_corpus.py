@@ -1,0 +1,124 @@
+"""Files of every kind are read as their entry in the corpus says, or refused in one sentence that helps.
+
+The entries are in data/corpus, and the README there says what they may hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from corpus import Case, cases, value, written
+from refusals import refused
+
+from mauvecl import Source, read_frames
+from mauvecl.host.neighbour_table import read_neighbours
+from mauvecl.observations.frames import Reason
+from mauvecl.study.orbits import PlanTarget, read_targets
+
+# Astropy warns of the usual units when it writes a VOTable.
+pytestmark = pytest.mark.filterwarnings("ignore:The unit .* has been deprecated in the VOUnit standard")
+
+CASES = [one for path in sorted((Path(__file__).parent / "data" / "corpus").glob("*.toml")) for one in cases(path)]
+
+
+def _spectrum(path: Path, case: Case) -> tuple[str, ...]:
+    star = Source.read(f"{path}{case.get('part', '')}", **case.get("options", {}))
+    nm, flux = value(case.get("nm", "nm")), value(case.get("flux", "flux"))
+    rows, rtol = value(case.get("inside", "every")), case.get("rtol", 1e-8)
+    np.testing.assert_allclose(star.wavelength_nm[rows], nm[rows] if nm.size > 1 else nm, rtol=rtol)
+    if case.get("relative"):
+        np.testing.assert_allclose(star.flux_flam / star.flux_flam[100], flux / flux[100], rtol=rtol)
+    else:
+        np.testing.assert_allclose(star.flux_flam, flux, rtol=case.get("flux_rtol", rtol))
+    return (*star.messages, *star.notes)
+
+
+def _frames(path: Path, case: Case) -> tuple[str, ...]:
+    frames = read_frames(path, _mapping(path, case), **case.get("options", {}))
+    rows = value(case.get("kept", "every"))
+    time, flux = value(case.get("time", "t"))[rows], value(case.get("light", "light"))[rows]
+    assert (frames.reference_mjd is None) == ("mjd" not in case)
+    if frames.reference_mjd is not None:
+        first = frames.reference_mjd + frames.time_s[0] / 86_400
+        assert first == pytest.approx(value(case["mjd"]), abs=case.get("days", 1e-8))
+        np.testing.assert_allclose(frames.time_s - frames.time_s[0], time - time[0], atol=case.get("atol", 1e-3))
+    else:
+        np.testing.assert_allclose(frames.time_s, time, atol=1e-4)
+    faults = {str(k): Reason(int(frames.faults[k])).name for k in np.flatnonzero(frames.faults)}
+    assert faults == case.get("faults", {})
+    good = frames.faults == 0
+    np.testing.assert_allclose(frames.flux[good], flux[good], rtol=case.get("rtol", 1e-9))
+    if frames.wavelength_nm is not None and "nm" in case:
+        found = frames.wavelength_nm[value(case.get("inside", "every"))]
+        np.testing.assert_allclose(found, value(case["nm"]), rtol=case.get("rtol", 1e-9))
+    if "error" in case:
+        assert frames.error is not None
+        np.testing.assert_allclose(frames.error[good], value(case["error"])[rows][good], rtol=1e-6)
+    for key in {"scale", "position", "unit"} & set(case):
+        assert getattr(frames, key) == case[key]
+    assert case.get("remarks", "any") != "none" or not frames.remarks, frames.remarks
+    return frames.remarks
+
+
+def _mapping(path: Path, case: Case) -> Path | None:
+    """Write the mapping of a case, with its changes; a key that is changed to an empty text is left out."""
+    if not (how := case.get("mapping", {}) | case.get("how", {})):
+        return None
+    lines = [f"{key} = {one!r}" for key, one in how.items() if one != ""]
+    (path.parent / "mapping.toml").write_text("\n".join(lines))
+    return path.parent / "mapping.toml"
+
+
+def _targets(path: Path, case: Case) -> tuple[str, ...]:
+    targets = [PlanTarget.model_validate(one) for one in read_targets(path)]
+    for target, wanted in zip(targets, case["targets"], strict=True):
+        found = target.model_dump()
+        assert wanted.get("only", [*target.model_fields_set]) == [*target.model_fields_set]
+        if "ra" in wanted:
+            place = target.target(simbad=False)
+            found |= {"ra": place.ra_deg, "dec": place.dec_deg}
+        for key, one in wanted.items():
+            assert key == "only" or _same(found[key], one), f"{key} = {found[key]!r}"
+    return ()
+
+
+def _same(found: Any, wanted: Any) -> bool:
+    """Compare with a value of TOML, which has lists and, here, the word None."""
+    if isinstance(wanted, list):
+        return len(found) == len(wanted) and all(map(_same, found, wanted))
+    if isinstance(wanted, float):
+        return found is not None and bool(found == pytest.approx(wanted, rel=1e-6, abs=1e-9))
+    return bool(found == (None if wanted == "None" else wanted))
+
+
+def _neighbours(path: Path, case: Case) -> tuple[str, ...]:
+    stars, notes = read_neighbours(path, case.get("of"))
+    for key, wanted in case["stars"].items():
+        found = [star.spectrum[0] if key == "type" else getattr(star, key) for star in stars]
+        assert _same(found, wanted), f"{key} = {found}"
+    return notes
+
+
+READERS: dict[str, Callable[[Path, Case], tuple[str, ...]]] = {
+    "spectrum": _spectrum, "frames": _frames, "targets": _targets, "neighbours": _neighbours,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", [pytest.param(case, id=name) for name, case in CASES])
+def test_files_are_read_as_they_say(case: Case, tmp_path: Path) -> None:
+    path = written(case, tmp_path)
+    read = READERS[case["reader"]]
+    if case.get("refused"):
+        key, *words = case["refused"]
+        with refused(key, *words, expected=case.get("expected")) as caught:
+            read(path, case)
+        text = str(caught.value)
+        assert 20 < len(text) < 600
+        assert "Error" not in text
+        return
+    said = read(path, case)
+    assert all(any(word in text for text in said) for word in case.get("says", ())), said
