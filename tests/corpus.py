@@ -93,7 +93,8 @@ def cases(path: Path) -> Iterator[tuple[str, Case]]:
             case = _filled(
                 content.get("given", {}) | entry | own, {key.removeprefix("$"): one for key, one in changes.items()}
             )
-            words = [path.stem, case.get("name", ""), *(str(one)[:30] for one in list(changes.values())[:2])]
+            known = [str(changes[key]) for key in changes if key.startswith("$")]
+            words = [path.stem, case.get("name", ""), *known[:2]]
             for form in case.get("forms", [""]):
                 yield " ".join(word for word in (*words, form) if word), case | {"form": form}
 
