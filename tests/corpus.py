@@ -24,6 +24,7 @@ from astropy.table import MaskedColumn, Table
 from astropy.time import Time
 
 Case = dict[str, Any]
+CORPUS = Path(__file__).parent / "data" / "corpus"
 #: A spectrum that is not straight, so that a wrong column, unit, order or shift shows at each point.
 NM = np.arange(170.0, 1000.0, 2.0)
 FLUX = 1e-13 * (1.1 + np.sin(NM / 37.0)) * np.exp(-(((NM - 560.0) / 300.0) ** 2))
@@ -68,7 +69,7 @@ NAMES: dict[str, Any] = {
 
 def value(text: Any) -> Any:
     """Return the value of an expression, or an array that is given."""
-    return eval(text, {"__builtins__": {}}, NAMES) if isinstance(text, str) else np.asarray(text)
+    return eval(text, dict(NAMES)) if isinstance(text, str) else np.asarray(text)
 
 
 def _filled(entry: Any, row: Case) -> Any:
@@ -155,7 +156,7 @@ FORMS = {"f": "D", "i": "K", "u": "K", "b": "L", "c": "M"}
 def _hdu(case: Case) -> Any:
     """Return an extension; keywords are set after astropy has made it, which would change or refuse some."""
     if "image" in case:
-        hdu: Any = fits.ImageHDU(value(case["image"]), name=case.get("name", ""))
+        hdu: Any = fits.ImageHDU(value(case["image"]), name=case.get("extname"))
     else:
         made = []
         for name, values in columns_of(case).items():
@@ -212,4 +213,13 @@ def written(case: Case, folder: Path) -> Path:
     path.write_bytes(content)
     for name, text in case.get("beside", {}).items():
         (folder / name).write_text(text)
+    return path
+
+
+def mapping_of(case: Case, folder: Path) -> Path | None:
+    """Write the mapping of a case, with its changes; a key that is changed to an empty text is left out."""
+    if not (how := case.get("mapping", {}) | case.get("how", {})):
+        return None
+    path = folder / "mapping.toml"
+    path.write_text("\n".join(f"{key} = {one!r}" for key, one in how.items() if one != ""))
     return path
