@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -93,9 +94,10 @@ def _same(found: Any, wanted: Any) -> bool:
 
 
 def _neighbours(path: Path, case: Case) -> tuple[str, ...]:
-    stars, notes = read_neighbours(path, case.get("of"))
+    stars, notes = read_neighbours(path, case.get("of") or None)
     for key, wanted in case["stars"].items():
-        found = [star.spectrum[0] if key == "type" else getattr(star, key) for star in stars]
+        how = {"type": lambda star: star.spectrum[0], "last": lambda star: star.name[-1]}
+        found = [how.get(key, attrgetter(key))(star) for star in stars]
         assert _same(found, wanted), f"{key} = {found}"
     return notes
 

@@ -1,4 +1,4 @@
-"""Frames from arrays and files: order, gaps, dates, and what is refused."""
+"""Frames from arrays: order, gaps, and faults."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ import numpy as np
 from astropy.table import Table
 
 from mauvecl.observations.frames import Frames, Reason
-from mauvecl.observations.mapping import FrameMapping
 from mauvecl.observations.reading import frames_of
-from tests.refusals import refused
 
 RNG = np.random.default_rng(29)
 TIME = np.arange(100) * 20.0
@@ -52,8 +50,3 @@ def test_the_errors_are_those_of_the_chosen_flux() -> None:
     frames = frames_of(Table({name: columns[name] for name in columns if name != "flux"}, units={"time": "s"}))
     assert frames.error is not None
     assert (frames.flux[0], frames.error[0]) == (2.0, 3.0)
-
-
-def test_an_unknown_time_scale_of_a_mapping_is_refused() -> None:
-    with refused("scale", "martian"):
-        FrameMapping(time="time", flux="flux", scale="martian")
