@@ -95,7 +95,7 @@ def cases(path: Path) -> Iterator[tuple[str, Case]]:
                 content.get("given", {}) | entry | own, {key.removeprefix("$"): one for key, one in changes.items()}
             )
             known = [str(changes[key]) for key in changes if key.startswith("$")]
-            words = [path.stem, case.get("name", ""), *known[:2]]
+            words = [path.stem, case.get("name", case.get("file", "")), *known[:2]]
             for form in case.get("forms", [""]):
                 yield " ".join(word for word in (*words, form) if word), case | {"form": form}
 
@@ -195,7 +195,9 @@ PACKERS = {"": bytes, "gz": gzip.compress, "bz2": bz2.compress, "xz": lzma.compr
 
 
 def written(case: Case, folder: Path) -> Path:
-    """Write the file of a case, with the changes of its bytes, and return its path."""
+    """Write the file of a case, with the changes of its bytes, and return its path; a stored file is where it is."""
+    if "folder" in case:
+        return CORPUS.parent / case["folder"] / case["file"]
     kind, _, packing = case["form"].partition(".")
     if "text" in case:
         content = case["text"].lstrip("\n").encode()
@@ -218,6 +220,8 @@ def written(case: Case, folder: Path) -> Path:
 
 def mapping_of(case: Case, folder: Path) -> Path | None:
     """Write the mapping of a case, with its changes; a key that is changed to an empty text is left out."""
+    if "mapping_file" in case:
+        return CORPUS.parent / case["folder"] / case["mapping_file"]
     if not (how := case.get("mapping", {}) | case.get("how", {})):
         return None
     path = folder / "mapping.toml"

@@ -1,6 +1,6 @@
 """Files of every kind are read as their entry in the corpus says, or refused in one sentence that helps.
 
-The entries are in data/corpus, and the README there says what they may hold.
+The entries are in data/corpus, whose README says what they may hold; those of stored files are beside the files.
 """
 
 from __future__ import annotations
@@ -18,13 +18,16 @@ from refusals import refused
 
 from mauvecl import Source, read_frames
 from mauvecl.host.neighbour_table import read_neighbours
+from mauvecl.host.spectra.formats import read_spectrum
+from mauvecl.host.stars.flare_table import read_flares
 from mauvecl.observations.frames import Reason
 from mauvecl.study.orbits import PlanTarget, read_targets
 
 # Astropy warns of the usual units when it writes a VOTable.
 pytestmark = pytest.mark.filterwarnings("ignore:The unit .* has been deprecated in the VOUnit standard")
 
-CASES = [one for path in sorted(CORPUS.glob("*.toml")) for one in cases(path)]
+STORED = [CORPUS.parent / folder / "expected.toml" for folder in ("cases", "light_curves")]
+CASES = [one for path in (*sorted(CORPUS.glob("*.toml")), *STORED) for one in cases(path)]
 
 
 def _spectrum(path: Path, case: Case) -> tuple[str, ...]:
@@ -71,6 +74,43 @@ def _frames(path: Path, case: Case) -> tuple[str, ...]:
     return frames.remarks
 
 
+def _summary(path: Path, case: Case) -> tuple[str, ...]:
+    """Read frames of a stored file, of which numbers are known instead of arrays."""
+    frames = read_frames(path, mapping_of(case, path.parent), **case.get("options", {}))
+    assert frames.n_frames == case["frames"]
+    assert case.get("dated", True) == (frames.reference_mjd is not None) or "mjd" not in case
+    if "mjd" in case:
+        assert frames.reference_mjd is not None
+        # A millisecond and a half, as files with eight decimals of a day have.
+        assert frames.reference_mjd + frames.time_s[0] / 86_400 == pytest.approx(case["mjd"], abs=2e-8)
+    assert frames.scale == case.get("scale", frames.scale)
+    assert frames.mission == case.get("mission", frames.mission)
+    assert frames.cadence_s == pytest.approx(case.get("cadence_s", frames.cadence_s), abs=1e-3)
+    median = float(np.nanmedian(frames.flux))
+    assert median == pytest.approx(case.get("median", median), rel=1e-3)
+    assert "error" not in case or np.median(frames.error) == pytest.approx(case["error"])
+    flagged = np.flatnonzero(frames.faults & Reason.QUALITY)
+    assert flagged.tolist() == case.get("flagged", flagged.tolist())
+    assert flagged.size == case.get("flagged_count", flagged.size)
+    usable = frames.flux[frames.faults == 0]
+    assert "flares_above" not in case or usable.max() - np.median(usable) > case["flares_above"]
+    return frames.remarks
+
+
+def _points(path: Path, case: Case) -> tuple[str, ...]:
+    """Read a spectrum that may be short or undefined in part, and compare it at some wavelengths."""
+    found = read_spectrum(Path(f"{path}{case.get('part', '')}"), **case.get("options", {}))
+    bad = found.wavelength_nm[~np.isfinite(found.flux_flam)]
+    np.testing.assert_allclose(bad, case.get("undefined_nm", []))
+    if "span_nm" in case:
+        np.testing.assert_allclose(found.wavelength_nm[[0, -1]], case["span_nm"], atol=0.01)
+    for nm, flux in zip(case["nm"], case["flux"], strict=True):
+        at = int(np.argmin(np.abs(found.wavelength_nm - nm)))
+        assert found.wavelength_nm[at] == pytest.approx(nm, abs=1e-4)
+        assert found.flux_flam[at] == pytest.approx(flux, rel=case.get("rtol", 1e-5))
+    return found.messages
+
+
 def _targets(path: Path, case: Case) -> tuple[str, ...]:
     targets = [PlanTarget.model_validate(one) for one in read_targets(path)]
     for target, wanted in zip(targets, case["targets"], strict=True):
@@ -84,12 +124,12 @@ def _targets(path: Path, case: Case) -> tuple[str, ...]:
     return ()
 
 
-def _same(found: Any, wanted: Any) -> bool:
+def _same(found: Any, wanted: Any, rtol: float = 1e-6) -> bool:
     """Compare with a value of TOML, which has lists and, here, the word None."""
     if isinstance(wanted, list):
-        return len(found) == len(wanted) and all(map(_same, found, wanted))
+        return len(found) == len(wanted) and all(_same(*both, rtol) for both in zip(found, wanted, strict=True))
     if isinstance(wanted, float):
-        return found is not None and bool(found == pytest.approx(wanted, rel=1e-6, abs=1e-9))
+        return found is not None and bool(found == pytest.approx(wanted, rel=rtol, abs=1e-9))
     return bool(found == (None if wanted == "None" else wanted))
 
 
@@ -98,12 +138,18 @@ def _neighbours(path: Path, case: Case) -> tuple[str, ...]:
     for key, wanted in case["stars"].items():
         how = {"type": lambda star: star.spectrum[0], "last": lambda star: star.name[-1]}
         found = [how.get(key, attrgetter(key))(star) for star in stars]
-        assert _same(found, wanted), f"{key} = {found}"
+        assert _same(found, wanted, case.get("rtol", 1e-6)), f"{key} = {found}"
     return notes
 
 
+def _flares(path: Path, case: Case) -> tuple[str, ...]:
+    np.testing.assert_array_equal(read_flares(path)["amplitude"], case["amplitudes"])
+    return ()
+
+
 READERS: dict[str, Callable[[Path, Case], tuple[str, ...]]] = {
-    "spectrum": _spectrum, "frames": _frames, "targets": _targets, "neighbours": _neighbours,
+    "spectrum": _spectrum, "points": _points, "frames": _frames, "summary": _summary, "targets": _targets,
+    "neighbours": _neighbours, "flares": _flares,
 }  # fmt: skip
 
 
