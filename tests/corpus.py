@@ -30,6 +30,8 @@ NM = np.arange(170.0, 1000.0, 2.0)
 FLUX = 1e-13 * (1.1 + np.sin(NM / 37.0)) * np.exp(-(((NM - 560.0) / 300.0) ** 2))
 #: A light curve of 60 frames.
 K = np.arange(60)
+#: Wavelengths of SDSS and LAMOST, Angstrom.
+GRID = 10 ** (3.5682 + 1e-4 * np.arange(3909))
 RNG = np.random.default_rng(2900)
 LIGHT = np.round(RNG.normal(1000, 5, K.size), 3)
 
@@ -54,6 +56,11 @@ def in_air(nm: Any) -> Any:
     return np.where(nm > 205, nm / index, nm)
 
 
+def curve(angstrom: Any) -> Any:
+    """Return the light of a curved spectrum, erg s-1 cm-2 A-1."""
+    return 1e-13 * (1.5 + np.sin(angstrom / 370.0))
+
+
 def dates(mjd: Any, form: str) -> Any:
     """Return dates in barycentric dynamical time."""
     return Time(Time(mjd, format="mjd", scale="tdb"), format=form)
@@ -63,13 +70,17 @@ NAMES: dict[str, Any] = {
     "np": np, "nm": NM, "flux": FLUX, "k": K, "t": 20.0 * K + 100.0, "light": LIGHT, "error": 0 * K + 5.0, "per": per,
     "at": at, "air": in_air(NM), "shuffled": RNG.permutation(K.size), "dates": dates, "nan": np.nan,
     "hidden": lambda values, rows: MaskedColumn(values, mask=np.isin(np.arange(len(values)), rows)),
-    "every": slice(None), "arrays": lambda *rows: np.array([*rows, None], object)[:-1],
+    "every": slice(None), "good": np.outer([1, 1], np.abs(np.arange(1024) - 506.5) < 487) > 0,
+    "curve": curve, "grid": GRID, "fibres": lambda low, high, ids: np.float32(
+        np.outer(np.arange(len(ids)) + 1, 1e17 * curve(np.arange(low, high + 0.1, 0.8)))
+    ),
+    "arrays": lambda *rows: np.array([*rows, None], object)[:-1],
 }  # fmt: skip
 
 
-def value(text: Any) -> Any:
+def value(text: Any, **names: Any) -> Any:
     """Return the value of an expression, or an array that is given."""
-    return eval(text, dict(NAMES)) if isinstance(text, str) else np.asarray(text)
+    return eval(text, NAMES | names) if isinstance(text, str) else np.asarray(text)
 
 
 def _filled(entry: Any, row: Case) -> Any:

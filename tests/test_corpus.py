@@ -100,11 +100,21 @@ def _summary(path: Path, case: Case) -> tuple[str, ...]:
 def _points(path: Path, case: Case) -> tuple[str, ...]:
     """Read a spectrum that may be short or undefined in part, and compare it at some wavelengths."""
     found = read_spectrum(Path(f"{path}{case.get('part', '')}"), **case.get("options", {}))
+    assert "law" in case or "nm" in case
     bad = found.wavelength_nm[~np.isfinite(found.flux_flam)]
     np.testing.assert_allclose(bad, case.get("undefined_nm", []))
     if "span_nm" in case:
         np.testing.assert_allclose(found.wavelength_nm[[0, -1]], case["span_nm"], atol=0.01)
-    for nm, flux in zip(case["nm"], case["flux"], strict=True):
+    if "law" in case:
+        law = value(case["law"], nm=found.wavelength_nm)
+        np.testing.assert_allclose(found.flux_flam, law, rtol=case["rtol"])
+        assert (np.diff(found.wavelength_nm) > 0).all()
+    if "wave" in case:
+        np.testing.assert_allclose(found.wavelength_nm, value(case["wave"]), rtol=1e-5)
+    assert case.get("star", found.name) == found.name
+    for text, start in zip(found.messages, case.get("messages", found.messages), strict=True):
+        assert text.startswith(start)
+    for nm, flux in zip(case.get("nm", ()), case.get("flux", ()), strict=True):
         at = int(np.argmin(np.abs(found.wavelength_nm - nm)))
         assert found.wavelength_nm[at] == pytest.approx(nm, abs=1e-4)
         assert found.flux_flam[at] == pytest.approx(flux, rel=case.get("rtol", 1e-5))
