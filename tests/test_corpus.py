@@ -5,12 +5,14 @@ The entries are in data/corpus, whose README says what they may hold; those of s
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
+import corpus
 import numpy as np
 import pytest
 from corpus import CORPUS, Case, cases, mapping_of, value, written
@@ -161,6 +163,12 @@ READERS: dict[str, Callable[[Path, Case], tuple[str, ...]]] = {
     "spectrum": _spectrum, "points": _points, "frames": _frames, "summary": _summary, "targets": _targets,
     "neighbours": _neighbours, "flares": _flares,
 }  # fmt: skip
+
+
+def test_keys_of_entries_are_known() -> None:
+    """Refuse an expectation whose key is spelt wrong, which would expect nothing."""
+    known = set(re.findall(r"[\"'](\w+)[\"']", "".join(Path(file).read_text() for file in (__file__, corpus.__file__))))
+    assert sorted({key for _, case in CASES for key in case} - known) == []
 
 
 @pytest.mark.parametrize("case", [pytest.param(case, id=name) for name, case in CASES])
