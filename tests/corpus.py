@@ -67,7 +67,8 @@ def dates(mjd: Any, form: str) -> Any:
 
 
 NAMES: dict[str, Any] = {
-    "np": np, "nm": NM, "flux": FLUX, "k": K, "t": 20.0 * K + 100.0, "light": LIGHT, "error": 0 * K + 5.0, "per": per,
+    "np": np, "nm": NM, "wide": np.arange(170.0, 1100.0), "flux": FLUX, "k": K,
+    "t": 20.0 * K + 100.0, "light": LIGHT, "error": 0 * K + 5.0, "per": per,
     "at": at, "air": in_air(NM), "shuffled": RNG.permutation(K.size), "dates": dates, "nan": np.nan,
     "hidden": lambda values, rows: MaskedColumn(values, mask=np.isin(np.arange(len(values)), rows)),
     "every": slice(None), "good": np.outer([1, 1], np.abs(np.arange(1024) - 506.5) < 487) > 0,

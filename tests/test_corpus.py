@@ -37,6 +37,7 @@ def _spectrum(path: Path, case: Case) -> tuple[str, ...]:
     for text, start in zip(star.messages, case.get("messages", star.messages), strict=True):
         assert text.startswith(start)
     assert star.messages[0] == case.get("first", star.messages[0])
+    assert case.get("star", star.name) == star.name
     if (expected := case.get("nm", "nm")) != "":
         nm, flux = value(expected), value(case.get("flux", "flux"))
         rows, rtol = value(case.get("inside", "every")), case.get("rtol", 1e-8)
