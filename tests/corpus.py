@@ -34,6 +34,8 @@ K = np.arange(60)
 GRID = 10 ** (3.5682 + 1e-4 * np.arange(3909))
 RNG = np.random.default_rng(2900)
 LIGHT = np.round(RNG.normal(1000, 5, K.size), 3)
+#: Frames of five pixels.
+SPECTRA = RNG.normal(1000.0, 5.0, (K.size, 5)) * np.linspace(0.5, 1.5, 5)
 
 
 def per(unit: str) -> Any:
@@ -69,6 +71,7 @@ def dates(mjd: Any, form: str) -> Any:
 NAMES: dict[str, Any] = {
     "np": np, "nm": NM, "wide": np.arange(170.0, 1100.0), "flux": FLUX, "k": K,
     "t": 20.0 * K + 100.0, "light": LIGHT, "error": 0 * K + 5.0, "per": per,
+    "spectra": SPECTRA, "waves": np.linspace(250.5, 650.5, 5), "mixed": RNG.permutation(SPECTRA.size),
     "at": at, "air": in_air(NM), "shuffled": RNG.permutation(K.size), "dates": dates, "nan": np.nan,
     "hidden": lambda values, rows: MaskedColumn(values, mask=np.isin(np.arange(len(values)), rows)),
     "every": slice(None), "good": np.outer([1, 1], np.abs(np.arange(1024) - 506.5) < 487) > 0,
@@ -206,10 +209,36 @@ WRITERS = {"csv": _text, "txt": _text, "below": _units_below, "ecsv": _ecsv, "vo
 PACKERS = {"": bytes, "gz": gzip.compress, "bz2": bz2.compress, "xz": lzma.compress}
 
 
+def _folder(case: Case, folder: Path) -> Path:
+    """Write a file for each frame, ``$i``, and a table of them, and spoil some; keywords are expressions."""
+    folder /= "frames"
+    folder.mkdir()
+    for i in range(K.size):
+        one = _filled({key: case[key] for key in case if key not in ("per_frame", "list")}, {"i": i})
+        for part in (one, *one.get("hdus", ())):
+            for where in {"header", "primary"} & set(part):
+                part[where] = {key: np.asarray(value(text)).item() for key, text in part[where].items()}
+        written(one | {"file": case["per_frame"] % i}, folder)
+    if "list" in case:
+        listed = case["list"] | {"file": f"list.{case['list']['form']}"}
+        written({"columns": case["columns"], "units": case["units"]} | listed, folder)
+    for name, change in case.get("spoilt", {}).items():
+        path = folder / name
+        if isinstance(change, str):
+            path.unlink(missing_ok=True)
+            if change or path.suffix != ".fits":
+                path.write_text(change)
+        else:
+            path.write_bytes(re.sub(change[0].encode(), change[1].encode(), path.read_bytes(), count=1))
+    return folder
+
+
 def written(case: Case, folder: Path) -> Path:
     """Write the file of a case, with the changes of its bytes, and return its path; a stored file is where it is."""
     if "folder" in case:
         return CORPUS.parent / case["folder"] / case["file"]
+    if "per_frame" in case:
+        return _folder(case, folder)
     kind, _, packing = case["form"].partition(".")
     if "text" in case:
         content = case["text"].lstrip("\n").encode()

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.table import QTable
-from layouts import LAYOUTS, Truth
+from corpus import CORPUS, mapping_of, written
+from corpus import cases as files
 from refusals import refused
 
 from mauvecl import Study, calibrate, change
@@ -20,6 +21,7 @@ from mauvecl.observations.barycentre import barycentric
 from mauvecl.observations.changes.periods import visit_times_d
 from mauvecl.observations.frames import Frames
 from mauvecl.observations.line_index import MG_II_CONTINUUM_NM, MG_II_NM, line_index
+from mauvecl.observations.mapping import FrameMapping
 from mauvecl.observations.reading import frames_of, reduce_frames
 from mauvecl.study.cases import cases
 
@@ -98,6 +100,7 @@ def test_bad_input_raises(name: str) -> None:
 
 
 def test_weights_of_other_pixels_are_refused(tmp_path: Path) -> None:
-    path, how = LAYOUTS["long CSV"](Truth.of(), tmp_path)
+    name = "row per pixel, with units in the mapping Angstrom s csv"
+    case = dict(files(CORPUS / "frames_of_spectra.toml"))[f"frames_of_spectra {name}"]
     with refused("weights"):
-        reduce_frames(path, np.ones((1, 5)), how)
+        reduce_frames(written(case, tmp_path), np.ones((1, 4)), FrameMapping.read(mapping_of(case, tmp_path)))
