@@ -104,7 +104,9 @@ def cases(path: Path) -> Iterator[tuple[str, Case]]:
         for rows in itertools.product(*(table[1:] for table in tables)):
             changes: Case = {}
             for (heads, *_), row in zip(tables, rows, strict=True):
-                changes |= zip(heads, row if isinstance(row, (list, tuple)) else [row], strict=False)
+                values = row if isinstance(row, list) else [row]
+                assert len(values) <= len(heads), f"{path.name}: {row} has more values than {heads}"
+                changes |= zip(heads, values, strict=False)
             own = {key: one for key, one in changes.items() if not key.startswith("$")}
             case = _filled(
                 content.get("given", {}) | entry | own, {key.removeprefix("$"): one for key, one in changes.items()}

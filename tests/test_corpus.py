@@ -139,7 +139,8 @@ def _targets(path: Path, case: Case) -> tuple[str, ...]:
             place = target.target(simbad=False)
             found |= {"ra": place.ra_deg, "dec": place.dec_deg}
         for key, one in wanted.items():
-            assert key == "only" or _same(found[key], one), f"{key} = {found[key]!r}"
+            rtol = 1e-11 if key in ("ra", "dec") else 1e-6
+            assert key == "only" or _same(found[key], one, rtol), f"{key} = {found[key]!r}"
     return ()
 
 
@@ -148,7 +149,7 @@ def _same(found: Any, wanted: Any, rtol: float = 1e-6) -> bool:
     if isinstance(wanted, list):
         return len(found) == len(wanted) and all(_same(*both, rtol) for both in zip(found, wanted, strict=True))
     if isinstance(wanted, float):
-        return found is not None and bool(found == pytest.approx(wanted, rel=rtol, abs=1e-9))
+        return found is not None and bool(found == pytest.approx(wanted, rel=rtol, abs=1e-10))
     return bool(found == (None if wanted == "None" else wanted))
 
 
