@@ -1,14 +1,11 @@
-"""Neighbours in the fibre: closed forms against a sum of spectra, tables of catalogues, and the choice of spectra."""
+"""Neighbours in the fibre: closed forms against a sum of spectra, and the choice of spectra."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-import astropy.units as u
 import numpy as np
 import pytest
-from astropy.table import Table
 from refusals import refused
 
 from mauvecl.host.expectation import Expectation, expect
@@ -108,70 +105,11 @@ def test_missing_values_matter_only_within_the_fibre() -> None:
     seen(STAR, Neighbour("x", 50.0))
 
 
-#: Positions 10 arcsec north and 20 arcsec east of a star at 60 deg declination.
-RA, DEC = 150.0, 60.0
-EAST = 20 / 3600 / np.cos(np.radians(60.0))
-TABLES: dict[str, tuple[dict[str, Any], str | None]] = {
-    "archive": (
-        {"designation": ["Gaia DR3 1", "Gaia DR3 2", "Gaia DR3 3"], "ra": [RA, RA, RA + EAST],
-         "dec": [DEC, DEC + 10 / 3600, DEC], "phot_g_mean_mag": [7.2, 9.0, 12.0], "bp_rp": [0.8, 0.85, 3.0],
-         "teff_gspphot": [5700.0, 5586.0, np.nan]}, "Gaia DR3 1"),
-    "archive by coordinates": (
-        {"source_id": [2, 3], "ra": [RA, RA + EAST], "dec": [DEC + 10 / 3600, DEC], "phot_g_mean_mag": [9.0, 12.0],
-         "bp_rp": [0.85, 3.0]}, f"{RA} +{DEC}"),
-    "web form": (
-        {"source_id": [2, 3], "target_separation (deg)": [10 / 3600, 20 / 3600], "phot_g_mean_mag": [9.0, 12.0],
-         "bp_rp": [0.85, 3.0]}, None),
-    "astroquery": ({"SOURCE_ID": [2, 3], "phot_g_mean_mag": [9.0, 12.0], "bp_rp": [0.85, 3.0],
-                    "dist": [10 / 3600, 20 / 3600]}, None),
-    "VizieR": ({"_r": [10.0, 20.0] * u.arcsec, "Source": [2, 3], "Gmag": [9.0, 12.0] * u.mag,
-                "BP-RP": [0.85, 3.0] * u.mag}, None),
-    "own": ({"name": ["2", "3"], "separation": [10.0, 20.0], "magnitude": [9.0, 12.0], "band": ["G", "Gaia G"],
-             "spectral_type": ["G5V", "M4V"]}, None),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("ending", ["ecsv", "fits", "vot"])
-@pytest.mark.parametrize("name", TABLES)
-def test_tables_of_catalogues_are_read(tmp_path: Path, name: str, ending: str) -> None:
-    columns, target = TABLES[name]
-    path = tmp_path / f"near.{ending}"
-    Table(columns).write(path, **({"format": "votable"} if ending == "vot" else {}))
-    stars, _ = read_neighbours(path, target)
-    assert [one.separation_arcsec for one in stars] == pytest.approx([10.0, 20.0], rel=1e-6)
-    assert [(one.magnitude, one.band) for one in stars] == [(9.0, "Gaia G"), (12.0, "Gaia G")]
-    assert [one.name[-1] for one in stars] == ["2", "3"]
-    assert [one.spectrum[0] for one in stars] == [("G2V", "G5V")[name in ("archive", "own")], "M4V"]
-
-
 def test_rows_may_name_spectrum_files(tmp_path: Path) -> None:
     (tmp_path / "b.txt").write_text("\n".join(f"{nm} 1e-13" for nm in range(180, 751)))
     (tmp_path / "near.csv").write_text("name,separation,file\nB,3,b.txt\n")
     (star,), _ = read_neighbours(tmp_path / "near.csv")
     assert star.source.flux_flam.max() == pytest.approx(1e-13)
-
-
-@pytest.mark.parametrize(
-    ("text", "target", "key", "facts"),
-    [
-        ("name,mag\nB,3\n", None, "neighbours", ("separation", "mag")),
-        ("name,ra,dec\nB,1,2\n", None, "neighbours_of", ("position",)),
-        ("name,ra,dec\nB,1,2\n", "Q", "neighbours_of", ("Q",)),
-        ("name,separation\nB,3\n", "Q", "neighbours_of", ("Q",)),
-        ("name,separation\nB,-3\n", None, "neighbours", ("row 1", "-3")),
-        ("name,separation\nB,wide\n", None, "neighbours", ("row 1", "wide")),
-        ("name,separation,magnitude\nB,3,\nC,,4\n", None, "neighbours", ("row 2", "separation")),
-        ("name,_r\nB,3\n", None, "neighbours", ("_r",)),
-        ("name,separation,magnitude,band\nB,3,4,Q\n", None, "band", ("Q",)),
-        ("name,separation,teff\nB,3,-4\n", None, "neighbours", ("teff", "-4")),
-    ],
-)
-def test_unusable_tables_are_refused(
-    tmp_path: Path, text: str, target: str | None, key: str, facts: tuple[str, ...]
-) -> None:
-    (tmp_path / "near.csv").write_text(text)
-    with refused(key, *facts):
-        read_neighbours(tmp_path / "near.csv", target)
 
 
 def test_star_at_the_same_place_is_pointed_out() -> None:

@@ -1,18 +1,12 @@
-"""Frames from arrays and files: order, gaps, dates, and what is refused."""
+"""Frames from arrays: order, gaps, and faults."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
-import pytest
-from astropy.io import fits
 from astropy.table import Table
 
 from mauvecl.observations.frames import Frames, Reason
-from mauvecl.observations.mapping import FrameMapping
-from mauvecl.observations.reading import frames_of, read_frames
-from tests.refusals import refused
+from mauvecl.observations.reading import frames_of
 
 RNG = np.random.default_rng(29)
 TIME = np.arange(100) * 20.0
@@ -46,46 +40,6 @@ def test_faults_of_the_file_are_reasons() -> None:
     assert [Reason.words(int(faults[k])) for k in (3, 5, 7)] == ["not finite", "not finite", "quality"]
 
 
-def _table() -> Table:
-    table = Table({"t": TIME / 86_400, "f": FLUX, "e": ERROR, "ok": np.zeros(100, int)})
-    table["t"].unit = "d"
-    return table
-
-
-def test_csv_ecsv_and_fits_give_the_same_frames(tmp_path: Path) -> None:
-    table = _table()
-    table.write(tmp_path / "a.csv")
-    table.write(tmp_path / "a.ecsv")
-    table.write(tmp_path / "a.fits")
-    mapping = FrameMapping(time="t", time_unit="d", flux="f", error="e", quality="ok", epoch="btjd", scale="tdb")
-    every = [read_frames(tmp_path / f"a.{end}", mapping) for end in ("csv", "ecsv", "fits")]
-    for frames in every:
-        np.testing.assert_allclose(frames.time_s, TIME, atol=1e-6)
-        np.testing.assert_allclose(frames.flux, FLUX)
-        assert frames.scale == "tdb"
-        assert frames.reference_mjd == pytest.approx(56_999.5)
-
-
-def test_light_curves_of_tess_and_kepler_need_no_mapping(tmp_path: Path) -> None:
-    columns = [
-        fits.Column("TIME", "D", "BJD - 2457000, days", array=TIME / 86_400 + 1500),
-        fits.Column("SAP_FLUX", "E", "e-/s", array=FLUX + 1),
-        fits.Column("PDCSAP_FLUX", "E", "e-/s", array=FLUX),
-        fits.Column("PDCSAP_FLUX_ERR", "E", "e-/s", array=ERROR),
-        fits.Column("QUALITY", "J", array=np.arange(100) == 9),
-    ]
-    hdu = fits.BinTableHDU.from_columns(columns, name="LIGHTCURVE")
-    primary = fits.PrimaryHDU()
-    primary.header["OBJECT"] = "TIC 1"
-    hdu.header.update({"BJDREFI": 2457000, "BJDREFF": 0.0, "TIMESYS": "TDB", "TREFPOS": "BARYCENTER"})
-    fits.HDUList([primary, hdu]).writeto(tmp_path / "tess.fits")
-    frames = read_frames(tmp_path / "tess.fits")
-    assert (frames.name, frames.scale, frames.position) == ("TIC 1", "tdb", "BARYCENTER")
-    assert frames.reference_mjd == pytest.approx(58_499.5)
-    np.testing.assert_allclose(frames.flux, FLUX, rtol=1e-6)
-    assert np.flatnonzero(frames.faults).tolist() == [9]
-
-
 def test_the_errors_are_those_of_the_chosen_flux() -> None:
     """A light curve that lightkurve exports has its own flux next to those of the mission."""
     ones = np.ones(30)
@@ -96,8 +50,3 @@ def test_the_errors_are_those_of_the_chosen_flux() -> None:
     frames = frames_of(Table({name: columns[name] for name in columns if name != "flux"}, units={"time": "s"}))
     assert frames.error is not None
     assert (frames.flux[0], frames.error[0]) == (2.0, 3.0)
-
-
-def test_an_unknown_time_scale_of_a_mapping_is_refused() -> None:
-    with refused("scale", "martian"):
-        FrameMapping(time="time", flux="flux", scale="martian")

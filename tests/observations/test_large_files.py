@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
-from layouts import LAYOUTS, Truth
+from layouts import Truth, row_per_frame
 
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.observations.reading import read_frames, reduce_frames
@@ -116,7 +116,7 @@ def test_pieces_give_what_the_whole_gives(tmp_path: Path, monkeypatch: pytest.Mo
     truth = Truth.of(n=1500, n_pixel=50)
     flux = truth.flux.copy()
     flux[:, 4], flux[11, 5] = np.nan, np.nan
-    path, mapping = LAYOUTS["FITS table, row per frame"](Truth(**(vars(truth) | {"flux": flux})), tmp_path)
+    path, mapping = row_per_frame(Truth(**(vars(truth) | {"flux": flux})), tmp_path)
     whole = read_frames(path, mapping)
     monkeypatch.setattr("mauvecl.host.tables.table.PIECE_BYTES", 8 * 50 * 400)
     monkeypatch.setattr("mauvecl.host.tables.fits_tables.PIECE_BYTES", 0)

@@ -1,4 +1,4 @@
-"""Invalid frames, files, mappings and questions about them raise an InputError that names the key."""
+"""Invalid frames and questions about them raise an InputError that names the key."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from astropy.io import fits
-from astropy.table import QTable, Table
-from layouts import LAYOUTS, Truth
+from astropy.table import QTable
+from corpus import CORPUS, mapping_of, written
+from corpus import cases as files
 from refusals import refused
 
 from mauvecl import Study, calibrate, change
@@ -22,7 +22,7 @@ from mauvecl.observations.changes.periods import visit_times_d
 from mauvecl.observations.frames import Frames
 from mauvecl.observations.line_index import MG_II_CONTINUUM_NM, MG_II_NM, line_index
 from mauvecl.observations.mapping import FrameMapping
-from mauvecl.observations.reading import frames_of, read_frames, reduce_frames
+from mauvecl.observations.reading import frames_of, reduce_frames
 from mauvecl.study.cases import cases
 
 TIME = np.arange(100) * 20.0
@@ -99,59 +99,8 @@ def test_bad_input_raises(name: str) -> None:
         call()
 
 
-def table(folder: Path, **changed: Any) -> object:
-    Table({"t": TIME / 86_400, "f": FLUX}).write(folder / "a.csv")
-    given: dict[str, Any] = {"time": "t", "time_unit": "d", "flux": "f"}
-    return read_frames(folder / "a.csv", FrameMapping(**(given | changed)))
-
-
-def header(folder: Path, key: str, value: Any) -> object:
-    hdu = fits.table_to_hdu(Table({"TIME": TIME, "FLUX": FLUX}))
-    hdu.header.update({"TIMEUNIT": "s", key: value})
-    hdu.writeto(folder / "a.fits")
-    return read_frames(folder / "a.fits")
-
-
-def mapping(folder: Path, text: str) -> object:
-    (folder / "m.toml").write_text(text)
-    return FrameMapping.read(folder / "m.toml")
-
-
-def content(folder: Path, written: bytes) -> object:
-    (folder / "a.csv").write_bytes(written)
-    return read_frames(folder / "a.csv")
-
-
-def weighted(folder: Path) -> object:
-    path, how = LAYOUTS["long CSV"](Truth.of(), folder)
-    return reduce_frames(path, np.ones((1, 5)), how)
-
-
-FILES: dict[str, tuple[Callable[[Path], object], str]] = {
-    "no column of times": (lambda folder: table(folder, time="x"), "column"),
-    "no column of light": (lambda folder: table(folder, flux="x"), "column"),
-    "times without a unit": (lambda folder: table(folder, time_unit=None), "time_unit"),
-    "times in parsec": (lambda folder: table(folder, time_unit="parsec"), "time_unit"),
-    "an epoch of yesterday": (lambda folder: table(folder, epoch="yesterday"), "epoch"),
-    "two columns of times and an exposure": (
-        lambda folder: table(folder, exposure_s=5.0, time=("t", "t")), "exposure"),
-    "an unknown key of a mapping": (
-        lambda folder: mapping(folder, 'time = "t"\nflux = "f"\nfluxunit = "Jy"\n'), "fluxunit"),
-    "a reference that is no date": (lambda folder: header(folder, "MJDREF", "new"), "MJDREF"),
-    "a time beyond the frame": (lambda folder: header(folder, "TIMEPIXR", 3.0), "TIMEPIXR"),
-    "an offset that is no number": (lambda folder: header(folder, "TIMEOFFS", "x"), "TIMEOFFS"),
-    "a reference that is true": (lambda folder: header(folder, "MJDREFI", True), "MJDREFI"),
-    "an empty file": (lambda folder: content(folder, b""), "file"),
-    "a part of a FITS file": (lambda folder: content(folder, b"SIMPLE  ="), "file"),
-    "columns of other names": (lambda folder: content(folder, b"a,b\n1,2\n"), "mapping"),
-    "bytes": (lambda folder: content(folder, b"\x00\xff" * 50), "file"),
-    "a time without a unit": (lambda folder: content(folder, b"time,flux\n1,x\n2,y\n"), "time_unit"),
-    "weights of other pixels": (weighted, "weights"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_bad_file_raises(name: str, tmp_path: Path) -> None:
-    call, key = FILES[name]
-    with refused(key):
-        call(tmp_path)
+def test_weights_of_other_pixels_are_refused(tmp_path: Path) -> None:
+    name = "row per pixel, with units in the mapping Angstrom s csv"
+    case = dict(files(CORPUS / "frames_of_spectra.toml"))[f"frames_of_spectra {name}"]
+    with refused("weights"):
+        reduce_frames(written(case, tmp_path), np.ones((1, 4)), FrameMapping.read(mapping_of(case, tmp_path)))

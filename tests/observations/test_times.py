@@ -18,7 +18,6 @@ from mauvecl.host.orbit.targets import Target
 from mauvecl.host.orbit.time_grid import TimeGrid
 from mauvecl.observations.barycentre import barycentric
 from mauvecl.observations.frames import Frames
-from mauvecl.observations.mapping import FrameMapping
 from mauvecl.observations.reading import read_frames
 
 RNG = np.random.default_rng(29)
@@ -101,38 +100,6 @@ def test_barycentric_times_stay_as_they_are() -> None:
     assert "barycentric already" in again.remarks[-1]
 
 
-#: Keywords of a header, and the MJD of time zero, the scale, the place, and seconds added to each time.
-KEYWORDS: list[tuple[dict[str, Any], float | None, str, str, float]] = [
-    ({"MJDREFI": 61000, "MJDREFF": 0.25, "TIMESYS": "TT", "TREFPOS": "GEOCENTER"}, 61_000.25, "tt", "GEOCENTER", 0),
-    ({"MJDREF": 61000.5}, 61_000.5, "utc", "", 0),
-    ({"JDREF": 2461000.5, "TIMESYS": "TAI"}, 61_000.0, "tai", "", 0),
-    ({"JDREFI": 2461000, "JDREFF": 0.5, "TIMESYS": "IAT"}, 61_000.0, "tai", "", 0),
-    ({"BJDREFI": 2457000, "TIMESYS": "TDB", "TIMEREF": "SOLARSYSTEM"}, 56_999.5, "tdb", "BARYCENTER", 0),
-    ({"MJDREF": 61000, "TIMESYS": "UTC(NIST)"}, 61_000.0, "utc", "", 0),
-    ({"MJDREF": 61000, "TIMESYS": "TDT"}, 61_000.0, "tt", "", 0),
-    ({"MJDREF": 61000, "TIMESYS": "ET", "TREFPOS": "topocenter"}, 61_000.0, "tt", "TOPOCENTER", 0),
-    ({"MJDREF": 61000, "TIMEOFFS": 7.5}, 61_000.0, "utc", "", 7.5),
-    ({"MJDREF": 61000, "TIMEPIXR": 0.0}, 61_000.0, "utc", "", 15.0),
-    ({"MJDREF": 61000, "TIMEPIXR": 1.0}, 61_000.0, "utc", "", -15.0),
-    ({"TIMESYS": "TDB"}, None, "tdb", "", 0),
-    ({}, None, "", "", 0),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("keywords", "mjd", "scale", "position", "shift_s"), KEYWORDS)
-def test_time_keywords_of_fits_are_read(
-    tmp_path: Path, keywords: dict[str, Any], mjd: float | None, scale: str, position: str, shift_s: float
-) -> None:
-    hdu = fits.table_to_hdu(Table({"TIME": TIME, "FLUX": FLUX}))
-    hdu.header.update(keywords | {"TIMEUNIT": "s"})
-    hdu.writeto(tmp_path / "a.fits")
-    frames = read_frames(tmp_path / "a.fits")
-    assert (frames.scale, frames.position) == (scale, position)
-    zero = 0.0 if frames.reference_mjd is None or mjd is None else (frames.reference_mjd - mjd) * 86_400
-    np.testing.assert_allclose(frames.time_s + zero, TIME + shift_s, atol=2e-5)
-    assert (frames.reference_mjd is None) == (mjd is None)
-
-
 @pytest.mark.parametrize("ending", ["csv", "fits"])
 @pytest.mark.parametrize("word", ["", "null", "N/A", "--", "NaT", "None", "<NA>", "masked"])
 def test_frames_without_a_date_are_left_out(word: str, ending: str, tmp_path: Path) -> None:
@@ -143,27 +110,6 @@ def test_frames_without_a_date_are_left_out(word: str, ending: str, tmp_path: Pa
     frames = read_frames(tmp_path / f"dates.{ending}")
     assert frames.flux.tolist() == [float(k) for k in range(24) if k != 3]
     np.testing.assert_allclose(np.diff(frames.time_s), [2.0, 2.0, 4.0, *[2.0] * 19], atol=1e-4)
-
-
-def test_dates_are_times(tmp_path: Path) -> None:
-    dates = Time(61_000.0 + TIME / 86_400, format="mjd", scale="tdb").isot
-    Table({"when": dates, "flux": FLUX}).write(tmp_path / "a.csv")
-    frames = read_frames(tmp_path / "a.csv", FrameMapping(time="when", flux="flux", scale="tdb"))
-    assert frames.reference_mjd == pytest.approx(61_000 + 15 / 86_400, abs=1e-9)
-    np.testing.assert_allclose(frames.time_s, TIME - 15, atol=2e-3)
-    frames = read_frames(tmp_path / "a.csv", FrameMapping(time="when", flux="flux"))
-    assert frames.scale == "utc"
-    assert "assumed to be in UTC" in frames.remarks[0]
-
-
-@pytest.mark.parametrize("ending", ["fits", "ecsv"])
-def test_columns_of_astropys_times_are_read(tmp_path: Path, ending: str) -> None:
-    when = Time(61_000.0, TIME / 86_400, format="mjd", scale="tdb")
-    Table({"time": when, "flux": FLUX}).write(tmp_path / f"a.{ending}")
-    frames = read_frames(tmp_path / f"a.{ending}")
-    assert frames.scale == "tdb"
-    assert frames.reference_mjd == pytest.approx(61_000 + 15 / 86_400, abs=1e-9)
-    np.testing.assert_allclose(frames.time_s, TIME - 15, atol=2e-5)
 
 
 @pytest.mark.long

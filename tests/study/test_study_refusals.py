@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 from refusals import refused
 
-from mauvecl.study.orbits import read_targets
 from mauvecl.study.study import Study
 
 LONG = "{{quantity='{}', start=10, stop=20, steps=900}}"
@@ -126,23 +125,3 @@ def test_two_temperatures_of_a_photosphere_raise() -> None:
             },
             "test",
         )
-
-
-@pytest.mark.parametrize(
-    ("text", "key"),
-    [
-        ("name,ra,dec\nnew,nan,nan\n", "ra"),
-        ("nom\na\n", "name"),
-        ("name\n", "name"),
-        ("name,ra\neps Eri,10\n", "coordinates"),
-        ("name,ra,dec\nnew,10,5\nother,ten,5\n", "ra"),
-        ("name,alpha\neps Eri,2\n", "alpha"),
-        ("name,rates,mass_msun,age_myr\neps Eri,K,0.8,500\n", "rates"),
-        ("name,V\neps Eri,3.7\nAU Mic,bright\n", "magnitude"),
-        ("name,distance_pc\neps Eri,-3\n", "distance_pc"),
-    ],
-)
-def test_bad_tables_of_targets_raise(tmp_path: Any, text: str, key: str) -> None:
-    (tmp_path / "targets.csv").write_text(text)
-    with refused(key):
-        read_targets(tmp_path / "targets.csv")

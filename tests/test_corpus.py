@@ -1,0 +1,198 @@
+"""Files of every kind are read as their entry in the corpus says, or refused in one sentence that helps.
+
+The entries are in data/corpus, whose README says what they may hold; those of stored files are beside the files.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+import astropy.units as u
+import corpus
+import numpy as np
+import pytest
+from corpus import CORPUS, Case, cases, mapping_of, value, written
+from refusals import refused
+
+from mauvecl import Source, read_frames
+from mauvecl.host.neighbour_table import read_neighbours
+from mauvecl.host.spectra.formats import read_spectrum
+from mauvecl.host.stars.flare_table import read_flares
+from mauvecl.observations.frames import Reason
+from mauvecl.study.orbits import PlanTarget, read_targets
+
+# Astropy warns of the usual units when it writes a VOTable.
+pytestmark = pytest.mark.filterwarnings("ignore:The unit .* has been deprecated in the VOUnit standard")
+
+STORED = [CORPUS.parent / folder / "expected.toml" for folder in ("cases", "light_curves")]
+CASES = [one for path in (*sorted(CORPUS.glob("*.toml")), *STORED) for one in cases(path)]
+
+
+def _spectrum(path: Path, case: Case) -> tuple[str, ...]:
+    star = Source.read(f"{path}{case.get('part', '')}", **case.get("options", {}))
+    for text, start in zip(star.messages, case.get("messages", star.messages), strict=True):
+        assert text.startswith(start)
+    assert star.messages[0] == case.get("first", star.messages[0])
+    assert case.get("star", star.name) == star.name
+    if (expected := case.get("nm", "nm")) != "":
+        nm, flux = value(expected), value(case.get("flux", "flux"))
+        rows, rtol = value(case.get("inside", "every")), case.get("rtol", 1e-8)
+        np.testing.assert_allclose(star.wavelength_nm[rows], nm[rows] if nm.size > 1 else nm, rtol=rtol)
+        scale = (star.flux_flam[100], flux[100]) if case.get("relative") else (1.0, 1.0)
+        np.testing.assert_allclose(star.flux_flam / scale[0], flux / scale[1], rtol=case.get("flux_rtol", rtol))
+    return (*star.messages, *star.notes)
+
+
+def _frames(path: Path, case: Case) -> tuple[str, ...]:
+    frames = read_frames(path, mapping_of(case, path.parent), **case.get("options", {}))
+    rows = value(case.get("kept", "every"))
+    time, flux = value(case.get("time", "t"))[rows], value(case.get("light", "light"))[rows]
+    assert (frames.reference_mjd is None) == ("mjd" not in case)
+    if frames.reference_mjd is not None:
+        first = frames.reference_mjd + frames.time_s[0] / 86_400
+        assert first == pytest.approx(value(case["mjd"]), abs=case.get("days", 1e-8))
+        np.testing.assert_allclose(frames.time_s - frames.time_s[0], time - time[0], atol=case.get("atol", 1e-3))
+    else:
+        np.testing.assert_allclose(frames.time_s, time, atol=1e-4)
+    faults = {str(k): Reason(int(frames.faults[k])).name for k in np.flatnonzero(frames.faults)}
+    assert faults == case.get("faults", {})
+    good = np.ones(frames.n_frames, bool) if case.get("pixels") else frames.faults == 0
+    np.testing.assert_allclose(frames.flux[good], flux[good], rtol=case.get("rtol", 1e-9))
+    if frames.wavelength_nm is not None and "nm" in case:
+        found = frames.wavelength_nm[value(case.get("inside", "every"))]
+        np.testing.assert_allclose(found, value(case["nm"]), rtol=case.get("rtol", 1e-9))
+    if case.get("error"):
+        assert frames.error is not None
+        np.testing.assert_allclose(frames.error[good], value(case["error"])[rows][good], rtol=1e-6)
+    for key in {"scale", "position"} & set(case):
+        assert getattr(frames, key) == case[key]
+    assert "unit" not in case or u.Unit(frames.unit) == u.Unit(case["unit"])
+    if case.get("quality"):
+        np.testing.assert_array_equal(frames.quality, value(case["quality"]))
+    if "exposure" in case:
+        np.testing.assert_allclose(frames.exposure_s, value(case["exposure"]))
+    assert case.get("star", frames.name) == frames.name
+    if "temperature" in case:
+        np.testing.assert_allclose(frames.temperature_c, value(case["temperature"]), rtol=1e-6)
+    assert case.get("says") or len(frames.remarks) == case.get("remarks", len(frames.remarks)), frames.remarks
+    return frames.remarks
+
+
+def _summary(path: Path, case: Case) -> tuple[str, ...]:
+    """Read frames of a stored file, of which numbers are known instead of arrays."""
+    frames = read_frames(path, mapping_of(case, path.parent), **case.get("options", {}))
+    assert frames.n_frames == case["frames"]
+    assert case.get("dated", True) == (frames.reference_mjd is not None) or "mjd" not in case
+    if "mjd" in case:
+        assert frames.reference_mjd is not None
+        # A millisecond and a half, as files with eight decimals of a day have.
+        assert frames.reference_mjd + frames.time_s[0] / 86_400 == pytest.approx(case["mjd"], abs=2e-8)
+    assert frames.scale == case.get("scale", frames.scale)
+    assert frames.mission == case.get("mission", frames.mission)
+    assert frames.cadence_s == pytest.approx(case.get("cadence_s", frames.cadence_s), abs=1e-3)
+    median = float(np.nanmedian(frames.flux))
+    assert median == pytest.approx(case.get("median", median), rel=1e-3)
+    assert "error" not in case or np.median(frames.error) == pytest.approx(case["error"])
+    flagged = np.flatnonzero(frames.faults & Reason.QUALITY)
+    assert flagged.tolist() == case.get("flagged", flagged.tolist())
+    assert flagged.size == case.get("flagged_count", flagged.size)
+    usable = frames.flux[frames.faults == 0]
+    assert "flares_above" not in case or usable.max() - np.median(usable) > case["flares_above"]
+    return frames.remarks
+
+
+def _points(path: Path, case: Case) -> tuple[str, ...]:
+    """Read a spectrum that may be short or undefined in part, and compare it at some wavelengths."""
+    found = read_spectrum(Path(f"{path}{case.get('part', '')}"), **case.get("options", {}))
+    assert "law" in case or "nm" in case
+    bad = found.wavelength_nm[~np.isfinite(found.flux_flam)]
+    np.testing.assert_allclose(bad, case.get("undefined_nm", []))
+    if "span_nm" in case:
+        np.testing.assert_allclose(found.wavelength_nm[[0, -1]], case["span_nm"], atol=0.01)
+    if "law" in case:
+        law = value(case["law"], nm=found.wavelength_nm)
+        np.testing.assert_allclose(found.flux_flam, law, rtol=case["rtol"])
+        assert (np.diff(found.wavelength_nm) > 0).all()
+    if "wave" in case:
+        np.testing.assert_allclose(found.wavelength_nm, value(case["wave"]), rtol=1e-5)
+    assert case.get("star", found.name) == found.name
+    for text, start in zip(found.messages, case.get("messages", found.messages), strict=True):
+        assert text.startswith(start)
+    for nm, flux in zip(case.get("nm", ()), case.get("flux", ()), strict=True):
+        at = int(np.argmin(np.abs(found.wavelength_nm - nm)))
+        assert found.wavelength_nm[at] == pytest.approx(nm, abs=1e-4)
+        assert found.flux_flam[at] == pytest.approx(flux, rel=case.get("rtol", 1e-5))
+    return found.messages
+
+
+def _targets(path: Path, case: Case) -> tuple[str, ...]:
+    targets = [PlanTarget.model_validate(one) for one in read_targets(path)]
+    for target, wanted in zip(targets, case["targets"], strict=True):
+        found = target.model_dump()
+        assert wanted.get("only", [*target.model_fields_set]) == [*target.model_fields_set]
+        if "ra" in wanted:
+            place = target.target(simbad=False)
+            found |= {"ra": place.ra_deg, "dec": place.dec_deg}
+        for key, one in wanted.items():
+            rtol = 1e-11 if key in ("ra", "dec") else 1e-6
+            assert key == "only" or _same(found[key], one, rtol), f"{key} = {found[key]!r}"
+    return ()
+
+
+def _same(found: Any, wanted: Any, rtol: float = 1e-6) -> bool:
+    """Compare with a value of TOML, which has lists and, here, the word None."""
+    if isinstance(wanted, list):
+        return len(found) == len(wanted) and all(_same(*both, rtol) for both in zip(found, wanted, strict=True))
+    if isinstance(wanted, float):
+        return found is not None and bool(found == pytest.approx(wanted, rel=rtol, abs=1e-10))
+    return bool(found == (None if wanted == "None" else wanted))
+
+
+def _neighbours(path: Path, case: Case) -> tuple[str, ...]:
+    stars, notes = read_neighbours(path, case.get("of") or None)
+    for key, wanted in case["stars"].items():
+        how = {"type": lambda star: star.spectrum[0], "last": lambda star: star.name[-1]}
+        found = [how.get(key, attrgetter(key))(star) for star in stars]
+        assert _same(found, wanted, case.get("rtol", 1e-6)), f"{key} = {found}"
+    return notes
+
+
+def _flares(path: Path, case: Case) -> tuple[str, ...]:
+    np.testing.assert_array_equal(read_flares(path)["amplitude"], case["amplitudes"])
+    return ()
+
+
+READERS: dict[str, Callable[[Path, Case], tuple[str, ...]]] = {
+    "spectrum": _spectrum, "points": _points, "frames": _frames, "summary": _summary, "targets": _targets,
+    "neighbours": _neighbours, "flares": _flares,
+}  # fmt: skip
+
+
+def test_keys_of_entries_are_known() -> None:
+    """Refuse an expectation whose key is spelt wrong, which would expect nothing."""
+    known = set(re.findall(r"[\"'](\w+)[\"']", "".join(Path(file).read_text() for file in (__file__, corpus.__file__))))
+    assert sorted({key for _, case in CASES for key in case} - known) == []
+
+
+@pytest.mark.parametrize("case", [pytest.param(case, id=name) for name, case in CASES])
+def test_files_are_read_as_they_say(case: Case, tmp_path: Path) -> None:
+    path = written(case, tmp_path)
+    with warnings.catch_warnings():
+        # What a reading has to say it says in remarks.
+        warnings.simplefilter("error")
+        if not case.get("refused"):
+            said = READERS[case["reader"]](path, case)
+            assert all(any(word in text for text in said) for word in case.get("says", ())), said
+        else:
+            key, *words = case["refused"]
+            with refused(key, *words, expected=case.get("expected")) as caught:
+                READERS[case["reader"]](path, case)
+            said = (str(caught.value),)
+            assert 20 < len(said[0]) < case.get("longest", 400 if case["reader"] == "spectrum" else 600)
+            assert not any(word in said[0] for word in ("Error", "HDU"))
+    assert not any(word in text for text in said for word in case.get("without", ())), said
