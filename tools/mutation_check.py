@@ -379,15 +379,15 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     # Readers.
     "dates of TESS from noon": (
-        "test_csv_ecsv_and_fits_give_the_same_frames",
+        "test_files_are_read_as_they_say[times unit btjd 1000 + (t - 100) / 14400 fits]",
         ('"btjd": 56_999.5,\n    "bkjd"', '"btjd": 57_000.0,\n    "bkjd"'),
     ),
     "starts of frames taken for their ends": (
-        "test_time_keywords_of_fits_are_read[keywords9-61000.0-utc--15.0]",
+        "test_files_are_read_as_they_say[times keywords of scale and place fits9]",
         ("made.shifted((0.5 - dates.at) * made.exposure_s)", "made.shifted((dates.at - 0.5) * made.exposure_s)"),
     ),
     "days taken for seconds": (
-        "test_csv_ecsv_and_fits_give_the_same_frames",
+        "test_files_are_read_as_they_say[extensions names that need no mapping fits1]",
         ("np.asarray(((time - first) * unit).to_value(u.s)), ", "np.asarray(time - first), "),
     ),
     "light that reaches the barycentre earlier": (
@@ -395,22 +395,22 @@ MUTATIONS: dict[str, Mutation] = {
         ("(when.tdb - first).to_value(u.s) + late", "(when.tdb - first).to_value(u.s) - late"),
     ),
     "wavelengths shorter in vacuum": (
-        "test_air_becomes_vacuum_where_the_file_says_air",
+        "test_files_are_read_as_they_say[media keyword AIRORVAC air txt]",
         ("vacuum[there] = air_nm[there] * index", "vacuum[there] = air_nm[there] / index"),
     ),
     "air in a unit overlooked": (
-        "test_air_becomes_vacuum_where_the_file_says_air",
+        "test_files_are_read_as_they_say[media unit Angstrom air 10 fits]",
         (
             'return match[1] or None, "air" if match[2].lower() == "air" else "vacuum"',
             'return match[1] or None, "vacuum"',
         ),
     ),
     "fluxes in the order of frequencies": (
-        "test_frequencies_may_rise_or_fall[order1]",
+        "test_files_are_read_as_they_say[spectrum_files text with its units txt11]",
         ("_in_flam(kept, nm, flux)[order]", "_in_flam(kept, nm, flux)"),
     ),
     "fluxes per nm": (
-        "test_flux_units_as_archives_spell_them[FLAM]",
+        "test_files_are_read_as_they_say[media keyword AIRORVAC air txt]",
         ("flam = u.erg / (u.s * u.cm**2 * u.AA)\n    with", "flam = u.erg / (u.s * u.cm**2 * u.nm)\n    with"),
     ),
     "errors of another flux": (
@@ -426,7 +426,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("uncertainty.represent_as(StdDevUncertainty).array", "uncertainty.array"),
     ),
     "quality flags without effect": (
-        "test_light_curves_of_tess_and_kepler_need_no_mapping",
+        "test_files_are_read_as_they_say[extensions light curve of TESS fits]",
         ("np.asarray(quality, np.int64) & self.mask) != 0", "np.asarray(quality, np.int64) & self.mask) < 0"),
     ),
     # Calibration, changes of throughput and colour.
