@@ -92,6 +92,7 @@ def test_joint_fits_marginalise_what_a_stare_does_not_know(changes: dict[str, di
     assert (np.array(plain)[:, columns[1]] ** 2).mean() > 4.0
 
 
+@pytest.mark.long
 def test_bins_marginalise_what_a_stare_does_not_know() -> None:
     """Fit bins of 20 stares with an unknown level of all light.
 

@@ -79,6 +79,7 @@ def test_intervals_of_the_fitted_equivalent_duration_cover(threshold: float) -> 
     assert stats.binom.ppf(0.0005, number, 0.6827) <= inside <= stats.binom.ppf(0.9995, number, 0.6827)
 
 
+@pytest.mark.long
 def test_long_flares_are_fitted_in_bins_with_the_same_result(threshold: float, monkeypatch: pytest.MonkeyPatch) -> None:
     survey = survey_of(light_curve(np.random.default_rng(298), LEVEL * (1 + 0.05 * flare(15_000, 3000))))
     found, taken = detect_events(survey, threshold)
@@ -166,6 +167,7 @@ def test_single_frames_and_dips_are_flagged_and_a_flare_of_three_frames_is_not()
     assert {int(k): int(reasons[k]) for k in np.flatnonzero(reasons)} == {100: Reason.SPIKE, 200: Reason.BELOW}
 
 
+@pytest.mark.long
 def test_the_level_follows_rotation_and_the_noise_does_not() -> None:
     rng = np.random.default_rng(294)
     time = np.arange(8000) * 120.0

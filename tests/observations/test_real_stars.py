@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from marks import long_but
 from numpy.typing import NDArray
 from scenes import flare
 from scipy import stats
@@ -219,7 +220,9 @@ def test_table_of_events_has_the_flare_in_its_units() -> None:
     assert [row["ed_fit_low"], row["ed_fit_high"]] == [row["ed_low"], row["ed_high"]]
 
 
-@pytest.mark.parametrize(("after_s", "half_width_s", "seed"), [(60.0, 40.0, 1), (40.0, 40.0, 2), (50.0, 30.0, 3)])
+@pytest.mark.parametrize(
+    ("after_s", "half_width_s", "seed"), long_but([(60.0, 40.0, 1), (40.0, 40.0, 2), (50.0, 30.0, 3)], (60.0, 40.0, 1))
+)
 def test_window_that_begins_in_a_tail_has_the_energy_relative_to_the_star(
     after_s: float, half_width_s: float, seed: int
 ) -> None:
@@ -237,6 +240,7 @@ def test_window_that_begins_in_a_tail_has_the_energy_relative_to_the_star(
     assert abs(event.energy.fitted_s - right) < 0.1 * right
 
 
+@pytest.mark.long
 def test_faint_star_with_a_great_flare_has_its_energy() -> None:
     """340 frames of mean 30.4 and noise 5.5, amplitude 120: the error is that of the level, to which it is relative."""
     rng = np.random.default_rng(403)
@@ -248,6 +252,7 @@ def test_faint_star_with_a_great_flare_has_its_energy() -> None:
     assert 0.005 < error / event.energy.fitted_s < 0.03
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("period_d", "cadence_s", "noise"), [(1.0, 120.0, 1e-4), (3.0, 1800.0, 1e-4)])
 def test_rotation_is_no_flare(period_d: float, cadence_s: float, noise: float) -> None:
     """Sinusoids of 1 % at one false alarm a century: fails by chance once in 2000 times or less."""
@@ -260,7 +265,7 @@ def test_rotation_is_no_flare(period_d: float, cadence_s: float, noise: float) -
     assert float(np.median(analysis.level.error)) == pytest.approx(noise, rel=0.1)
 
 
-@pytest.mark.parametrize("name", ["fast-2min", "slow-30min"])
+@pytest.mark.parametrize("name", [pytest.param("fast-2min", marks=pytest.mark.long), "slow-30min"])
 def test_files_of_rotating_stars_have_no_flare(name: str) -> None:
     analysis = analyse_frames(read_frames(CASES / "rotating-star" / f"{name}.fits"), false_alarms=0.01, per="year")
     assert not detected(analysis)
@@ -302,6 +307,7 @@ def test_edges_of_a_transit_are_no_flares_and_flares_of_its_star_are() -> None:
         assert one.energy.low_s[1] < truth < one.energy.high_s[1]
 
 
+@pytest.mark.long
 def test_files_that_once_failed_have_an_answer() -> None:
     folder = CASES / "analyse-fault"
     assert analyse_frames(read_frames(folder / "flaring-rotator-1.fits")).events

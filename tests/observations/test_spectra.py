@@ -211,6 +211,7 @@ def test_cosmic_rays_are_replaced_and_counted_and_flares_are_not() -> None:
     assert np.median(left) < 2.0
 
 
+@pytest.mark.long
 def test_saturated_pixels_and_missing_errors_of_raw_frames_are_stated() -> None:
     rng = np.random.default_rng(304)
     quiet = model().quiet
