@@ -110,12 +110,13 @@ class _Reader:
         header = hdu.header
         if text_at(header, "ZIMAGE") == "True":
             raise InputError("holds a compressed image", "a table with WAVELENGTH and FLUX", key="table", value=number)
-        # The unit of the file applies to the flux if its column states none (SDSS).
+        # The unit of the file applies to flux and model if their columns state none (SDSS).
         whole = text_at(self.primary, "BUNIT") or text_at(header, "BUNIT") or None
         columns = []
         for k, column in enumerate(hdu.columns):
             unit = (column.unit or "").strip() or None
-            if unit is None and role_of(str(column.name)).kind == "flux" and role_of(str(column.name)).unit is None:
+            role = role_of(str(column.name))
+            if unit is None and role.kind in ("flux", "model") and role.unit is None:
                 unit = whole
             columns.append(Column(str(column.name), _reader(hdu, column), unit, text_at(header, f"TUCD{k + 1}")))
         ucds = " ".join(column.ucd for column in columns if column.ucd)
