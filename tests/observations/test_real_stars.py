@@ -220,6 +220,17 @@ def test_table_of_events_has_the_flare_in_its_units() -> None:
     assert [row["ed_fit_low"], row["ed_fit_high"]] == [row["ed_low"], row["ed_high"]]
 
 
+def test_probability_of_an_event_is_that_of_the_larger_rate() -> None:
+    """Search white noise for 30 events a day, whose rates by the process and by measured residuals differ."""
+    rng = np.random.default_rng(407)
+    frames = Frames.of(np.arange(3000) * 60.0, 1 + 1e-3 * rng.standard_normal(3000), np.full(3000, 1e-3))
+    analysis = analyse_frames(frames, false_alarms=30.0, per="day")
+    events = AnalyseAnswer(Study(), analysis).events
+    rates = np.array([events["rate_normal"].to_value("1 / d"), events["rate_measured"].to_value("1 / d")])
+    assert (rates[0] != rates[1]).any()
+    np.testing.assert_allclose(events["probability"], -np.expm1(-rates.max(axis=0) * analysis.days), rtol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("after_s", "half_width_s", "seed"), long_but([(60.0, 40.0, 1), (40.0, 40.0, 2), (50.0, 30.0, 3)], (60.0, 40.0, 1))
 )
