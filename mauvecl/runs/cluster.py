@@ -242,7 +242,12 @@ class DaskWorkers:
         try:
             if sent.status == "finished":
                 try:
-                    answer = sent.result()
+                    answer = _result(sent)
+                except _LostError:
+                    with self._lock:
+                        self._given.pop(task.key, None)
+                    self._again(attempt)
+                    return
                 except OSError as broken:
                     # The connection may break between the end of a shard and the transfer of its counts.
                     awaited.set_exception(self._gone().with_traceback(broken.__traceback__))
@@ -293,6 +298,24 @@ class DaskWorkers:
         self._closing = True
         self._given.clear()
         self._open.close()
+
+
+class _LostError(Exception):
+    """The worker of a finished shard has left before its counts were transferred."""
+
+
+def _result(sent: DaskFuture[Any]) -> Any:
+    """Return the result of a finished task; raise `_LostError` if its worker has left with it.
+
+    Dask would wait until the task is repeated, which never happens if all workers that may do so have left; it calls
+    the functions of all finished tasks in one thread, so that every other shard would wait, too.
+    """
+    while True:
+        try:
+            return sent.result(timeout=RECOUNT_S)
+        except TimeoutError:
+            if sent.status != "finished":
+                raise _LostError from None
 
 
 @contextlib.contextmanager

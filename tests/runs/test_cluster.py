@@ -358,6 +358,41 @@ def test_shards_whose_workers_have_left_are_sent_to_others(
     same(found, engine.detect(quiet, flares, realisations=150_000, seed=6))
 
 
+class LeftWithItsResult:
+    """A finished task whose worker leaves while the result is transferred."""
+
+    status = "finished"
+    asked = 0
+
+    def result(self, timeout: float) -> None:
+        self.asked += 1
+        self.status = "finished" if self.asked < 3 else "lost"
+        raise TimeoutError
+
+
+def test_shard_whose_worker_leaves_with_its_result_is_sent_again(
+    tmp_path: Path, engine: Engine, scene: list[Expectation]
+) -> None:
+    with by_hand(tmp_path) as (_, file):
+        workers = DaskWorkers(str(file))
+        send, given = workers._send, list[LeftWithItsResult]()
+
+        def lose_the_first(attempt: Any) -> None:
+            if given:
+                send(attempt)
+                return
+            given.append(LeftWithItsResult())
+            workers._sent[given[0]] = attempt  # type: ignore[index]
+            threading.Thread(target=workers._came, args=(attempt, given[0])).start()
+
+        workers._send = lose_the_first  # type: ignore[method-assign]
+        found = Pool(workers).detect(scene[0], scene[1:], realisations=N, seed=1)
+        workers.close()
+    assert given[0].asked == 3
+    assert workers.retries == 1
+    same(found, engine.detect(scene[0], scene[1:], realisations=N, seed=1))
+
+
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
     """Start the documentation's example for batch systems; return its address and its file."""
@@ -429,7 +464,7 @@ def test_scheduler_lost_during_a_fetch_raises() -> None:
     class Lost:
         status = "finished"
 
-        def result(self) -> None:
+        def result(self, timeout: float) -> None:
             raise ConnectionResetError("Connection reset by peer")
 
     sent: Any = Lost()
