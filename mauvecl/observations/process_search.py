@@ -103,7 +103,7 @@ class Filter:
 
     @property
     def unsolved(self) -> Bool:
-        """Whether the norm of any sum is not solved, shape (n_onset,)."""
+        """Onsets at which the norm of at least one sum is not solved, shape (n_onset,)."""
         return np.asarray(np.any([one.unsolved for one in self.norms], axis=0))
 
     def row(self) -> FilterRow:
@@ -288,13 +288,12 @@ class ProcessSearch:
         norms, lost = list[SolvedNorms](), np.zeros((len(self.processes), peaks.size))
         for k, level in enumerate(self._levels):
             key = (template.half_width_s, phase, k)
-            earlier = None if self._before is None else self._before._norms_of[key]
             if not self.processes[k].terms:
                 one = self._independent(k, shape, first, peaks)
-            elif earlier is None:
+            elif self._before is None:
                 one = self._norms(k, shape, first, peaks)
             else:
-                one = self._updated(earlier, shape, first, peaks)
+                one = self._updated(self._before._norms_of[key], shape, first, peaks)
             self._norms_of[key] = one
             norms.append(one)
             held = np.zeros(self.n_grid)

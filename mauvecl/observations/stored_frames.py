@@ -72,7 +72,8 @@ class StoredFile(TableFile):
         }
         shape = (n, scene.calibration["wavelength_nm"].size)
         self.parts["flux"] = Values("flux", shape, self._flux, "adu", what)
-        self.parts["raw"] = Values("raw", shape, self._raw, "adu", what)
+        if self.stacked == 1:
+            self.parts["raw"] = Values("raw", shape, self._raw, "adu", what)
         self.parts["error"] = Values("error", shape, self._error, "adu", what)
         if "temperature_c" in of:
             self.parts["temperature"] = Values.of("temperature", each * float(of["temperature_c"]), "deg_C", what)

@@ -219,17 +219,17 @@ class DaskWorkers:
                 left = {
                     sent: one for sent, one in self._sent.items() if one.workers and present.isdisjoint(one.workers)
                 }
-                for sent, attempt in left.items():
+                for sent in left:
                     del self._sent[sent]
-                    # The request was given to the same workers.
-                    self._given.pop(attempt.task.key, None)
             for attempt in left.values():
-                self._again(attempt)
+                self._again(attempt, lost=True)
 
-    def _again(self, attempt: _Attempt, *, tried: int = 0) -> None:
-        """Send a shard again, and add failures to its count."""
+    def _again(self, attempt: _Attempt, *, tried: int = 0, lost: bool = False) -> None:
+        """Send a shard again, with its request if that was lost with its workers, and add failures to its count."""
         with self._lock:
             self.retries += 1
+            if lost:
+                self._given.pop(attempt.task.key, None)
         attempt.tried += tried
         self._send(attempt)
 
@@ -244,9 +244,7 @@ class DaskWorkers:
                 try:
                     answer = _result(sent)
                 except _LostError:
-                    with self._lock:
-                        self._given.pop(task.key, None)
-                    self._again(attempt)
+                    self._again(attempt, lost=True)
                     return
                 except OSError as broken:
                     # The connection may break between the end of a shard and the transfer of its counts.
@@ -267,11 +265,7 @@ class DaskWorkers:
             elif sent.status in ("cancelled", "lost") and self._client.status != "running":
                 awaited.set_exception(self._gone())
             else:
-                if error is None:
-                    # The request was lost with its worker.
-                    with self._lock:
-                        self._given.pop(task.key, None)
-                self._again(attempt, tried=1)
+                self._again(attempt, tried=1, lost=error is None)
         except BaseException as error:
             if not awaited.done():
                 awaited.set_exception(self._gone() if isinstance(error, OSError) else error)
