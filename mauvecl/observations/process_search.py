@@ -50,7 +50,7 @@ BATCH = 2**21
 
 
 @dataclass(frozen=True, eq=False)
-class FilterRow:
+class TemplateRow:
     """Templates of one half-width and phase at all onsets."""
 
     template: Template
@@ -58,6 +58,12 @@ class FilterRow:
     shape: Float  # flux of the template above `NEGLECTED`, shape (n,)
     first: int  # its first frame, relative to the frame of the peak
     peaks: NDArray[np.int64]  # frame of the peak at each onset, from the first frame of the stare, including gaps
+
+
+@dataclass(frozen=True, eq=False)
+class FilterRow(TemplateRow):
+    """Templates with their denominators."""
+
     # Shape (n_direction, n_onset); mean of rho for a flare with unit peak along each direction, zero if not searched.
     per_amplitude: Float
 
@@ -84,14 +90,9 @@ class SolvedNorms:
 
 
 @dataclass(frozen=True, eq=False)
-class Filter:
-    """Templates of one half-width and phase, with the denominators of each sum at all onsets."""
+class Filter(TemplateRow):
+    """Templates with the norms of each sum, from which their denominators follow."""
 
-    template: Template
-    phase: int
-    shape: Float  # flux of the template above `NEGLECTED`, shape (n,)
-    first: int  # its first frame, relative to the frame of the peak
-    peaks: NDArray[np.int64]  # shape (n_onset,); frames of the peaks
     norms: tuple[SolvedNorms, ...]  # of each sum
     lost: Float  # shape (n_sum, n_onset); what the unknown level takes from the norms
     weights: Float  # shape (n_direction, n_sum); squared directions of the bank
