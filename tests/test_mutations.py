@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
 
 import pytest
+from scripts import tool
 
 ROOT = Path(__file__).parent.parent
-SPEC = importlib.util.spec_from_file_location("mutation_check", ROOT / "tools" / "mutation_check.py")
-assert SPEC is not None
-assert SPEC.loader is not None
-check = importlib.util.module_from_spec(SPEC)
-sys.modules[SPEC.name] = check
-SPEC.loader.exec_module(check)
+check = tool("mutation_check")
 
 
 def test_every_mutation_has_its_texts_and_its_test() -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -14,6 +12,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from scripts import tool
 
 pytestmark = pytest.mark.long
 
@@ -24,13 +23,7 @@ GIB = 2**30
 @pytest.fixture(scope="module")
 def fuzz() -> ModuleType:
     """Return `tools/fuzz_files.py`, which runs commands within limits."""
-    spec = importlib.util.spec_from_file_location("fuzz_files", ROOT / "tools" / "fuzz_files.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    return tool("fuzz_files")
 
 
 def test_mutated_files_are_answered_or_refused(fuzz: ModuleType) -> None:

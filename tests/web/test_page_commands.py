@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import re
 import shlex
-import sys
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from marks import long_but
+from scripts import tool
 
 pytest.importorskip("bokeh")
 
@@ -53,18 +52,7 @@ LINKS = (
 )
 
 
-def _tool() -> Any:
-    """Load `tools/check_commands.py`."""
-    spec = importlib.util.spec_from_file_location("check_commands", ROOT / "tools" / "check_commands.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-check_commands = _tool()
+check_commands = tool("check_commands")
 
 
 def _study_of(command: str, monkeypatch: pytest.MonkeyPatch) -> Study:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from golden_inputs import RAW
 from refusals import refused
 
 pytest.importorskip("bokeh")
@@ -44,18 +45,6 @@ magnitude = 4.5
 frames = "dark.fits"
 mapping = "frames.toml"
 """
-MAPPING = """
-hdu = "FRAMES"
-time = "TIME"
-time_unit = "s"
-flux = "RAW"
-flux_unit = "DN"
-wavelength = "WAVELENGTH"
-wavelength_unit = "nm"
-temperature = "TEMPERATURE"
-temperature_unit = "deg_C"
-exposure_s = 5.0
-"""
 
 
 def fits_of(source: Source | None, temperatures: list[float], seed: int) -> bytes:
@@ -81,7 +70,7 @@ def spectrum() -> bytes:
 def contents() -> dict[str, bytes]:
     """Return the files of a visitor by name."""
     return {
-        "standards.toml": STUDY.encode(), "frames.toml": MAPPING.encode(), "b3v.ecsv": spectrum(),
+        "standards.toml": STUDY.encode(), "frames.toml": RAW.encode(), "b3v.ecsv": spectrum(),
         "b3v.fits": fits_of(star("B3V", 4.5), [17.0], 1), "dark.fits": fits_of(None, [15.0, 17.0, 19.0], 2),
     }  # fmt: skip
 
