@@ -1,0 +1,53 @@
+"""Bad input is refused in one sentence: one table for all verbs and public functions, in data/refusals.
+
+The README there says what an entry may hold.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import tomllib
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import astropy.units as u
+import numpy as np
+import pytest
+from commands import ended
+from refusals import refused
+
+import mauvecl
+
+TABLES = Path(__file__).parent / "data" / "refusals"
+ROWS = [
+    pytest.param(path, row, id=f"{path.stem}: {row.get('run') or row['call']}")
+    for path in sorted(TABLES.glob("*.toml"))
+    for row in tomllib.loads(path.read_text(encoding="utf-8"))["refusal"]
+]
+
+
+@cache
+def _names(path: Path) -> dict[str, Any]:
+    """Return the public names, and what the table's setup makes of them."""
+    names = {name: getattr(mauvecl, name) for name in mauvecl.__all__} | {"mauvecl": mauvecl, "np": np, "u": u}
+    exec(tomllib.loads(path.read_text(encoding="utf-8")).get("setup", ""), names)
+    return names
+
+
+@pytest.mark.parametrize(("path", "row"), ROWS)
+def test_bad_input_is_refused(path: Path, row: dict[str, Any], tmp_path: Path) -> None:
+    for name, text in (tomllib.loads(path.read_text(encoding="utf-8")).get("files", {}) | row.get("files", {})).items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    if "call" in row:
+        with refused(row["key"], *row["says"]):
+            eval(row["call"], _names(path) | {"folder": tmp_path})
+        return
+    code, out, reported = ended(*shlex.split(row["run"]), folder=tmp_path)
+    assert code == 2, out + reported
+    sentence = reported.removeprefix("mauvecl: ").strip()
+    for fact in (row["key"], *row["says"]):
+        assert fact in sentence, sentence
+    # Notes on what was assumed may precede the sentence; nothing follows it.
+    assert not re.search(r"Traceback|internal error", reported), reported
