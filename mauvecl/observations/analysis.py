@@ -160,7 +160,12 @@ class Analysis:
                 'search.frame.light = "free", the default, searches without the light that all pixels share.'
             )
         if self.level.process.terms:
-            lines.append(f"The quiescent light is not constant: {self.level.process.describe(self.unit)}.")
+            # The standard deviation of a process differs from that of a light curve which shows few periods of it.
+            level = self.level.level[self.level.used]
+            lines.append(
+                f"The quiescent light is not constant: its fitted level has a standard deviation of "
+                f"{100 * level.std() / level.mean():.2g} %, by {self.level.process.describe()}."
+            )
         if not self.likeness.alike:
             lines.append(
                 f"Residuals of the quiescent light are correlated ({self.likeness.correlation:.2f} at a lag of "

@@ -35,6 +35,9 @@ MOST_FLARING, MOST_ACTIVE, MOST_EXCESS = 0.1, 0.3, 1.5
 #: Time scale from which a process is slow, however long the light curve (assumed: 2 d, twelve times the longest loss
 #: that is searched).
 SLOW_S = 172_800.0
+#: Standard deviation of a process, in those of the noise of a mean over its time scale, below which losses of light
+#: cannot have made it (assumed: losses of an S/N of 5 in 1 % of the frames have 0.5).
+LEAST_LOSS = 0.5
 #: Largest share of the frames in losses; more of them are the level of the star, before or after a step (assumed).
 MOST_LOST = 0.4
 #: Standard deviations of a frame above the median of a constant light from which frames belong to flares; their number
@@ -95,7 +98,13 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
     none, process = np.zeros_like(taken), fitted.flux_process
     rotates = any(term.kind == "rotation" for term in process.terms)
     slow_s = min(survey.stare.duration_s / 3, SLOW_S)
-    fast = any(term.kind != "rotation" and term.scale_s < slow_s for term in process.terms)
+    noise = process.excess * float(np.sqrt(np.median(fitted.flux_variance)))
+    fast = any(
+        term.kind != "rotation"
+        and term.scale_s < slow_s
+        and term.sd * np.sqrt(term.scale_s / survey.stare.frame_s) > LEAST_LOSS * noise
+        for term in process.terms
+    )
     active = taken.mean() > MOST_ACTIVE
     many = active or (taken.mean() > MOST_FLARING and not rotates)
     if survey.weighted or not (many or process.excess > MOST_EXCESS or fast):
