@@ -134,13 +134,13 @@ class Trial:
     flux: Float = field(default_factory=lambda: np.zeros(0))
     level: Float | float = 1.0  # quiescent light of each frame, in the unit of the flux
     noise: float = np.nan  # standard deviation of the white noise, likewise
-    lost: NDArray[np.bool_] | None = None  # frames that have lost more light than the noise of a frame
     flares: list[Flare] = field(default_factory=list)
     wavelength_nm: Float | None = None
     star: tuple[str, float] | None = None  # library name and V magnitude, for spectra
     path: Path | None = None  # a file that exists, in place of the arrays
     mapping: Path | None = None
     expected: int | None = None  # number of detected flares, where it is known without a list of them
+    lost: NDArray[np.bool_] | None = None  # frames that have lost more light than the noise of a frame
 
     def energies(self, flare: Flare, start_s: float, stop_s: float) -> tuple[float, float, float]:
         """Return a flare's equivalent duration: the whole, within the frames, and in the frames from start to stop."""
