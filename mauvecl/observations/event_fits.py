@@ -110,7 +110,7 @@ def fit_event(window: Window, searched: Shape) -> list[Fit]:
     for family in published:
         grid = first[family.name]
         shape, flare = grid.best
-        fits += _single(window, family, shape, flare, grid.box)
+        fits += _single(window, family, shape, flare, grid.box, grid)
         several = _further(window, shape, [flare])
         if len(several) > 1:
             fits += _several(window, family, several)
@@ -169,13 +169,16 @@ class Grid:
         return np.asarray((self.family.weights @ (self.parts @ weights))[self.shape, self.node])
 
     @classmethod
-    def of(cls, likelihood: Likelihood, family: Family, box: Float, outer: Float) -> Grid:
+    def of(cls, likelihood: Likelihood, family: Family, box: Float, outer: Float, before: Grid | None = None) -> Grid:
         """Compute the posterior on a grid that is refined or widened until it covers all that is not negligible.
 
         Parameters
         ----------
         box, outer : ndarray, shape (2, 2)
             First and largest range of the peak and of the logarithm of the half-width.
+        before : Grid, optional
+            Grid of the same window and family, whose means are taken where the range is the same: they take most of
+            the time.
         """
         window = likelihood.window
         n_node = NODES if len(family.weights) == 1 else NODES_OF_MANY
@@ -183,7 +186,10 @@ class Grid:
         for _ in range(REFINEMENTS):
             axes = [np.linspace(low, high, n_node) for low, high in box]
             p, w = (each.ravel() for each in np.meshgrid(axes[0], axes[1], indexing="ij"))
-            parts = np.array([window.model(part, p, np.exp(w)) for part in family.parts])
+            if before is not None and np.array_equal(before.box, box):
+                parts = before.parts
+            else:
+                parts = np.array([window.model(part, p, np.exp(w)) for part in family.parts])
             slope, information = likelihood.matched(parts, family.weights, window.values)
             amplitude = slope / information
             step = (box[:, 1] - box[:, 0]) / (n_node - 1)
@@ -241,7 +247,7 @@ def _first_fit(window: Window, family: Family) -> Grid:
     outer = _ranges(window)
     grid = Grid.of(Likelihood.of(window, [], family.shape(0), 0.0), family, outer, outer)
     shape, flare = grid.best
-    return Grid.of(Likelihood.of(window, [flare], shape, 0.0), family, grid.box, outer)
+    return Grid.of(Likelihood.of(window, [flare], shape, 0.0), family, grid.box, outer, grid)
 
 
 def _further(window: Window, shape: Profile, flares: list[FittedFlare]) -> list[FittedFlare]:
@@ -330,7 +336,9 @@ def _refined(likelihood: Likelihood, shape: Profile, flares: Sequence[FittedFlar
     return [_flare(shape, p, np.exp(w), np.exp(a)) for a, p, w in found.x.reshape(-1, 3)]
 
 
-def _single(window: Window, family: Family, shape: Profile, flare: FittedFlare, box: Float) -> list[Fit]:
+def _single(
+    window: Window, family: Family, shape: Profile, flare: FittedFlare, box: Float, grid: Grid | None = None
+) -> list[Fit]:
     """Fit a single flare with each departure of a family from its shapes.
 
     Parameters
@@ -339,6 +347,8 @@ def _single(window: Window, family: Family, shape: Profile, flare: FittedFlare, 
         A first fit, from which the departures follow.
     box : ndarray, shape (2, 2)
         Range of the peak and of the logarithm of the half-width from which the grid begins.
+    grid : Grid, optional
+        Grid of the first fit, if it is one of the family.
     """
     outer = _ranges(window)
     box = np.column_stack([np.maximum(box[:, 0], outer[:, 0]), np.minimum(box[:, 1], outer[:, 1])])
@@ -346,7 +356,7 @@ def _single(window: Window, family: Family, shape: Profile, flare: FittedFlare, 
     for epsilon in family.epsilon:
         for _ in range(ROUNDS if epsilon else 1):
             likelihood = Likelihood.of(window, [flare], shape, epsilon)
-            grid = Grid.of(likelihood, family, box, outer)
+            grid = Grid.of(likelihood, family, box, outer, grid)
             before, box = flare.equivalent_duration_s, grid.box
             shape, flare = grid.best
             if abs(np.log(flare.equivalent_duration_s / before)) < SETTLED:
