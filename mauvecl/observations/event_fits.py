@@ -337,7 +337,7 @@ def _refined(likelihood: Likelihood, shape: Profile, flares: Sequence[FittedFlar
 
 
 def _single(
-    window: Window, family: Family, shape: Profile, flare: FittedFlare, box: Float, grid: Grid | None = None
+    window: Window, family: Family, shape: Profile, flare: FittedFlare, box: Float, last: Grid | None = None
 ) -> list[Fit]:
     """Fit a single flare with each departure of a family from its shapes.
 
@@ -347,7 +347,7 @@ def _single(
         A first fit, from which the departures follow.
     box : ndarray, shape (2, 2)
         Range of the peak and of the logarithm of the half-width from which the grid begins.
-    grid : Grid, optional
+    last : Grid, optional
         Grid of the first fit, if it is one of the family.
     """
     outer = _ranges(window)
@@ -356,7 +356,7 @@ def _single(
     for epsilon in family.epsilon:
         for _ in range(ROUNDS if epsilon else 1):
             likelihood = Likelihood.of(window, [flare], shape, epsilon)
-            grid = Grid.of(likelihood, family, box, outer, grid)
+            last = grid = Grid.of(likelihood, family, box, outer, last)
             before, box = flare.equivalent_duration_s, grid.box
             shape, flare = grid.best
             if abs(np.log(flare.equivalent_duration_s / before)) < SETTLED:
