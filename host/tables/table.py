@@ -126,7 +126,7 @@ class Values:
                 row = start + place // max(1, int(np.prod(values.shape[1:]))) + 1
                 raise InputError(
                     f"{self.what}: {self.name!r} = {shortened(text, 40)} in row {row}", expected, key=self.name,
-                    value=text,
+                    value=text
                 ) from error  # fmt: skip
         return parsed.reshape(values.shape)
 
