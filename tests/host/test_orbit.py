@@ -293,11 +293,12 @@ def test_windows_sum_to_the_visible_time(month: Any) -> None:
         assert long.windows(k).start_s.tolist() == every.start_s[every.length_s >= 1200].tolist()
 
 
-def test_polygon_across_the_date_line() -> None:
-    corners = [[170.0, -10.0], [-170.0, -10.0], [-170.0, 10.0], [170.0, 10.0]]
+@pytest.mark.parametrize(("west", "middle", "east"), [(170.0, 180.0, -170.0), (-100.0, 0.0, 100.0)])
+def test_polygon_across_the_date_line_or_half_the_earth(west: float, middle: float, east: float) -> None:
+    corners = [[west, -10.0], [middle, -10.0], [east, -10.0], [east, 10.0], [middle, 10.0], [west, 10.0]]
     found = seen(days=10.0, targets=["Vega"], limits=NO_LIMITS | {"anomaly": corners})
     longitude, latitude = found.track.subsatellite_deg
-    inside = (np.abs(longitude) > 170) & (np.abs(latitude) < 10)
+    inside = ((longitude - west) % 360 < (east - west) % 360) & (np.abs(latitude) < 10)
     assert inside.sum() > 50
     np.testing.assert_array_equal(found.seen[:, 0], ~inside)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -55,25 +54,20 @@ def landing(offset: Float, instrument: Instrument) -> Float:
     return np.asarray(line_function(offset[..., None] + half * x, top_hat, fwhm) @ w * half)
 
 
-def brute(instrument: Instrument, wavelength: Float, flux: Float, pixel: int, order: Order) -> float:
-    """Compute a pixel's electrons per second by adaptive quadrature between all kinks."""
+def by_quadrature(instrument: Instrument, wavelength: Float, flux: Float, pixel: int, order: Order) -> float:
+    """Compute a pixel's electrons per second by Gauss-Legendre quadrature between all kinks."""
     centre = instrument.wavelength_nm[pixel]
     corner = (instrument.top_hat_width_nm + np.array([-1, 1]) * instrument.dispersion_nm_per_pixel) / 2
-    reach = corner[1] + 8 * instrument.gaussian_fwhm_nm / 2.35
-    kinks = np.concatenate([wavelength, instrument.knots_nm, centre - corner, centre + corner])
-    low, high = max(centre - reach, wavelength[0]), min(centre + reach, wavelength[-1])
-    edges = np.unique(np.concatenate([[low, high], kinks[(kinks > low) & (kinks < high)]]))
-
-    def integrand(x: float) -> float:
-        own = x if order == "physical" else centre
-        share = landing(np.array(centre - x), instrument)
-        # erg s^-1 cm^-2 A^-1 is 1e-6 W cm^-2 nm^-1.
-        per_joule = instrument.electrons_per_joule_cm2(own, held=True)
-        return float(np.interp(x, wavelength, flux) * 1e-6 * share * per_joule)
-
-    peak = max(integrand(x) for x in np.linspace(low, high, 101))
-    pieces = [quad(integrand, a, b, epsabs=1e-12 * peak, epsrel=1e-11) for a, b in pairwise(edges)]
-    return float(sum(piece[0] for piece in pieces))
+    reach = corner[1] + 8 * instrument.gaussian_fwhm_nm / 2.35 + 0.1
+    within = np.linspace(centre - reach, centre + reach, 400)
+    edges = np.unique(np.concatenate([wavelength, instrument.knots_nm, centre - corner, centre + corner, within]))
+    edges = edges[np.abs(edges - centre) <= reach]
+    x, w = np.polynomial.legendre.leggauss(8)
+    at = edges[:-1, None] + np.diff(edges)[:, None] * (1 + x) / 2
+    per_joule = instrument.electrons_per_joule_cm2(at if order == "physical" else centre, held=True)
+    # erg s^-1 cm^-2 A^-1 is 1e-6 W cm^-2 nm^-1.
+    light = np.interp(at, wavelength, flux) * 1e-6 * landing(centre - at, instrument)
+    return float(np.sum(light * per_joule * np.diff(edges)[:, None] / 2 * w))
 
 
 def test_whole_profile_has_the_width_of_the_paper() -> None:
@@ -88,18 +82,21 @@ def test_whole_profile_has_the_width_of_the_paper() -> None:
     assert 2 * np.interp(-density[0] / 2, -density, offset) == pytest.approx(13.3, abs=0.05)
 
 
-@pytest.mark.long
 @ORDERS
 @KERNELS
-def test_random_spectra_agree_with_quadrature(mauve: Instrument, top_hat: float, fwhm: float, order: Order) -> None:
+@pytest.mark.parametrize("n", [400, 40_001])
+def test_random_spectra_agree_with_quadrature(
+    mauve: Instrument, top_hat: float, fwhm: float, order: Order, n: int
+) -> None:
+    """Try fewer and more nodes than a matrix of the response is made for."""
     instrument = mauve.with_(top_hat_width_nm=top_hat, gaussian_fwhm_nm=fwhm)
     rng = np.random.default_rng(20250101)
-    wavelength = np.sort(np.append(rng.uniform(150, 790, 400), [150, 790]))
+    wavelength = np.sort(np.append(rng.uniform(150, 790, n), [150, 790]))
     flux = rng.random(wavelength.size) * np.where(rng.random(wavelength.size) < 0.03, 50, 1)
     rate = rate_of(instrument, wavelength, flux, order)
     for pixel in (0, 811, 1642):
         # Far below the requested 1e-6.
-        assert rate[pixel] == pytest.approx(brute(instrument, wavelength, flux, pixel, order), rel=1e-9)
+        assert rate[pixel] == pytest.approx(by_quadrature(instrument, wavelength, flux, pixel, order), rel=1e-9)
 
 
 def per_efficiency(instrument: Instrument, rate: Float) -> Float:
@@ -138,26 +135,6 @@ def test_light_is_conserved_and_stays_within_reach(mauve: Instrument, nm: float)
     assert landed.sum() == pytest.approx(0.5, rel=1e-6) if 230 <= nm <= 640 else landed.sum() < 0.499
     assert np.abs(landed[np.abs(mauve.wavelength_nm - nm) > 45]).max() < 1e-9
     assert bool(landed.max() > 1e-9) == (160.0 < nm < 770.0)
-
-
-@ORDERS
-def test_many_nodes_lose_no_flux(mauve: Instrument, order: Order) -> None:
-    """More nodes than a matrix is made for agree with quadrature, as fewer do."""
-    rng = np.random.default_rng(11)
-    wavelength = np.linspace(150, 790, 150_001)
-    flux = rng.exponential(size=wavelength.size)
-    rate = rate_of(mauve, wavelength, flux, order)
-    # Cells of 0.004 nm: three points each are brute force here.
-    x, w = np.polynomial.legendre.leggauss(3)
-    at = wavelength[:-1, None] + np.diff(wavelength)[:, None] * (1 + x) / 2
-    mass = np.interp(at, wavelength, flux) * np.diff(wavelength)[:, None] / 2 * w * 1e-6
-    for pixel in (0, 700, 1642):
-        centre = mauve.wavelength_nm[pixel]
-        near = np.abs(at[:, 0] - centre) < 45
-        own = at[near] if order == "physical" else centre
-        per_joule = mauve.electrons_per_joule_cm2(own, held=True)
-        expected = np.sum(mass[near] * per_joule * landing(centre - at[near], mauve))
-        assert rate[pixel] == pytest.approx(expected, rel=1e-9)
 
 
 @ORDERS

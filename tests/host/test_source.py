@@ -221,6 +221,7 @@ def test_other_numbers_of_the_span() -> None:
     finer = np.append(180.1, grid()[11:])
     short = Source.from_arrays(finer, np.interp(finer, grid(), hot), name="short")
     assert any("starts at 180.1 nm and is continued to 180 nm" in text for text in short.messages)
+    assert short.flux_flam[0] == pytest.approx(short.flux_flam[1:][np.abs(finer - finer[0]) <= 5.0].mean())
     mauve = Instrument.load("mauve")
     one, other = (expect(star.at_magnitude(5.0), mauve, exposure=5.0) for star in (whole, short))
     np.testing.assert_allclose(one.source_electrons, other.source_electrons, rtol=2e-4)

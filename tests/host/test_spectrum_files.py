@@ -85,10 +85,10 @@ def test_calspec_saved_by_astropy_as_ecsv(tmp_path: Path) -> None:
 
 
 NOT_FLUX = [
-    "error", "err", "flux_err", "FluxErr", "e_flux", "e_Flux", "eflux", "dflux", "sigma", "SIGMA_FLUX", "STATERROR",
-    "sys_err", "unc", "flux_unc", "uncertainty", "ivar", "invvar", "variance", "stdev", "flux_min", "flux_error_low",
-    "S/N", "snr", "noise", "weight", "wave_err", "dlambda", "bin_width", "fwhm", "resolution", "quality", "DATAQUAL",
-    "dq", "DQ", "flag", "and_mask", "cont", "continuum", "flux_cont", "flux_continuum", "counts", "net", "NET", "ADU",
+    "error", "err", "flux_err", "FluxErr", "e_flux", "e_Flux", "eflux", "dflux", "sig", "flux_sig", "sigma", "SIGMA_FLUX",
+    "STATERROR", "sys_err", "unc", "flux_unc", "uncertainty", "ivar", "invvar", "variance", "stdev", "flux_min",
+    "flux_error_low", "S/N", "snr", "noise", "weight", "wave_err", "dlambda", "bin_width", "fwhm", "resolution", "quality",
+    "DATAQUAL", "dq", "DQ", "flag", "and_mask", "cont", "continuum", "flux_cont", "flux_continuum", "counts", "net", "NET", "ADU",
     "gross_counts", "sky", "bkg_flux", "BACKGROUND", "bgflux", "flux_sky", "transmission", "throughput", "qe",
     "Efficiency", "model", "bestfit", "template", "flux_upper", "mag", "L_lambda", "foo", "NPOINTS", "airmass",
     "normalization",
