@@ -85,19 +85,19 @@ def test_calspec_saved_by_astropy_as_ecsv(tmp_path: Path) -> None:
 
 
 NOT_FLUX = [
-    "error", "err", "flux_err", "FluxErr", "e_flux", "e_Flux", "eflux", "dflux", "sig", "flux_sig", "sigma", "SIGMA_FLUX",
-    "STATERROR", "sys_err", "unc", "flux_unc", "uncertainty", "ivar", "invvar", "variance", "stdev", "flux_min",
-    "flux_error_low", "S/N", "snr", "noise", "weight", "wave_err", "dlambda", "bin_width", "fwhm", "resolution", "quality",
-    "DATAQUAL", "dq", "DQ", "flag", "and_mask", "cont", "continuum", "flux_cont", "flux_continuum", "counts", "net", "NET", "ADU",
-    "gross_counts", "sky", "bkg_flux", "BACKGROUND", "bgflux", "flux_sky", "transmission", "throughput", "qe",
-    "Efficiency", "model", "bestfit", "template", "flux_upper", "mag", "L_lambda", "foo", "NPOINTS", "airmass",
-    "normalization",
+    "error", "err", "flux_err", "FluxErr", "e_flux", "e_Flux", "eflux", "dflux", "sig", "flux_sig", "sigma",
+    "SIGMA_FLUX", "STATERROR", "sys_err", "unc", "flux_unc", "uncertainty", "ivar", "invvar", "variance", "stdev",
+    "flux_min", "flux_error_low", "S/N", "snr", "noise", "weight", "wave_err", "dlambda", "bin_width", "fwhm",
+    "resolution", "quality", "DATAQUAL", "dq", "DQ", "flag", "and_mask", "cont", "continuum", "flux_cont",
+    "flux_continuum", "counts", "net", "NET", "ADU", "gross_counts", "sky", "bkg_flux", "BACKGROUND", "bgflux",
+    "flux_sky", "transmission", "throughput", "qe", "Efficiency", "model", "bestfit", "template", "flux_upper", "mag",
+    "L_lambda", "foo", "NPOINTS", "airmass", "normalization",
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", NOT_FLUX)
 def test_other_columns_are_not_taken_for_the_flux(name: str, tmp_path: Path) -> None:
-    columns = {name: 0.3 * FLUX, "wave_nm": NM, "spare": 2 * FLUX, "flux": FLUX}
+    columns = {name: 0.3 * FLUX, "wave_nm": NM, "spare": 2 * FLUX, "obs_flux": FLUX}
     assert is_right(read(tmp_path, text(columns)))
 
 
