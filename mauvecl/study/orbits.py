@@ -371,7 +371,7 @@ def _target(
     elif "coordinates" not in one and name_key(name := one.get("name", "")) not in by_key():
         for column in (ra, columns["coordinates"]):
             if column is not None and _is_marked_missing(text := str(rows.table[column][row])):
-                fault = f"row {row + 1} has no coordinates ({column} = {shortened(text)}), and {shortened(name)}"
+                fault = f"row {row + 1} has no coordinates ({column} = {' '.join(text.split())}), and {shortened(name)}"
                 expected = "its coordinates, or a name of the list"
                 raise rows.error(f"{fault} is not in the embedded list", expected, column, text)
     for key in PATH_KEYS:
