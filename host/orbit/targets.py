@@ -19,6 +19,7 @@ from ..sky.helioecliptic import parse_position
 from ..stars import well_known
 from ..stars.star_names import near_names
 from ..stars.well_known import by_key, name_key
+from ..tables.coordinates import EXPECTED, is_missing_position
 from ..tables.ecsv import parse_ecsv
 from ..tables.times import offline
 from .earth import direction
@@ -55,6 +56,10 @@ class Target:
         simbad : bool
             Whether to query SIMBAD for a name that is not embedded (needs `mauvecl[names]` and a network).
         """
+        if is_missing_position(text):
+            raise InputError(
+                f"target {shortened(text)} is a pair of missing values", EXPECTED, key="target", value=text
+            )
         star = by_key().get(name_key(text))
         if star is not None:
             return cls(name or star.name, star.ra_deg, star.dec_deg, f"embedded list ({star.source})",

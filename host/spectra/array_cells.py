@@ -11,7 +11,7 @@ import numpy as np
 from mauvecl.schema.errors import InputError
 
 from .column_choice import Choice, as_typed, listed, numbered, plain
-from .file_table import FileTable
+from .spectrum_table import SpectrumTable
 
 #: Columns whose presence shows that rows are parts of one spectrum: detector segments and echelle orders.
 SEGMENTS = ("segment", "sporder", "order", "stripe")
@@ -43,7 +43,7 @@ class Rows:
     messages: tuple[str, ...] = ()
 
 
-def selected_rows(table: FileTable, choice: Choice, cells: list[Any], asked: Sequence[str]) -> Rows:
+def selected_rows(table: SpectrumTable, choice: Choice, cells: list[Any], asked: Sequence[str]) -> Rows:
     """Return the selected row, or all rows if they are segments of one spectrum.
 
     Parameters
@@ -89,9 +89,9 @@ def selected_rows(table: FileTable, choice: Choice, cells: list[Any], asked: Seq
     return Rows(found, identifier, messages)
 
 
-def _values_of(table: FileTable, names: Sequence[str], wanted: Sequence[str]) -> Any:
+def _values_of(table: SpectrumTable, names: Sequence[str], wanted: Sequence[str]) -> Any:
     """Return the values of the column with one of several names, or None."""
-    return next((c.values() for c, name in zip(table.columns, names, strict=True) if name in wanted), None)
+    return next((c.cells for c, name in zip(table.columns, names, strict=True) if name in wanted), None)
 
 
 def _arrays(cells: list[Any], step: Any) -> list[Any]:
@@ -112,13 +112,13 @@ def _arrays(cells: list[Any], step: Any) -> list[Any]:
     return [*axes, flux]
 
 
-def _identifiers(table: FileTable, without: set[int], n: int) -> list[list[str]]:
+def _identifiers(table: SpectrumTable, without: set[int], n: int) -> list[list[str]]:
     """Return the possible names of each row: its short texts and integers, the most specific first."""
     columns = [list(table.row_names)] if len(table.row_names) == n else []
     for place, column in enumerate(table.columns):
         if place in without:
             continue
-        values = column.values()
+        values = column.cells
         if np.shape(values) == (n,) and np.asarray(values).dtype.kind in "SUiuO" and np.ndim(values[0]) == 0:
             texts = (one.decode(errors="replace") if isinstance(one, bytes) else str(one) for one in values)
             columns.append([text.strip() for text in texts])

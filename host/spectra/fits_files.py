@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -13,8 +13,9 @@ from mauvecl.schema.errors import InputError
 from ..tables.fits import column_values, open_fits, reading, text_at
 from ..tables.fits_images import axis_of, is_spectrum_image, is_survey_image, paired_images, rows_of
 from ..tables.medium import medium_of
+from ..tables.table import Values
 from .column_roles import role_of
-from .file_table import Column, FileTable
+from .spectrum_table import SpectrumTable
 
 #: Units implied by the archives' tables, those of CALSPEC.
 IMPLIED_UNITS = ("Angstrom", "erg / (s cm2 Angstrom)")
@@ -22,7 +23,9 @@ IMPLIED_UNITS = ("Angstrom", "erg / (s cm2 Angstrom)")
 _REMARKS = ("COMMENT", "HISTORY", "DESCRIP")
 
 
-def fits_tables(content: bytes, name: str, origin: str, asked: Sequence[str], check: bool = True) -> list[FileTable]:
+def fits_tables(
+    content: bytes, name: str, origin: str, asked: Sequence[str], check: bool = True
+) -> list[SpectrumTable]:
     """Read the tables of a FITS file, including images of spectra.
 
     Raises InputError if the content is not FITS, is truncated, contradicts its checksums, or has no tables or images.
@@ -39,7 +42,7 @@ class _Reader:
         self.hdus, self.name, self.origin, self.asked = hdus, name, origin, asked
         self.primary = hdus[0].header
 
-    def tables(self) -> list[FileTable]:
+    def tables(self) -> list[SpectrumTable]:
         from astropy.io import fits
 
         pairs = paired_images(self.hdus)
@@ -54,7 +57,7 @@ class _Reader:
         if is_survey_image(self.hdus[0], text_at(self.primary, "TELESCOP")):
             # SDSS keeps lines and redshifts of the spectrum in tables.
             return [self._of_image(0, self.hdus[0])]
-        kinds = [{role_of(c.name, c.unit, c.ucd).kind for c in table.columns} for table in tables]
+        kinds = [{role.kind for role in table.roles} for table in tables]
         images, errors = self._images()
         labels = {image.label.strip().lower() for image in images}
         named = labels & {word.lower() for word in self.asked}
@@ -70,9 +73,9 @@ class _Reader:
         """Return the name by which users select an extension: its number if requested, else its name."""
         return str(number) if str(number) in self.asked else text_at(hdu.header, "EXTNAME") or str(number)
 
-    def _table(self, header: Any, columns: Sequence[Column], label: str, **more: Any) -> FileTable:
+    def _table(self, header: Any, columns: Sequence[Values], label: str, **more: Any) -> SpectrumTable:
         is_relative = text_at(self.primary, "TELESCOP").upper().startswith("LAMOST")
-        return FileTable(
+        return SpectrumTable(
             columns,
             next((t for key in ("TARGNAME", "TARGETID", "OBJECT") for one in (self.primary, header)
                   if (t := text_at(one, key)[:80])), self.name),
@@ -106,23 +109,23 @@ class _Reader:
             notes.append("dereddened and at zero velocity: counts need it reddened again")
         return tuple(notes)
 
-    def _of_table(self, number: int, hdu: Any) -> FileTable:
+    def _of_table(self, number: int, hdu: Any) -> SpectrumTable:
         header = hdu.header
         if text_at(header, "ZIMAGE") == "True":
             raise InputError("holds a compressed image", "a table with WAVELENGTH and FLUX", key="table", value=number)
         # The unit of the file applies to flux and model if their columns state none (SDSS).
-        whole = text_at(self.primary, "BUNIT") or text_at(header, "BUNIT") or None
+        whole = text_at(self.primary, "BUNIT") or text_at(header, "BUNIT")
         columns = []
         for k, column in enumerate(hdu.columns):
-            unit = (column.unit or "").strip() or None
+            unit = (column.unit or "").strip()
             role = role_of(str(column.name))
-            if unit is None and role.kind in ("flux", "model") and role.unit is None:
+            if not unit and role.kind in ("flux", "model") and role.unit is None:
                 unit = whole
-            columns.append(Column(str(column.name), _reader(hdu, column), unit, text_at(header, f"TUCD{k + 1}")))
+            columns.append(_values(hdu, str(column.name), unit, column, text_at(header, f"TUCD{k + 1}")))
         ucds = " ".join(column.ucd for column in columns if column.ucd)
         return self._table(header, columns, self._label(number, hdu), remarks=f"\n{ucds}")
 
-    def _images(self) -> tuple[list[FileTable], list[InputError]]:
+    def _images(self) -> tuple[list[SpectrumTable], list[InputError]]:
         """Return the images with an axis of wavelengths, and the faults of others."""
         images, errors = [], []
         for number, hdu in enumerate(self.hdus):
@@ -134,31 +137,22 @@ class _Reader:
         flux = [one for one in images if one.label.strip().lower() in ("flux", "sci", "spectrum")]
         return (flux if flux and not self.asked else images), errors
 
-    def _of_image(self, number: int, hdu: Any) -> FileTable:
+    def _of_image(self, number: int, hdu: Any) -> SpectrumTable:
         header = hdu.header
         flux, names, note = rows_of(hdu, text_at(self.primary, "TELESCOP"), bool(self.asked))
         axis, unit, kind, notes = axis_of(header, self.primary, flux.shape[-1])
-        columns = [
-            Column("wavelength", lambda: axis, unit),
-            # SDSS-I/II writes erg/cm/s/Ang for erg/cm2/s/Ang.
-            Column(
-                "flux",
-                lambda: flux,
-                re.sub(r"erg/cm/s/", "erg/cm2/s/", text_at(header, "BUNIT") or text_at(self.primary, "BUNIT")) or None,
-            ),
-        ]
+        # SDSS-I/II writes erg/cm/s/Ang for erg/cm2/s/Ang.
+        flux_unit = re.sub(r"erg/cm/s/", "erg/cm2/s/", text_at(header, "BUNIT") or text_at(self.primary, "BUNIT"))
+        columns = [Values.of("wavelength", axis, unit), Values.of("flux", flux, flux_unit)]
         remarks = "\nair wavelength" if kind == "AWAV" else "\nvacuum" if kind == "WAVE" else ""
         return self._table(
             header, columns, self._label(number, hdu), remarks=remarks, notes=(*notes, *note), row_names=names
         )
 
-    def _of_pair(self, arm: str, axis: Any, flux: Any, rows: Sequence[str]) -> FileTable:
+    def _of_pair(self, arm: str, axis: Any, flux: Any, rows: Sequence[str]) -> SpectrumTable:
         """Return the table of an image of fluxes whose wavelengths are in another image (DESI, PFS, APOGEE)."""
         name = text_at(axis.header, "EXTNAME").removeprefix(f"{arm}_")
-        columns = [
-            Column(name, _reader(axis), text_at(axis.header, "BUNIT") or None),
-            Column("flux", _reader(flux), text_at(flux.header, "BUNIT") or None),
-        ]
+        columns = [_values(hdu, title, text_at(hdu.header, "BUNIT")) for hdu, title in ((axis, name), (flux, "flux"))]
         group = "arms" if arm else None
         return self._table(flux.header, columns, arm or "flux", row_names=rows, group=group)
 
@@ -170,11 +164,11 @@ class _Reader:
         return ()
 
 
-def _reader(hdu: Any, column: Any = None) -> Callable[[], Any]:
-    """Return a reader of an extension's data or column that raises InputError for damaged content."""
+def _values(hdu: Any, name: str, unit: str, column: Any = None, ucd: str = "") -> Values:
+    """Return an extension's data or column, which is read on access; that raises InputError for damaged content."""
 
-    def values() -> Any:
+    def read(start: int, stop: int) -> Any:
         with reading("it"):
-            return hdu.data if column is None else column_values(hdu.data, column)
+            return hdu.data[start:stop] if column is None else column_values(hdu.data[start:stop], column)
 
-    return values
+    return Values(name, (int(hdu.header[f"NAXIS{hdu.header['NAXIS']}"]),), read, unit, ucd=ucd)

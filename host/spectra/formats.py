@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
@@ -16,8 +17,12 @@ from ..files.size_limits import read_bytes, unpacked
 if TYPE_CHECKING:
     import astropy.units as u
 
+    from ..tables.table import MemoryTable
     from .conversion import ReadSpectrum
-    from .file_table import FileTable
+    from .spectrum_table import SpectrumTable
+
+#: Largest number and length of messages in the table of a kept star, and length of the remarks on columns.
+MAX_NOTES, MAX_NOTE_LENGTH, MAX_REMARKS = 20, 400, 20_000
 
 
 def without_columns(path: str | Path) -> tuple[Path, tuple[str, ...]]:
@@ -84,25 +89,45 @@ def _stem(name: str) -> str:
 
 def _tables(
     content: bytes, name: str, origin: str, asked: Sequence[str], units: tuple[bool, bool], check: bool
-) -> list[FileTable]:
-    from ..tables.opening import form_of
+) -> list[SpectrumTable]:
+    from ..tables.ecsv import parse_ecsv
+    from ..tables.opening import check_no_page, form_of, votables
+    from ..tables.table import MemoryTable
     from ..tables.text_table import text_of
     from .fits_files import fits_tables
-    from .table_files import ecsv_tables, votable_tables
     from .text import text_tables
 
     form = form_of(content[:4096])
     if form == "FITS":
         return fits_tables(content, name, origin, asked, check)
     if form == "VOTable":
-        return votable_tables(content, name, origin)
-    if form == "XML":
-        start = content[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")[:20]
-        raise InputError(
-            f"is a page or XML that begins with {shortened(start.decode('ascii', 'replace'))}",
-            "a spectrum", key="file", value=start,
-        )  # fmt: skip
+        tables = enumerate(votables(content, "it", "a spectrum"), 1)
+        return [_in_memory(one, name, origin, str(one.header.get("name") or one.header.get("ID") or number))
+                for number, one in tables]  # fmt: skip
+    check_no_page(content, form, "it", "a spectrum")
     text = text_of(content)
     if form == "ECSV":
-        return ecsv_tables(text, name, origin)
+        table = MemoryTable(parse_ecsv(text, "it"), "it")
+        own = table.header.get("name")
+        return [_in_memory(table, own.strip()[:80] if isinstance(own, str) and own.strip() else name, origin)]
     return text_tables(text, name, f"text {origin}", asked, *units)
+
+
+def _in_memory(file: MemoryTable, name: str, origin: str, label: str = "") -> SpectrumTable:
+    """Return the table of an ECSV file or a VOTable."""
+    from ..tables.medium import medium_of
+    from .spectrum_table import SpectrumTable
+
+    columns = [file.find(one) for one in file.names]
+    said = [f"{one.ucd} {one.description}" for one in columns]
+    return SpectrumTable(
+        columns, name, origin, label, remarks="\n".join((*_texts(file.header.get("comments")), *said))[:MAX_REMARKS],
+        medium=partial(medium_of, file.header), messages=_texts(file.header.get("told")),
+    )  # fmt: skip
+
+
+def _texts(given: Any) -> tuple[str, ...]:
+    """Return the short texts of a list; an empty tuple for anything else."""
+    if not isinstance(given, list):
+        return ()
+    return tuple(one for one in given[:MAX_NOTES] if isinstance(one, str) and len(one) <= MAX_NOTE_LENGTH)

@@ -8,18 +8,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
 
+from ..tables.table import Values
 from .array_cells import holds_arrays, no_such, selected_rows
 from .column_choice import as_typed, choose, listed, numbered, plain
 from .column_roles import Role
-from .file_table import FileTable, numbers
+from .spectrum_table import SpectrumTable
 
 Float = NDArray[np.float64]
+
+#: Values of at least this mark missing measurements (IRAF's INDEF is 1.6e38).
+INDEFINITE = 1e38
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +33,7 @@ class RawSpectrum:
 
     #: Wavelengths and fluxes of each segment, shape (n,) each.
     segments: list[tuple[Float, Float]]
-    table: FileTable
+    table: SpectrumTable
     wavelength_name: str
     flux_name: str
     wavelength_role: Role
@@ -36,7 +41,7 @@ class RawSpectrum:
     messages: tuple[str, ...] = ()
 
 
-def spectrum_in(tables: Sequence[FileTable], asked: Sequence[str]) -> RawSpectrum:
+def spectrum_in(tables: Sequence[SpectrumTable], asked: Sequence[str]) -> RawSpectrum:
     """Return the spectrum of a file, or the selected one of several."""
     if not tables:
         raise InputError("has no table", "one with a wavelength and a flux", key="table")
@@ -79,9 +84,9 @@ def spectrum_in(tables: Sequence[FileTable], asked: Sequence[str]) -> RawSpectru
     return found[0]
 
 
-def _spectrum_of(table: FileTable, asked: Sequence[str]) -> RawSpectrum:
+def _spectrum_of(table: SpectrumTable, asked: Sequence[str]) -> RawSpectrum:
     names = [column.name for column in table.columns]
-    roles = [column.known_role for column in table.columns]
+    roles = table.roles
     known = {plain(name) for name in names} | {plain(f"column {place + 1}") for place in range(len(names))}
     # Words that do not name a column may name a row.
     rest = [word for word in asked if plain(word) not in known]
@@ -96,7 +101,7 @@ def _spectrum_of(table: FileTable, asked: Sequence[str]) -> RawSpectrum:
             raise InputError.of("wavelength_unit", edges, "one unit")
         messages.append(f"its wavelengths are the middles of bins, from {edges}")
     chosen = [table.columns[i] for i in (*choice.wavelength, choice.flux)]
-    cells = [column.values() for column in chosen]
+    cells = [column.cells for column in chosen]
     if holds_arrays(cells[-1]):
         selected = selected_rows(table, choice, cells, rest)
         rows = selected.arrays
@@ -109,7 +114,7 @@ def _spectrum_of(table: FileTable, asked: Sequence[str]) -> RawSpectrum:
         rows = [cells]
     segments = []
     for row in rows:
-        *axes, flux = (numbers(cell, column.name.strip()) for cell, column in zip(row, chosen, strict=True))
+        *axes, flux = (_numbers(cell, column.name.strip()) for cell, column in zip(row, chosen, strict=True))
         segments.append((sum(axes[1:], axes[0]) / len(axes), flux))
         for array, column in zip((axes[0], flux), (chosen[0], chosen[-1]), strict=True):
             if array.ndim != 1:
@@ -129,3 +134,12 @@ def _spectrum_of(table: FileTable, asked: Sequence[str]) -> RawSpectrum:
     return RawSpectrum(
         segments, table, chosen[0].name, chosen[-1].name, axis, flux_role, (*table.messages, *messages),
     )  # fmt: skip
+
+
+def _numbers(cells: Any, name: str) -> Float:
+    """Return cells as numbers; NaN for missing measurements."""
+    if np.asanyarray(cells).dtype.kind == "b":
+        raise InputError(f"{name} holds true and false", "real numbers", key=name, value="true and false")
+    found = Values.of(name, cells, what="its table").numbers()
+    found[~(np.abs(found) < INDEFINITE)] = np.nan
+    return found

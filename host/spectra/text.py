@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,11 +16,12 @@ from mauvecl.schema.text import shortened
 
 from ..tables.medium import medium_of
 from ..tables.missing import is_missing
+from ..tables.table import Values
 from ..tables.text_table import keywords_of, number_in
 from .column_choice import AXES
-from .column_roles import Role
-from .file_table import Column, FileTable
+from .column_roles import Role, role_of
 from .header_units import stated_units
+from .spectrum_table import SpectrumTable
 from .text_header import Header, Split, names_of
 
 #: Units of a text file without stated units (the paper's rule).
@@ -34,7 +36,7 @@ _NOT_FINITE = {"nan", "inf", "-inf"}
 
 def text_tables(
     text: str, name: str, origin: str, asked: Sequence[str], wavelength: bool, flux: bool
-) -> list[FileTable]:
+) -> list[SpectrumTable]:
     """Read the table of a text file.
 
     Parameters
@@ -55,26 +57,31 @@ def text_tables(
     if any(cell.strip()[:1] in ("(", "[") for cell in rows[0][2]):
         return [_table_of_arrays(names, units, rows, name, origin, header)]
     if names:
-        columns = [_column(rows, k, names[k], units[k] if units else None) for k in range(n)]
+        columns = [_column(rows, k, names[k], units[k] if units else "") for k in range(n)]
+        roles = [role_of(one.name, one.unit) for one in columns]
     else:
-        columns = _unnamed(rows, n, asked, messages)
-    columns = _with_units_of(remarks, columns, wavelength, flux, is_named=bool(names))
+        columns = [_column(rows, k, str(k + 1)) for k in range(max(n, 2))]
+        roles = _roles_by_number(n, asked, messages)
+    roles = _with_units_of(remarks, roles, wavelength, flux, is_named=bool(names))
     keywords = keywords_of([f"# {line}" for line, _ in header])
     return [
-        FileTable(columns, name, origin, implied_units=IMPLIED_UNITS, remarks=remarks, messages=tuple(messages),
-                  medium=partial(medium_of, keywords))
+        SpectrumTable(columns, name, origin, implied_units=IMPLIED_UNITS, remarks=remarks, messages=tuple(messages),
+                  medium=partial(medium_of, keywords), known_roles=roles)
     ]  # fmt: skip
 
 
 Row = tuple[int, str, list[str]]
 
 
-def _column(rows: Sequence[Row], place: int, name: str, unit: str | None = None, role: Role | None = None) -> Column:
-    return Column(name, partial(_values, rows, place), unit, role=role)
+def _column(rows: Sequence[Row], place: int, name: str, unit: str = "") -> Values:
+    """Return a column, whose numbers are parsed when they are read."""
+    return Values(
+        name, (len(rows),), lambda start, stop: np.array([_value(row, place) for row in rows[start:stop]]), unit
+    )
 
 
-def _unnamed(rows: Sequence[Row], n: int, asked: Sequence[str], messages: list[str]) -> list[Column]:
-    """Return columns by number: the first two, or those selected by the user."""
+def _roles_by_number(n: int, asked: Sequence[str], messages: list[str]) -> list[Role]:
+    """Return the roles of columns without names: the first two are the spectrum, or those selected by the user."""
     indices = [int(one) - 1 for one in asked if one.isascii() and one.isdigit() and 1 <= int(one[:6]) <= n]
     if len(indices) != len(asked) or len(indices) > 2:
         raise InputError.of("columns", asked, f"their numbers, 1 to {n}")
@@ -82,14 +89,11 @@ def _unnamed(rows: Sequence[Row], n: int, asked: Sequence[str], messages: list[s
         messages.append(f"the first two of its {n} columns are used, which have no names")
     wave, value = (0, 1) if not indices else (0, indices[0]) if len(indices) == 1 else (indices[0], indices[1])
     roles = {wave: Role("wavelength", 1), value: Role("flux", 1)}
-    return [_column(rows, k, str(k + 1), role=roles.get(k, Role("unknown"))) for k in range(max(n, 2))]
+    return [roles.get(k, Role("unknown")) for k in range(max(n, 2))]
 
 
-def _with_units_of(
-    remarks: str, columns: Sequence[Column], wavelength: bool, flux: bool, is_named: bool
-) -> list[Column]:
-    """Return columns with units from remarks if their names and headers state none."""
-    roles = [column.known_role for column in columns]
+def _with_units_of(remarks: str, roles: Sequence[Role], wavelength: bool, flux: bool, is_named: bool) -> list[Role]:
+    """Return roles with units from remarks if the names and headers of columns state none."""
     # A column with an unknown name may be the flux if none is recognised.
     fluxes = ("flux", "model") if any(role.kind in ("flux", "model") for role in roles) else ("unknown",)
     has_axis = any(role.kind in AXES and role.unit for role in roles)
@@ -97,11 +101,8 @@ def _with_units_of(
     axis_unit, flux_unit = stated_units(
         remarks, wavelength=wavelength and not has_axis, flux=flux and not has_flux, is_named=is_named
     )
-    found = []
-    for column, role in zip(columns, roles, strict=True):
-        unit = axis_unit if role.kind in AXES else flux_unit if role.kind in fluxes else None
-        found.append(column if unit is None or role.unit else column.with_unit(unit))
-    return found
+    units = [axis_unit if role.kind in AXES else flux_unit if role.kind in fluxes else None for role in roles]
+    return [role if role.unit else replace(role, unit=unit) for role, unit in zip(roles, units, strict=True)]
 
 
 def _divided(lines: Sequence[str]) -> tuple[Header, list[tuple[int, str]]]:
@@ -185,11 +186,6 @@ def _cells(line: str, mark: str | None, decimal: bool) -> list[str]:
     return [cell.strip().replace(",", ".") if decimal else cell.strip() for cell in cells]
 
 
-def _values(rows: Sequence[Row], place: int) -> Any:
-    """Parse the numbers of a column."""
-    return np.array([_value(row, place) for row in rows])
-
-
 def _value(row: Row, place: int) -> float:
     number, line, cells = row
     if len(cells) <= place:
@@ -207,7 +203,7 @@ def _value(row: Row, place: int) -> float:
 
 def _table_of_arrays(
     names: Sequence[str], units: Sequence[str], rows: Sequence[Row], name: str, origin: str, header: Header
-) -> FileTable:
+) -> SpectrumTable:
     """Return a table whose cells contain arrays, with a spectrum per row, as in Gaia's files."""
     n = len(rows[0][2])
     if not names:
@@ -217,25 +213,32 @@ def _table_of_arrays(
         raise InputError(
             "contains arrays in its cells and no names of columns", "names in its first line", key="columns"
         )
-    columns = [Column(names[k].strip(), _array_reader(rows, k), units[k] if units else None) for k in range(n)]
+    columns = [
+        Values(names[k].strip(), (len(rows),), _array_reader(rows, k), units[k] if units else "") for k in range(n)
+    ]
     known = {column.name.lower(): column for column in columns}
     if "source_id" in known and "wavelength" not in known and "flux" in known:
-        if np.shape(known["flux"].values())[-1:] == GAIA_NM.shape:
-            columns = [known["source_id"], Column("wavelength", lambda: GAIA_NM, "nm"),
-                       Column("flux", known["flux"].values, GAIA_FLUX)]  # fmt: skip
-        return FileTable(
+        if np.shape(known["flux"].cells)[-1:] == GAIA_NM.shape:
+            columns = [
+                known["source_id"],
+                Values.of("wavelength", GAIA_NM, "nm"),
+                replace(known["flux"], unit=GAIA_FLUX),
+            ]
+        return SpectrumTable(
             columns,
             name,
             f"{origin}, Gaia DR3 sampled XP spectrum",
             row_title="Gaia DR3 {}",
             notes=("wavelengths 336 + 2 i nm, W m-2 nm-1: Gaia DR3's documentation",),
         )
-    return FileTable(columns, name, origin, implied_units=IMPLIED_UNITS, remarks="\n".join(line for line, _ in header))
+    return SpectrumTable(
+        columns, name, origin, implied_units=IMPLIED_UNITS, remarks="\n".join(line for line, _ in header)
+    )
 
 
-def _array_reader(rows: Sequence[Row], place: int) -> Callable[[], Any]:
-    def read() -> Any:
-        cells = [cells[place].strip() if place < len(cells) else "" for _, _, cells in rows]
+def _array_reader(rows: Sequence[Row], place: int) -> Callable[[int, int], Any]:
+    def read(start: int, stop: int) -> Any:
+        cells = [cells[place].strip() if place < len(cells) else "" for _, _, cells in rows[start:stop]]
         if not any(cell[:1] in ("(", "[") for cell in cells):
             return np.array(cells)
         arrays = [_array(cell) for cell in cells]

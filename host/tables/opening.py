@@ -105,14 +105,11 @@ def _in_memory(
     content: bytes, form: Form, what: str, commas: bool, expected: str, texts: Collection[str]
 ) -> MemoryTable:
     if form == "VOTable":
-        file = votable_in(content, what)
-        with parsing(what, expected):
-            found = MemoryTable(file.get_first_table().to_table(use_names_over_ids=True), what)
-        found.header |= _systems(file)
-        found.table.meta |= found.header
+        found = next(votables(content, what, expected), None)
+        if found is None:
+            raise InputError(f"{what} has no table", expected, key="file")
         return found
-    if form == "XML":
-        raise InputError(f"{what} is a page or XML", expected, key="file")
+    check_no_page(content, form, what, expected)
     try:
         text = text_of(content)
     except InputError as error:
@@ -122,6 +119,29 @@ def _in_memory(
     found = MemoryTable(text_table(text, what, commas or is_csv(text), expected, texts=texts), what)
     found.header |= keywords_of([line for line in text.splitlines() if line[:1] in "#%!;"])
     return found
+
+
+def check_no_page(content: bytes, form: Form, what: str, expected: str) -> None:
+    """Raise InputError for XML other than VOTable, such as a page of an archive that says that a file is missing."""
+    if form == "XML":
+        start = content[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")[:20]
+        fault = f"{what} is a page or XML that begins with {shortened(start.decode('ascii', 'replace'))}"
+        raise InputError(fault, expected, key="file", value=start)
+
+
+def votables(content: bytes, what: str, expected: str) -> Iterator[MemoryTable]:
+    """Yield the tables of a VOTable, whose parameters and systems of times and coordinates are keywords."""
+    file = votable_in(content, what)
+    shared = {str(one.name or one.ID): one.value for resource in file.resources for one in resource.params}
+    shared |= _systems(file)
+    for table in file.iter_tables():
+        with parsing(what, expected):
+            for field in table.fields:
+                field.name = field.name or field.ID
+            found = MemoryTable(table.to_table(use_names_over_ids=True), what)
+        found.header |= shared | {str(one.name or one.ID): one.value for one in table.params}
+        found.table.meta |= found.header
+        yield found
 
 
 def _systems(file: VOTableFile) -> dict[str, Any]:

@@ -36,11 +36,21 @@ class Values:
     unit: str = ""
     what: str = ""  # the file, for messages
     row_bytes: int = 0  # bytes that are read for a row, if more than those of its values
+    ucd: str = ""  # unified content descriptor of the IVOA
+    description: str = ""
 
     @classmethod
-    def of(cls, name: str, values: Any, unit: object = None, what: str = "") -> Values:
+    def of(
+        cls, name: str, values: Any, unit: object = None, what: str = "", ucd: str = "", description: str = ""
+    ) -> Values:
         """Return values that are in memory."""
-        return cls(name, np.shape(values), lambda start, stop: values[start:stop], text_of_unit(unit), what)
+        unit = text_of_unit(unit)
+        return cls(name, np.shape(values), lambda start, stop: values[start:stop], unit, what, 0, ucd, description)
+
+    @property
+    def cells(self) -> Any:
+        """All rows, as the file has them."""
+        return self.read(0, self.n_rows)
 
     @property
     def n_rows(self) -> int:
@@ -116,7 +126,7 @@ class Values:
                 row = start + place // max(1, int(np.prod(values.shape[1:]))) + 1
                 raise InputError(
                     f"{self.what}: {self.name!r} = {shortened(text, 40)} in row {row}", expected, key=self.name,
-                    value=text,
+                    value=text
                 ) from error  # fmt: skip
         return parsed.reshape(values.shape)
 
@@ -282,4 +292,6 @@ class MemoryTable(TableFile):
         column = self.table[title]
         if isinstance(column, Time):
             return Values.of(name, np.asarray(np.ma.filled(column.mjd, np.nan)), "d", self.what)
-        return Values.of(name, getattr(column, "value", column), getattr(column, "unit", None), self.what)
+        ucd, description = str((column.info.meta or {}).get("ucd", "")), column.info.description or ""
+        unit = getattr(column, "unit", None)
+        return Values.of(name, getattr(column, "value", column), unit, self.what, ucd, description)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import ValidationError, field_validator, model_validator
 
 from mauvecl.host.orbit.observing_limits import Limits
+from mauvecl.host.tables.coordinates import is_missing_position
 from mauvecl.host.tables.names import DECLINATIONS, RIGHT_ASCENSIONS, SPECTRAL_TYPES, STARS, key_of
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, Widget, first
@@ -347,7 +348,7 @@ def _target(
     for key, field in PlanTarget.model_fields.items():
         column = columns.get(key)
         text = rows.text(column, row)
-        if column is None or not text:
+        if column is None or not text or (key == "coordinates" and is_missing_position(text)):
             continue
         unit = first(field, Unit)
         if unit is None and first(field, Range) is None:
@@ -367,13 +368,12 @@ def _target(
     if ra is not None and dec is not None and given:
         east, north = (rows.degrees(name, row, right_ascension=name == ra) for name in (ra, dec))
         one["coordinates"] = f"{east!r} {north!r}"
-    elif (
-        ra is not None and "coordinates" not in one and _is_nan(rows, ra, row) and name_key(one["name"]) not in by_key()
-    ):
-        raise rows.error(
-            f"row {row + 1} has {ra} = nan, and {shortened(one['name'])} is not in the embedded list",
-            "its coordinates, or a name of the list", ra,
-        )  # fmt: skip
+    elif "coordinates" not in one and name_key(name := one.get("name", "")) not in by_key():
+        for column in (ra, columns["coordinates"]):
+            if column is not None and _is_marked_missing(text := str(rows.table[column][row])):
+                fault = f"row {row + 1} has no coordinates ({column} = {' '.join(text.split())}), and {shortened(name)}"
+                expected = "its coordinates, or a name of the list"
+                raise rows.error(f"{fault} is not in the embedded list", expected, column, text)
     for key in PATH_KEYS:
         if folder is not None and isinstance(one.get(key), str):
             one[key] = folder / one[key]
@@ -386,12 +386,9 @@ def _target(
     return one
 
 
-def _is_nan(rows: Rows, name: str, row: int) -> bool:
-    """Return whether a cell is not a number, instead of empty."""
-    import numpy as np
-
-    cell = rows.table[name][row]
-    return not np.ma.is_masked(cell) and str(cell).strip().lower() == "nan"
+def _is_marked_missing(cell: str) -> bool:
+    """Return whether a cell says that a coordinate, or a pair of them, is not a number, instead of being empty."""
+    return cell.strip().lower() == "nan" or is_missing_position(cell)
 
 
 def _is_number(cell: str) -> bool:

@@ -13,10 +13,7 @@ from astropy.io import fits
 from corpus import CORPUS, cases
 from refusals import refused
 
-from mauvecl.host.expectation import expect
-from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.host.spectra.formats import read_spectrum
-from mauvecl.host.stars.source import Source
+from mauvecl import Instrument, Source, expect
 
 HERE = Path(__file__).parents[1] / "data" / "spectra"
 ANGSTROM = {"wavelength_unit": "Angstrom"}
@@ -105,14 +102,19 @@ def test_short_spectra_suffice_for_a_narrower_range() -> None:
 
 def test_messages_of_archive_files() -> None:
     reported = {name: Source.read(HERE / name, **options).messages for name, options, *_ in RIGHT}
-    assert reported["18sco_stis_004.fits"] == ("its own points cover 171.042-31891.2 nm",)
-    assert reported["sun_reference_stis_002.fits"] == ("its own points cover 119.5-2695.74 nm",)
-    assert "its own points cover 290.033-2497.72 nm, 82% of 200-700 nm" in reported["vb8_stiswfcnic_004.fits"]
-    assert any("ASSUMED: flux in erg" in text for text in reported["10lac_stis_001.txt"])
-    assert any("merged; 11 of them differ" in text for text in reported["10lac_stis_001.txt"])
-    assert any("130 of its 2242 points" in text for text in reported["h_stis_ngsl_hd095735_v2.txtA"])
-    assert any("113 of its 1349 points" in text for text in reported["vb8_stiswfcnic_004.fits"])
-    assert any("below 290.033 nm it is continued by M3V" in text for text in reported["vb8_stiswfcnic_004.fits"])
+    for name in ("18sco_stis_004.fits", "sun_reference_stis_002.fits"):
+        assert len(reported[name]) == 1
+    for name, words in (
+        ("18sco_stis_004.fits", "its own points cover 171.042-31891.2 nm"),
+        ("sun_reference_stis_002.fits", "its own points cover 119.5-2695.74 nm"),
+        ("vb8_stiswfcnic_004.fits", "its own points cover 290.033-2497.72 nm, 82% of 200-700 nm"),
+        ("vb8_stiswfcnic_004.fits", "113 of its 1349 points"),
+        ("vb8_stiswfcnic_004.fits", "below 290.033 nm it is continued by M3V"),
+        ("10lac_stis_001.txt", "ASSUMED: flux in erg"),
+        ("10lac_stis_001.txt", "merged; 11 of them differ"),
+        ("h_stis_ngsl_hd095735_v2.txtA", "130 of its 2242 points"),
+    ):
+        assert any(words in text for text in reported[name]), name
 
 
 def test_messages_of_the_star_that_continues_a_spectrum() -> None:
@@ -128,17 +130,6 @@ def test_messages_of_the_continuing_star_are_given_if_dark_ends_are_cut() -> Non
     wavelength = np.arange(90.0, 1100.0)
     spectrum = wavelength, np.where(wavelength < 300.0, 0.0, 1e-12)
     assert any("in M4V, noise rules" in text for text in Source.from_arrays(*spectrum, extend="M4V").messages)
-
-
-def test_start_and_step_in_one_row() -> None:
-    """Read IUE's 640 fluxes from 1750 A in steps of 2.662668 A, which are zero from 3350 A."""
-    read = read_spectrum(HERE / "lwp11854.mxlo")
-    with fits.open(HERE / "lwp11854.mxlo") as hdus:
-        row = hdus[1].data[0]
-        angstrom = float(row["WAVELENGTH"]) + float(row["DELTAW"]) * np.arange(640)
-        flux = np.array(row["FLUX"], float)
-    np.testing.assert_allclose(read.wavelength_nm, angstrom / 10, rtol=1e-12)
-    np.testing.assert_allclose(read.flux_flam, flux, rtol=1e-12)
 
 
 def test_gaia_arrays_in_a_cell() -> None:

@@ -1,92 +1,167 @@
-"""Damaged headers, other libraries' exceptions, and suggestions that can be typed."""
+"""Files that are packed, cut, damaged, too large or no files at all; suggestions of messages can be typed."""
 
 from __future__ import annotations
 
+import bz2
+import gzip
+import lzma
+import os
 import re
+import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from corpus import CORPUS, cases, written
+from refusals import refused
 
-from mauvecl.host.files.parsing import parsing
-from mauvecl.host.spectra.column_choice import as_typed
-from mauvecl.host.spectra.formats import read_spectrum
-from mauvecl.schema.errors import InputError
+from mauvecl import InputError, Source
 
+CASES = dict(cases(CORPUS / "spectrum_files.toml"))
+PACKERS = pytest.mark.parametrize("pack", [gzip.compress, bz2.compress, lzma.compress])
 NM = np.linspace(200.0, 1100.0, 100)
 
 
+def noisy_text(n: int) -> bytes:
+    """Return a spectrum of n points as text that compresses badly."""
+    flux = np.random.default_rng(7).uniform(1e-13, 2e-13, n)
+    return "\n".join(f"{a:.9g} {b:.9e}" for a, b in zip(np.linspace(180.0, 1100.0, n), flux, strict=True)).encode()
+
+
+@pytest.mark.long
+@PACKERS
+def test_compressed_files_of_several_streams_are_unpacked(pack: Callable[[bytes], bytes], tmp_path: Path) -> None:
+    content = noisy_text(60_000)
+    half = len(content) // 2
+    for name, packed in (
+        ("plain", content),
+        ("one", pack(content)),
+        ("two", pack(content[:half]) + pack(content[half:])),
+    ):
+        (tmp_path / name).write_bytes(packed)
+    assert len({Source.read(tmp_path / name).digest for name in ("plain", "one", "two")}) == 1
+
+
+@PACKERS
+def test_truncated_files_raise(pack: Callable[[bytes], bytes], tmp_path: Path) -> None:
+    packed = pack(noisy_text(4000))
+    for size in (8, len(packed) // 2, len(packed) - 1):
+        (tmp_path / "cut").write_bytes(packed[:size])
+        with refused("file"):
+            Source.read(tmp_path / "cut")
+
+
+@pytest.mark.long
+@PACKERS
+def test_decompression_bomb_raises_early(
+    pack: Callable[[bytes], bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "bomb").write_bytes(pack(bytes(64 << 20)))
+    monkeypatch.setenv("MAUVECL_LARGEST_CONTENT_MIB", "16")
+    # Python reserves the memory of the largest file.
+    monkeypatch.setenv("MAUVECL_LARGEST_FILE_MIB", "1")
+    tracemalloc.start()
+    with refused("MAUVECL_LARGEST_CONTENT_MIB", "16"):
+        Source.read(tmp_path / "bomb")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 40 << 20
+
+
+def test_only_regular_files_of_limited_size_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fifo, large = tmp_path / "fifo", tmp_path / "large"
+    os.mkfifo(fifo)
+    names = ("/dev/zero", fifo, tmp_path, tmp_path / "none", "a\0b", "x\ny" * 5000, tmp_path / ("y" * 300), "\ud800")
+    for path in names:
+        with refused("file") as caught:
+            Source.read(path)
+        assert len(str(caught.value)) < 600
+    with large.open("wb") as file:
+        file.truncate((1 << 20) + 1)
+    monkeypatch.setenv("MAUVECL_LARGEST_FILE_MIB", "1")
+    with refused("MAUVECL_LARGEST_FILE_MIB", "1"):
+        Source.read(large)
+    os.truncate(large, 1 << 20)
+    # It is read, and holds no text.
+    with refused("file", "null bytes"):
+        Source.read(large)
+    for value in ("", "-1", "0", "1e3", "99999999", "٣"):
+        monkeypatch.setenv("MAUVECL_LARGEST_FILE_MIB", value)
+        with refused("MAUVECL_LARGEST_FILE_MIB"):
+            Source.read(large)
+
+
 @pytest.mark.parametrize(
-    ("error", "said"),
-    [
-        (ValueError("'NoneType' object has no attribute 'ndim'"), "x cannot be read, expected y"),
-        (KeyError("sequence item 0: expected str"), "x cannot be read, expected y"),
-        (ValueError("Number of columns (2) in line 13, column 4"), "x cannot be read (line 13, column 4), expected y"),
-        (RecursionError("maximum depth"), "x is nested too deeply, expected y"),
-        (OSError(5, "filter returned failure"), "x cannot be read, expected y"),
-        (SystemError(""), "x cannot be read, expected y"),
-    ],
+    "name", ["FITS table plain fits", "FITS image linear fits", "FITS table start and step fits",
+             "content instead of a name text txt", "content instead of a name fits.gz"]
 )  # fmt: skip
-def test_messages_hold_no_text_of_another_library(error: Exception, said: str) -> None:
-    with pytest.raises(InputError) as caught, parsing("x", "y"):
-        raise error
-    assert str(caught.value) == said
-    assert caught.value.__cause__ is error
+def test_damaged_files_raise_or_are_read(name: str, tmp_path: Path) -> None:
+    """Change random bytes of whole files with a fixed seed; only InputError may be raised."""
+    rng = np.random.default_rng(14)
+    path = written(CASES[f"spectrum_files {name}"], tmp_path)
+    content = path.read_bytes()
+    for _ in range(60):
+        damaged = bytearray(content)
+        # Headers stand at the front.
+        for place in rng.integers(0, min(len(damaged), 6000), 6):
+            damaged[place] = rng.integers(32, 127)
+        path.write_bytes(bytes(damaged))
+        try:
+            Source.read(path)
+        except InputError as error:
+            assert "\n" not in str(error)  # noqa: PT017
 
 
-@pytest.mark.parametrize(
-    ("name", "said"),
-    [
-        ("a, b", "FILE[row 2]"), ("a[1]", "FILE[row 2]"), ('"q"', "FILE[row 2]"), (" ", "FILE[row 2]"),
-        ("x" * 41, "FILE[row 2]"), ("two words", "FILE[two words]"), ("twice", "FILE[row 2]"),
-    ],
-)  # fmt: skip
-def test_suggested_part_can_be_typed(name: str, said: str) -> None:
-    assert as_typed(name, "row", 1, ["twice", "twice", "two words"]) == said
+def test_checksums_are_verified(tmp_path: Path) -> None:
+    """Damage a byte of the data and of the header; files without checksums are read as before."""
+    path = written(CASES["spectrum_files FITS table plain fits"] | {"checksum": True}, tmp_path)
+    whole, digest = path.read_bytes(), Source.read(path).digest
+    with fits.open(path) as hdus:
+        start, header = hdus[1].fileinfo()["datLoc"], hdus[1].fileinfo()["hdrLoc"]
+    for place, key in ((start + 8 * 2 * 100 + 13, "DATASUM"), (whole.index(b"FLAM", header), "CHECKSUM")):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1
+        path.write_bytes(bytes(damaged))
+        with refused(key, value=1):
+            Source.read(path)
+    without = bytearray(whole)
+    for key in (b"CHECKSUM=", b"DATASUM ="):
+        at = without.index(key, header)
+        without[at : at + 80] = b"COMMENT".ljust(80)
+    path.write_bytes(bytes(without))
+    assert Source.read(path).digest == digest
 
 
-def rows_named(names: list[str]) -> Any:
-    """Return a writer of a table with a spectrum in each row, named by a column."""
-
-    def write(path: Path) -> None:
-        flux = np.ones((len(names), NM.size)) * np.arange(1, len(names) + 1)[:, None]
-        table = Table({"name": names, "wavelength": np.tile(NM, (len(names), 1)), "flux": flux})
-        table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
-        table.write(path)
-
-    return write
+def with_units(table: Table) -> Table:
+    table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
+    return table
 
 
-def tables_named(names: list[str]) -> Any:
-    """Return a writer of several tables."""
+@pytest.mark.parametrize("names", [
+    ["a, b", "c"], ["GJ 65 [A]", "GJ 65 [B]"], ["x" * 60, "y" * 60], ['"q"', "r"], [" ", "s"], ["two words", "t"],
+    ["twice", "twice"],
+])  # fmt: skip
+def test_suggested_row_is_accepted(names: list[str], tmp_path: Path) -> None:
+    flux = np.ones((len(names), NM.size)) * np.arange(1, len(names) + 1)[:, None]
+    table = Table({"name": names, "wavelength": np.tile(NM, (len(names), 1)), "flux": flux})
+    with_units(table).write(tmp_path / "a.fits")
+    suggestion_is_accepted(tmp_path / "a.fits")
 
-    def write(path: Path) -> None:
-        table = Table({"wavelength": NM, "flux": np.ones(NM.size)})
-        table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
-        hdus = [fits.BinTableHDU(table, name=name) for name in names]
-        fits.HDUList([fits.PrimaryHDU(), *hdus]).writeto(path)
 
-    return write
+@pytest.mark.parametrize("names", [["A,B", "C"], ["A", "B"]])
+def test_suggested_table_is_accepted(names: list[str], tmp_path: Path) -> None:
+    table = with_units(Table({"wavelength": NM, "flux": np.ones(NM.size)}))
+    hdus = [fits.BinTableHDU(table, name=name) for name in names]
+    fits.HDUList([fits.PrimaryHDU(), *hdus]).writeto(tmp_path / "a.fits")
+    suggestion_is_accepted(tmp_path / "a.fits")
 
 
-@pytest.mark.parametrize(
-    "write",
-    [
-        rows_named(["a, b", "c"]),
-        rows_named(["GJ 65 [A]", "GJ 65 [B]"]),
-        rows_named(["x" * 60, "y" * 60]),
-        tables_named(["A,B", "C"]),
-        tables_named(["A", "B"]),
-    ],
-)
-def test_suggestion_of_a_message_is_accepted(write: Any, tmp_path: Path) -> None:
-    path = tmp_path / "a.fits"
-    write(path)
+def suggestion_is_accepted(path: Path) -> None:
     with pytest.raises(InputError) as error:
-        read_spectrum(path)
+        Source.read(path)
     suggested = re.search(r"FILE(\[[^\]]*\])", str(error.value))
     assert suggested is not None, error.value
-    assert read_spectrum(Path(f"{path}{suggested[1]}")).flux_flam.size == NM.size
+    assert Source.read(f"{path}{suggested[1]}").flux_flam.max() == 1.0

@@ -6,26 +6,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from refusals import refused
 
-from mauvecl.host.expectation import Expectation, expect
-from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.host.neighbour_table import read_neighbours
-from mauvecl.host.neighbours import Neighbour, Neighbours
-from mauvecl.host.stars.source import Source
-from mauvecl.noise.comparison import Comparison
-from mauvecl.statistics.linear import Matched
-from mauvecl.statistics.statistic import Setting
+from mauvecl import Expectation, Instrument, Source, Study, expect, simulate
 
-MAUVE = Instrument.load("mauve")
 STAR = Source.from_library("G2V").at_magnitude(7.4)
-B = Neighbour("B", 12.5, 6.9, "V", "K5V")
-C = Neighbour("C", 47.0, 8.0, "V", "F5V")
-FAR = Neighbour("D", 47.47, 1.0, "V", "A0V")
+HEAD = "name,separation,V,sptype"
+B, C, FAR = "B,12.5,6.9,K5V", "C,47.0,8.0,F5V", "D,47.47,1.0,A0V"
 
 
-def seen(star: Source, *neighbours: Neighbour, share: float = 1.0) -> Expectation:
-    return expect(star, MAUVE, exposure=50.0, neighbours=Neighbours(neighbours, share) if neighbours else None)
+def seen(folder: Path, *rows: str, head: str = HEAD, share: float = 1.0) -> Expectation:
+    """Return the expectation of the star with neighbours in a table."""
+    (folder / "near.csv").write_text("\n".join((head, *rows)) + "\n")
+    star = {"library": "G2V", "magnitude": 7.4, "neighbours": str(folder / "near.csv"), "neighbour_share": share}
+    study = {"star": [star], "observation": {"exposure_s": 50.0}}
+    return simulate(Study.build(study, "test")).inputs[0]
+
+
+def alone(star: Source = STAR) -> Expectation:
+    return expect(star, Instrument.load("mauve"), exposure=50.0)
 
 
 def blend(share: float) -> Source:
@@ -38,79 +36,53 @@ def blend(share: float) -> Source:
 
 
 @pytest.mark.parametrize("share", [1.0, 0.3])
-def test_light_and_noise_equal_those_of_the_summed_spectrum(share: float) -> None:
-    x, whole = seen(STAR, B, C, FAR, share=share), seen(blend(share))
+def test_light_and_noise_equal_those_of_the_summed_spectrum(tmp_path: Path, share: float) -> None:
+    x, whole = seen(tmp_path, B, C, FAR, share=share), alone(blend(share))
     np.testing.assert_allclose(x.mean_raw_dn, whole.mean_raw_dn, rtol=1e-9)
     np.testing.assert_allclose(x.variance_dn2, whole.variance_dn2, rtol=1e-9)
     # The signal is the star's alone, and its S/N falls by the noise of the others.
-    np.testing.assert_allclose(x.signal_dn, seen(STAR).signal_dn, rtol=1e-9)
+    np.testing.assert_allclose(x.signal_dn, alone().signal_dn, rtol=1e-9)
     noise = np.sqrt(whole.variance_dn2 - x.n_frames / 12)
-    np.testing.assert_allclose(x.snr(), seen(STAR).signal_dn / noise, rtol=1e-6)
+    np.testing.assert_allclose(x.snr(), alone().signal_dn / noise, rtol=1e-6)
+    budget = x.noise_budget()
+    parts = [budget[name].value ** 2 for name in budget.colnames if name not in ("wavelength", "total")]
+    np.testing.assert_allclose(np.sum(parts, axis=0), budget["total"].value ** 2, rtol=1e-12)
+    assert "neighbour_photon" not in alone().noise_budget().colnames
 
 
-def test_flare_snr_equals_that_of_the_summed_spectrum() -> None:
-    """Compare with sqrt(sum(delta^2 / v)), where v includes the photons of all stars."""
-    quiet, flare, whole = seen(STAR, B, C), seen(STAR.flaring(0.081), B, C), seen(blend(1.0))
-    delta = seen(STAR.flaring(0.081)).recorded_light_dn - seen(STAR).recorded_light_dn
-    expected = np.sqrt(np.sum(delta**2 / whole.variance_dn2))
-    setting = Setting(quiet, ~quiet.saturated, Comparison.of("template", "model"), [flare], None, None)
-    form = Matched().closed_form(setting, flare, flare)
-    assert form.mean / Matched().closed_form(setting, quiet, flare).std == pytest.approx(expected, rel=1e-6)
-
-
-def test_dilution_follows_from_magnitudes() -> None:
+def test_dilution_follows_from_magnitudes(tmp_path: Path) -> None:
     """Check that stars of one type share the light by their magnitudes."""
-    x = seen(STAR, Neighbour("twin", 1.0, 8.4, "V", "G2V"), Neighbour("faint", 1.0, 9.9, "V", "G2V"), share=0.5)
+    x = seen(tmp_path, "twin,1.0,8.4,G2V", "faint,1.0,9.9,G2V", share=0.5)
     assert x.target_share == pytest.approx(1 / (1 + 0.5 * (10**-0.4 + 10**-1.0)), rel=1e-9)
 
 
-def test_stars_beyond_the_fibre_or_without_share_add_nothing() -> None:
-    for x in (seen(STAR, FAR), seen(STAR, B, share=0.0)):
-        np.testing.assert_array_equal(x.variance_dn2, seen(STAR).variance_dn2)
+def test_stars_beyond_the_fibre_or_without_share_add_nothing(tmp_path: Path) -> None:
+    """A star beyond the fibre needs neither magnitude nor type."""
+    for x in (seen(tmp_path, FAR), seen(tmp_path, "x,50,,"), seen(tmp_path, B, share=0.0)):
+        np.testing.assert_array_equal(x.variance_dn2, alone().variance_dn2)
         assert x.target_share == 1.0
-    assert "none within 47.46 arcsec; 1 star beyond does not enter" in seen(STAR, FAR).messages[0]
-
-
-def test_noise_budget_has_the_photons_of_neighbours() -> None:
-    budget = seen(STAR, B).noise_budget()
-    parts = [budget[name].value ** 2 for name in budget.colnames if name not in ("wavelength", "total")]
-    np.testing.assert_allclose(np.sum(parts, axis=0), budget["total"].value ** 2, rtol=1e-12)
-    assert "neighbour_photon" not in seen(STAR).noise_budget().colnames
+    said = " ".join(seen(tmp_path, FAR).messages)
+    assert "none within 47.46 arcsec; 1 star beyond does not enter" in said
 
 
 @pytest.mark.parametrize(
-    ("star", "spectrum", "statement"),
+    ("head", "row", "spectrum", "statement"),
     [
-        (Neighbour("a", 1.0, 9.0, spectral_type="K5V"), "K5V", ""),
-        (Neighbour("b", 1.0, 9.0, spectral_type="k3v"), "K2.5V", ""),
-        (Neighbour("c", 1.0, 9.0, spectral_type="M2V"), "M1V", "of type M2V: M1V, the nearest type"),
-        (Neighbour("d", 1.0, 9.0, temperature_k=6040.0), "F8V", "of 6040 K: F8V (6039 K), the nearest"),
-        (Neighbour("e", 1.0, 9.0, bp_rp=2.95), "M4V", "of BP - RP = 2.95: M4V (2.98), the nearest colour"),
-        (Neighbour("f", 1.0, 9.0, spectral_type="A0V", temperature_k=3000.0), "A0V", ""),
+        (HEAD, "a,1,9,K5V", "K5V", ""),
+        (HEAD, "b,1,9,k3v", "K2.5V", ""),
+        (HEAD, "c,1,9,M2V", "M1V", "of type M2V: M1V, the nearest type"),
+        ("name,separation,V,teff", "d,1,9,6040", "F8V", "of 6040 K: F8V (6039 K), the nearest"),
+        ("name,separation,V,bp_rp", "e,1,9,2.95", "M4V", "of BP - RP = 2.95: M4V (2.98), the nearest colour"),
+        (f"{HEAD},teff", "f,1,9,A0V,3000", "A0V", ""),
     ],
 )
-def test_spectra_are_chosen_and_stated(star: Neighbour, spectrum: str, statement: str) -> None:
-    assert star.spectrum[0] == spectrum
-    assert star.spectrum[1].startswith(statement)
-    assert bool(statement) == bool(star.spectrum[1])
-    assert any("nearest" in text for text in seen(STAR, star).messages) == bool(statement)
+def test_spectra_are_chosen_and_stated(tmp_path: Path, head: str, row: str, spectrum: str, statement: str) -> None:
+    x = seen(tmp_path, row, head=head)
+    light = alone(Source.from_library(spectrum).at_magnitude(9.0)).source_electrons
+    np.testing.assert_allclose(x.neighbour_electrons, light, rtol=1e-9)
+    assert any("nearest" in text for text in x.messages) == bool(statement)
+    assert statement in " ".join(x.messages)
 
 
-def test_missing_values_matter_only_within_the_fibre() -> None:
-    for star in (Neighbour("x", 5.0, 9.0), Neighbour("x", 5.0, spectral_type="G2V")):
-        with refused("neighbours", "x", "5 arcsec"):
-            seen(STAR, star)
-    with refused("spectral_type", "DA2"):
-        seen(STAR, Neighbour("x", 5.0, 9.0, spectral_type="DA2"))
-    seen(STAR, Neighbour("x", 50.0))
-
-
-def test_rows_may_name_spectrum_files(tmp_path: Path) -> None:
-    (tmp_path / "b.txt").write_text("\n".join(f"{nm} 1e-13" for nm in range(180, 751)))
-    (tmp_path / "near.csv").write_text("name,separation,file\nB,3,b.txt\n")
-    (star,), _ = read_neighbours(tmp_path / "near.csv")
-    assert star.source.flux_flam.max() == pytest.approx(1e-13)
-
-
-def test_star_at_the_same_place_is_pointed_out() -> None:
-    assert any("star.neighbours_of" in text for text in seen(STAR, Neighbour("A", 0.3, 7.2, "V", "G2V")).messages)
+def test_star_at_the_same_place_is_pointed_out(tmp_path: Path) -> None:
+    assert any("neighbours_of" in text for text in seen(tmp_path, "A,0.3,7.2,G2V").messages)

@@ -1,81 +1,121 @@
-"""The orbit, compared with SGP4's verification vectors, astropy's frames, and closed forms."""
+"""The orbit and what is seen from it, compared with SGP4's verification, astropy's frames and plain geometry."""
 
+from __future__ import annotations
+
+import sys
+import threading
+import types
+from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import sgp4
+from astropy.table import Table
+from numpy.typing import NDArray
 from refusals import refused
+from scipy.interpolate import RegularGridInterpolator
 
-from mauvecl.host.orbit.earth import direction
-from mauvecl.host.orbit.elements import Elements
-from mauvecl.host.orbit.orbit import MEAN_FROM_D, Orbit, Track
-from mauvecl.host.orbit.time_grid import TimeGrid, utc_text
-from mauvecl.host.tables.times import offline
-from mauvecl.schema.errors import InputError
+import mauvecl
+from mauvecl import InputError, Sky, Study, visible
+from mauvecl.host.orbit.conditions import Particles, Thermal
 
 VECTORS = Path(sgp4.__file__).parent
+PROTONS = Path(mauvecl.__file__).parent / "host" / "orbit" / "protons.ecsv"
+EARTH_KM = 6378.137
+NAMES = ("eps Eri", "AU Mic", "V889 Her", "EK Dra", "DX Leo")
+NO_LIMITS = dict.fromkeys(("earth_limb_deg", "sun_deg", "moon_deg", "declination_deg", "proton_flux"), "none")
+MONTH = {"start": "2026-12-20T06:30", "days": 40.0, "targets": list(NAMES)}
+
+
+def section(**orbit: Any) -> Any:
+    """Return the section of a study that describes the orbit and its times."""
+    return Study.build({"orbit": orbit}, "test").orbit
+
+
+def track(**orbit: Any) -> Any:
+    """Return the positions at the times of a study."""
+    made = section(**orbit)
+    return made.orbit().track(made.times())
+
+
+def seen(**orbit: Any) -> Any:
+    """Return the visibility of the targets of a study."""
+    return visible(Study.build({"orbit": orbit}, "test")).visibility
 
 
 @pytest.fixture(scope="module")
-def orbit() -> Orbit:
-    return Orbit.load()
+def month() -> Any:
+    """Return the visibility of five targets over forty days that include the end of a month."""
+    return seen(**MONTH)
 
 
-@pytest.fixture(scope="module")
-def day(orbit: Orbit) -> Track:
-    """Return the track of a day at the elements' epoch."""
-    return orbit.track(TimeGrid("2026-09-14T12:00", 1.0, 60.0))
+def degrees_between(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the angles between unit vectors of shapes (n, 3) and (k, 3), or (n, 3) each."""
+    cosine = np.einsum("ni,ni->n", one, other) if one.shape == other.shape else one @ other.T
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def verification() -> list[tuple[str, str, list[list[float]]]]:
+def unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def verification() -> list[tuple[str, list[list[float]]]]:
     """Read elements and rows (minutes, x, y, z) of each satellite in the verification of SGP4."""
     lines = (VECTORS / "SGP4-VER.TLE").read_text().splitlines()
-    tles = [(a[:69], b[:69]) for a, b in pairwise(lines) if a[:2] == "1 " and b[:2] == "2 "]
+    tles = [f"{a[:69]}\n{b[:69]}\n" for a, b in pairwise(lines) if a[:2] == "1 " and b[:2] == "2 "]
     blocks: list[list[list[float]]] = []
     for line in (VECTORS / "tcppver.out").read_text().splitlines():
         if line.rstrip().endswith("xx"):
             blocks.append([])
         elif line.strip():
             blocks[-1].append([float(word) for word in line.split()[:4]])
-    return [(*tle, rows) for tle, rows in zip(tles, blocks, strict=True)]
+    return list(zip(tles, blocks, strict=True))
 
 
-def test_positions_equal_those_of_the_sgp4_verification() -> None:
+def test_positions_equal_those_of_the_sgp4_verification(tmp_path: Path) -> None:
     """Check gravity model and fields with all satellites whose lines have correct checksums."""
-    seen = 0
-    for first, second, rows in verification():
+    count = 0
+    for tle, rows in verification():
+        (tmp_path / "one.tle").write_text(tle)
         try:
-            elements = Elements(first, second, "SGP4-VER")
+            elements = section(tle=str(tmp_path / "one.tle")).orbit().elements
         except InputError:
             continue
         for minutes, *place in rows:
             error, position, _ = elements.satellite.sgp4_tsince(minutes)
             if not error:
-                assert position == pytest.approx(place, abs=2e-5), (first, minutes)
-                seen += 1
-    assert seen > 400
+                assert position == pytest.approx(place, abs=2e-5), (tle, minutes)
+                count += 1
+    assert count > 400
 
 
-def test_track_matches_the_verification_vectors() -> None:
+def test_track_matches_the_verification_vectors(tmp_path: Path) -> None:
     """Compare a low orbit at the times of a plan; the text of its epoch is accurate to 20 m."""
-    first, second, rows = next(one for one in verification() if one[0][2:7] == "06251")
-    elements = Elements(first, second, "SGP4-VER")
+    tle, rows = next(one for one in verification() if one[0][2:7] == "06251")
+    (tmp_path / "own.tle").write_text(f"NAME\n{tle}")
+    make = partial(track, tle=str(tmp_path / "own.tle"), kind="tle")
     minutes = np.array([row[0] for row in rows])
     step = float(minutes[1] - minutes[0]) * 60
-    start = utc_text(elements.epoch_jd + (minutes[0] * 60 - step / 2) / 86_400, 6)
-    track = Orbit(elements, "tle").track(TimeGrid(start, len(rows) * step / 86_400, step))
-    assert np.abs(track.of_date_km - np.array(rows)[:, 1:]).max() < 0.02
+    # Times are the middles of steps.
+    epoch = np.datetime64("2006-01-01", "us") + np.timedelta64(round((float(tle[20:32]) - 1) * 86_400e6), "us")
+    start = str(epoch + np.timedelta64(round((minutes[0] * 60 - step / 2) * 1e6), "us"))
+    found = make(start=start, days=len(rows) * step / 86_400, step_s=step)
+    assert np.abs(found.of_date_km - np.array(rows)[:, 1:]).max() < 0.02
 
 
 @pytest.mark.long
-def test_frames_agree_with_astropy(day: Track) -> None:
-    with offline():
-        import astropy.units as u
-        from astropy.coordinates import GCRS, ITRS, TEME, CartesianRepresentation, get_body
-        from astropy.time import Time
+def test_frames_agree_with_astropy() -> None:
+    day = track(start="2026-09-14T12:00", days=1.0)
+    import astropy.units as u
+    from astropy.coordinates import GCRS, ITRS, TEME, CartesianRepresentation, SkyCoord, get_body
+    from astropy.time import Time
+    from astropy.utils import iers
 
+    with iers.conf.set_temp("auto_download", False):
         times = Time(*day.times.julian, format="jd", scale="utc")
         here = TEME(CartesianRepresentation(day.of_date_km.T * u.km), obstime=times)
         there = here.transform_to(GCRS(obstime=times)).cartesian.xyz.to_value("km").T
@@ -88,90 +128,66 @@ def test_frames_agree_with_astropy(day: Track) -> None:
     assert np.abs(place.lat.deg - latitude).max() < 0.001
     assert np.abs(moon - day.bodies.moon_km).max() < 2.0  # 1 arcsec
     assert np.abs(sun / np.linalg.norm(sun, axis=1)[:, None] - day.bodies.sun).max() < 5e-7
+    found = seen(days=0.1, targets=["90 0", "10 85", "200 -30"]).target
+    wanted = SkyCoord([90, 10, 200] * u.deg, [0, 85, -30] * u.deg).cartesian.xyz.value.T
+    np.testing.assert_allclose(found, wanted, atol=1e-12)
 
 
 @pytest.mark.long
-def test_orbit_has_the_documented_values(orbit: Orbit, day: Track) -> None:
+def test_orbit_has_the_documented_values() -> None:
     """Compare with TIME.md, section 5."""
-    from mauvecl.host.orbit.radiation import proton_map
-    from mauvecl.host.orbit.visibility import in_shadow
-
-    elements = orbit.elements
+    elements = section().orbit().elements
     assert elements.period_s / 60 == pytest.approx(94.635, abs=0.001)
     assert elements.axis_km == pytest.approx(6879.0, abs=0.1)
     assert elements.epoch == "2026-09-14T15:42:13"
-    assert day.local_time_h.mean() * 60 == pytest.approx(10 * 60 + 26, abs=0.5)
+    assert track(start="2026-09-14T12:00", days=1.0).local_time_h.mean() * 60 == pytest.approx(626, abs=0.5)
     # Ten whole orbits; a step of 20 s is 0.04 % of them.
-    whole = orbit.track(TimeGrid("2026-09-14T12:00", 10 * elements.period_s / 86_400, 20.0))
-    assert in_shadow(whole).mean() == pytest.approx(0.368, abs=0.002)
-    year = orbit.track(TimeGrid("2026-09-14", 365.0, 7200.0))
+    whole = {"start": "2026-09-14T12:00", "days": 10 * elements.period_s / 86_400, "step_s": 20.0}
+    assert seen(**whole, targets=["Vega"]).shadow.mean() == pytest.approx(0.368, abs=0.002)
+    year = track(start="2026-09-14", days=365.0, step_s=7200.0)
     assert 16.5 < year.beta_deg.min() < 18.5
     assert 27.5 < year.beta_deg.max() < 28.5
-    month = orbit.track(TimeGrid("2026-09-14", 30.0, 60.0))
-    flux = proton_map().at(*month.subsatellite_deg)
-    shares = [100 * float((flux > limit).mean()) for limit in (1, 10, 100)]
+    shares = []
+    for flux in (1.0, 10.0, 100.0):
+        found = seen(start="2026-09-14", days=30.0, targets=["Vega"], limits=NO_LIMITS | {"proton_flux": flux})
+        shares.append(100 * (1 - found.kept_by["anomaly"][0]))
+        if flux == 10.0:
+            inside = [values[~found.seen[:, 0]] for values in found.track.subsatellite_deg]
+            ends = [end for values in inside for end in (values.min(), values.max())]
+            assert ends == pytest.approx([-71, 31, -55, -10], abs=2.0)  # cells are 2 deg wide
     assert shares == pytest.approx([6.3, 5.0, 3.2], abs=0.15)
-    longitude, latitude = (np.asarray(values)[flux > 10] for values in month.subsatellite_deg)
-    ends = [longitude.min(), longitude.max(), latitude.min(), latitude.max()]
-    assert ends == pytest.approx([-71, 31, -55, -10], abs=2.0)  # cells are 2 deg wide
 
 
-def test_mean_orbit_begins_at_the_satellite(orbit: Orbit) -> None:
-    """Check that it begins at SGP4's position, keeps its local time, and is described as a mean orbit."""
-    near = TimeGrid("2026-09-14T15:00", 0.1, 30.0)
-    mean, exact = (Orbit(orbit.elements, kind).track(near) for kind in ("mean", "tle"))
-    apart = np.linalg.norm(mean.of_date_km - exact.of_date_km, axis=1)
-    assert apart.max() < 30  # short-period terms of J2 and the eccentricity
-    later = TimeGrid("2027-06-01", 30.0, 60.0)
-    assert orbit.resolved(later) == "mean"
-    assert np.abs(orbit.track(later).local_time_h - mean.local_time_h.mean()).max() < 0.01
-    assert "mean Sun-synchronous" in orbit.messages(later)[0]
+def test_mean_orbit_begins_at_the_satellite_and_keeps_its_local_time() -> None:
+    """It begins at SGP4's position, follows it for a fortnight but for drag, and is described as a mean orbit."""
+    for start, days, farthest in (("2026-09-14T15:00", 0, 30.0), ("2026-09-28T00:00", 14, None)):
+        mean, exact = (track(start=start, days=0.1, step_s=30.0, kind=kind) for kind in ("mean", "tle"))
+        # Short-period terms of J2 and the eccentricity, and drag, which only SGP4 has.
+        most = farthest or 3 * section().orbit().along_track_km(days)
+        assert np.linalg.norm(mean.of_date_km - exact.of_date_km, axis=1).max() < most
+        assert degrees_between(mean.normal, exact.normal).max() < 0.1
+    later = section(start="2027-06-01", days=30.0)
+    orbit, times = later.orbit(), later.times()
+    assert orbit.resolved(times) == "mean"
+    near = track(start="2026-09-14T15:00", days=0.1, step_s=30.0, kind="mean")
+    assert np.abs(orbit.track(times).local_time_h - near.local_time_h.mean()).max() < 0.01
+    assert "mean Sun-synchronous" in orbit.messages(times)[0]
     # J2 turns the node of these very elements nearly as fast as the Sun moves.
     assert orbit.elements.node_drift_deg_per_day == pytest.approx(0.98565, abs=0.002)
 
 
-def test_mean_orbit_follows_sgp4_for_a_fortnight(orbit: Orbit) -> None:
-    """Compare node and place along the orbit, except for drag, which only SGP4 has."""
-    fortnight = TimeGrid("2026-09-28T00:00", 0.1, 30.0)
-    mean, exact = (Orbit(orbit.elements, kind).track(fortnight) for kind in ("mean", "tle"))
-    assert np.degrees(np.arccos((mean.normal * exact.normal).sum(axis=1))).max() < 0.1
-    apart = np.linalg.norm(mean.of_date_km - exact.of_date_km, axis=1).max()
-    assert apart < 3 * orbit.along_track_km(14)
-
-
-def test_messages_about_the_epoch(orbit: Orbit) -> None:
-    assert orbit.messages(TimeGrid("2026-09-20", 5.0)) == []
-    reported = orbit.messages(TimeGrid("2026-10-10", 5.0))
-    assert len(reported) == 1
-    assert "along its track" in reported[0]
+def test_messages_about_the_epoch() -> None:
+    orbit = section().orbit()
+    assert orbit.messages(section(start="2026-09-20", days=5.0).times()) == []
+    (reported,) = orbit.messages(section(start="2026-10-10", days=5.0).times())
+    assert "along its track" in reported
     assert orbit.along_track_km(30) == pytest.approx(1 + 60 + 0.5 * 5.125e-5 * 900 * 2 * np.pi * 6879.04, rel=1e-4)
-    assert orbit.farthest_d(TimeGrid("2026-10-10", 5.0)) < MEAN_FROM_D
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("no elements here", ("elements",)),
-        ("1 66756U 25276CU  26257.65431682  .00005125  00000+0  22992-3 0  9997\n2 66756", ("elements",)),
-        ("1 66756U\n2 66756", ("elements", "69")),
-    ],
-)
-def test_invalid_elements_raise(tmp_path: Path, text: str, words: tuple[str, ...]) -> None:
-    (tmp_path / "bad.tle").write_text(text)
-    with refused(*words):
-        Orbit.load(tmp_path / "bad.tle")
-
-
-def test_elements_from_a_file(tmp_path: Path, orbit: Orbit) -> None:
-    text = f"MAUVE\n{orbit.elements.first}\n{orbit.elements.second}\n"
-    (tmp_path / "own.tle").write_text(text)
-    assert Orbit.load(tmp_path / "own.tle").elements.satellite.ndot == orbit.elements.satellite.ndot
 
 
 @pytest.mark.parametrize("start", ["2027-01-01", "2027-01-01T11:59:59", "2027-01-01T12:00:01", "2027-01-01T23:59:59.5"])
 def test_days_begin_at_midnight(start: str) -> None:
     """Check all divisions of a date into two numbers by astropy."""
-    times = TimeGrid(start, 1.0, 3600.0)
+    times = section(start=start, days=1.0, step_s=3600.0).times()
     midnight, fraction = times.first
     assert midnight % 1 == 0.5
     assert 0 <= fraction < 1
@@ -179,15 +195,227 @@ def test_days_begin_at_midnight(start: str) -> None:
     assert np.floor(times.julian[1][0]) == 0 or start.endswith("59.5")
 
 
-def test_global_state_is_restored(orbit: Orbit) -> None:
+def test_global_state_is_restored() -> None:
     from astropy.coordinates import solar_system_ephemeris
     from astropy.utils import iers
 
     before = iers.conf.auto_download, solar_system_ephemeris.get()
-    _ = orbit.track(TimeGrid("2027-03-01", 1.0)).beta_deg
+    _ = track(start="2027-03-01", days=1.0).beta_deg
     assert (iers.conf.auto_download, solar_system_ephemeris.get()) == before
 
 
-def test_direction_of_coordinates() -> None:
-    assert direction(90.0, 0.0) == pytest.approx([0, 1, 0], abs=1e-15)
-    assert direction(np.array([0.0, 10.0]), 90.0)[1] == pytest.approx([0, 0, 1], abs=1e-15)
+@pytest.mark.parametrize(
+    ("from_plane_deg", "shares"), [(0.0, (0.622, 0.567, 0.511)), (90 - 39.1, (0.703, 0.607, 0.518))]
+)
+def test_visible_share_of_a_circular_orbit(from_plane_deg: float, shares: tuple[float, ...]) -> None:
+    """Compare with TIME.md, section 5, to 0.5 %: 1 - arccos(cos(rho + x) / cos b) / pi."""
+    when = {"start": "2027-06-01", "days": 10 * section().orbit().elements.period_s / 86_400, "step_s": 10.0}
+    path = track(**when)
+    middle = len(path.normal) // 2
+    angle = np.radians(from_plane_deg)
+    x, y, z = np.cos(angle) * unit(path.position_km)[middle] + np.sin(angle) * path.normal[middle]
+    star = f"{np.degrees(np.arctan2(y, x)) % 360:.9f} {np.degrees(np.arcsin(z)):+.9f}"
+    for margin, share in zip((0.0, 10.0, 20.0), shares, strict=True):
+        found = seen(**when, targets=[star], limits=NO_LIMITS | {"earth_limb_deg": margin}).share[0]
+        assert found == pytest.approx(share, abs=0.005 * share)
+        rho = np.arcsin(EARTH_KM / 6879.0)
+        cosine = np.cos(rho + np.radians(margin)) / np.cos(angle)
+        assert found == pytest.approx(1 - np.arccos(cosine) / np.pi, abs=1e-3)
+
+
+def _agree(found: Any, over_deg: NDArray[np.float64]) -> None:
+    sure = np.abs(over_deg) > 1e-4
+    assert sure.mean() > 0.99
+    assert (found.seen == (over_deg >= 0))[sure].all()
+    np.testing.assert_allclose(found.share, (over_deg >= 0).mean(axis=0), atol=1e-3)
+
+
+def test_limits_apply_to_the_angles(month: Any) -> None:
+    """Compare each limit, computed with cosines in float32, with angles in float64."""
+    path, target = month.track, month.target
+    below = np.degrees(np.arcsin(EARTH_KM / np.linalg.norm(path.position_km, axis=1)))[:, None]
+    moon = unit(path.bodies.moon_km - path.position_km)
+    cone = degrees_between(path.normal, target)
+    declination = np.broadcast_to(np.degrees(np.arcsin(target[:, 2])), cone.shape)
+    for limit, over in (
+        ({"earth_limb_deg": 25.0}, degrees_between(-unit(path.position_km), target) - below - 25.0),
+        ({"sun_deg": 46.0}, degrees_between(path.bodies.sun, target) - 46.0),
+        ({"moon_deg": 25.0}, degrees_between(moon, target) - 25.0),
+        ({"normal_cone_deg": 60.0}, np.abs(cone - 90.0) - 30.0),
+        ({"declination_deg": [-31.0, 0.0]}, np.minimum(-declination, declination + 31.0)),
+    ):
+        found = seen(**MONTH, limits=NO_LIMITS | limit)
+        _agree(found, over)
+        assert list(found.kept_by) == [next(iter(limit)).removesuffix("_deg")]
+        np.testing.assert_allclose(found.kept_by[next(iter(found.kept_by))], found.share)
+    assert (month.share <= np.min(list(month.kept_by.values()), axis=0) + 1e-12).all()
+    assert seen(**MONTH, limits=NO_LIMITS).share == pytest.approx(1.0)
+
+
+def test_shadow_and_eclipse_rule(month: Any) -> None:
+    """It is dark where more than half of the Sun's disk is behind the Earth."""
+    path = month.track
+    below = np.degrees(np.arcsin(EARTH_KM / np.linalg.norm(path.position_km, axis=1)))
+    depth = below - degrees_between(-unit(path.position_km), path.bodies.sun)
+    sure = np.abs(depth) > 1e-6
+    assert (month.shadow == (depth > 0))[sure].all()
+    both, dark, light = (seen(**MONTH, limits={"eclipse": rule}) for rule in ("any", "only", "never"))
+    assert (dark.seen ^ light.seen == both.seen).all()
+    assert not dark.seen[~month.shadow].any()
+    assert month.windows(0).in_shadow_s.sum() == dark.seen[:, 0].sum() * 60
+
+
+def test_windows_sum_to_the_visible_time(month: Any) -> None:
+    names, hours = month.by_month()
+    assert names == ["2026-12", "2027-01"]
+    for k in range(len(NAMES)):
+        windows = month.windows(k)
+        total = month.hours[k]
+        assert windows.length_s.sum() / 3600 == pytest.approx(total)
+        assert hours[:, k].sum() == pytest.approx(total)
+        assert month.by_day(k).sum() == pytest.approx(total)
+        assert month.by_orbit(k).sum() / 60 == pytest.approx(total)
+        assert (windows.in_shadow_s <= windows.length_s).all()
+        assert (windows.start_s[1:] > windows.stop_s[:-1]).all()
+    # Days begin at midnight: the first after 17.5 hours.
+    second = np.floor((month.track.times.seconds / 3600 - 17.5) / 24) == 0
+    assert month.by_day(0)[1] == pytest.approx(month.seen[second, 0].sum() / 60)
+    assert len(month.by_day(0)) == 41
+    # The first of January begins after 11 days and 17.5 hours.
+    split = month.track.times.seconds < (11 * 24 + 17.5) * 3600
+    assert hours[0] == pytest.approx(month.seen[split].sum(axis=0) / 60)
+    # Orbits of 94.6 minutes in forty days.
+    assert len(month.by_orbit(0)) in (609, 610)
+    assert seen(**MONTH, limits={"duty_cycle": 0.5}).hours == pytest.approx(month.hours / 2)
+    long = seen(**MONTH, limits={"shortest_s": 1200.0})
+    for k in range(len(NAMES)):
+        every = month.windows(k)
+        assert long.windows(k).start_s.tolist() == every.start_s[every.length_s >= 1200].tolist()
+
+
+@pytest.mark.parametrize(("west", "middle", "east"), [(170.0, 180.0, -170.0), (-100.0, 0.0, 100.0)])
+def test_polygon_across_the_date_line_or_half_the_earth(west: float, middle: float, east: float) -> None:
+    corners = [[west, -10.0], [middle, -10.0], [east, -10.0], [east, 10.0], [middle, 10.0], [west, 10.0]]
+    found = seen(days=10.0, targets=["Vega"], limits=NO_LIMITS | {"anomaly": corners})
+    longitude, latitude = found.track.subsatellite_deg
+    inside = ((longitude - west) % 360 < (east - west) % 360) & (np.abs(latitude) < 10)
+    assert inside.sum() > 50
+    np.testing.assert_array_equal(found.seen[:, 0], ~inside)
+
+
+def protons(energy: int, longitude: Any, latitude: Any) -> NDArray[np.float64]:
+    """Interpolate the map of protons, whose cells without a row are zero, by scipy."""
+    table = Table.read(PROTONS, format="ascii.ecsv")
+    grid = np.zeros((91, 181))
+    row, column = (
+        np.round((table[name] + half) / 2).astype(int) for name, half in (("latitude", 90), ("longitude", 180))
+    )
+    grid[row, column] = table[f"above_{energy}_mev"]
+    grid[:, 180] = grid[:, 0]
+    at = RegularGridInterpolator((np.arange(-90, 91, 2.0), np.arange(-180, 181, 2.0)), grid)
+    return np.asarray(at(np.column_stack([latitude, longitude])))
+
+
+def test_protons_along_the_orbit(month: Any) -> None:
+    """Compare the limit of the flux above 10 MeV, and hits by protons above 30 MeV, with scipy's interpolation."""
+    place = month.track.subsatellite_deg
+    allowed = seen(**MONTH, limits=NO_LIMITS | {"proton_flux": 10.0}).seen[:, 0]
+    np.testing.assert_array_equal(allowed, protons(10, *place) <= 10.0)
+    hits = Particles(1.0, 0.5).rate_per_cm2_s(month.track)
+    np.testing.assert_allclose(hits, 1.0 + 0.5 * protons(30, *place), rtol=1e-9)
+    assert hits.max() > 100
+
+
+def test_temperature_follows_its_equation() -> None:
+    """Check exp(-t / tau) after a step from shadow to sunlight, and that balance is kept."""
+    thermal = Thermal(20.0, 10.0, 600.0)
+    assert thermal.temperature_c(np.full(50, 1.0), 30.0) == pytest.approx(20.0)
+    light = np.r_[np.zeros(5000), np.ones(100)]
+    found = thermal.temperature_c(light, 30.0)
+    t = 30.0 * np.arange(1, 101)
+    assert found[5000:] == pytest.approx(20 - 10 * np.exp(-t / 600), abs=1e-6)
+    # Steps of any length agree where they meet.
+    assert thermal.temperature_c(np.repeat(light, 3), 10.0)[2::3] == pytest.approx(found, abs=1e-9)
+
+
+def test_zodiacal_light_over_the_year() -> None:
+    """Compare the tables of days with `Sky.at` for each target and month."""
+    when = {"start": "2027-01-01", "days": 360.0, "step_s": 21_600.0, "targets": ["eps Eri", "Vega"]}
+    days = visible(Study.build({"orbit": when}, "test")).by_day
+    for row in days[::30]:
+        try:
+            sky = Sky.at(row["target"], f"{row['day']}T12:00:00")
+        except InputError as error:
+            assert not np.isfinite(row["zodiacal_light"].value)
+            away = float(str(error).split("the Sun is ")[1].split(" deg")[0])
+        else:
+            assert row["zodiacal_light"].value == pytest.approx(sky.surface_brightness, abs=0.01)
+            away = float(sky.description.split(" deg from the Sun")[0].split()[-1])
+        assert row["elongation"].value == pytest.approx(away, abs=0.06)
+
+
+def looked_up(name: str) -> Any:
+    """Return a target that SIMBAD is asked for."""
+    return visible(Study.build({"orbit": {"targets": [name], "days": 0.1, "simbad": True}}, "test")).targets[0]
+
+
+def _simbad(monkeypatch: pytest.MonkeyPatch, query_tap: Callable[[str], object]) -> None:
+    """Replace SIMBAD's query, in astroquery if it is installed, else in a module of the same form."""
+    try:
+        from astroquery.simbad import SimbadClass
+    except ImportError:
+        package, module = types.ModuleType("astroquery"), types.ModuleType("astroquery.simbad")
+        module.Simbad = types.SimpleNamespace(query_tap=query_tap)  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, "astroquery", package)
+        monkeypatch.setitem(sys.modules, "astroquery.simbad", module)
+    else:
+        monkeypatch.setattr(SimbadClass, "query_tap", lambda _, query, **__: query_tap(query))
+
+
+def test_answer_of_simbad_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read degrees and mas of the TAP service, masked values, blanks and quotes."""
+    asked = []
+
+    def answer(query: str) -> Table:
+        asked.append(query)
+        names, rows = ("ra", "dec", "plx_value", "sp_type", "V"), [(10.5, -3.25, 50.0, " K2V ", 7.5)]
+        if "HD 2" in query:
+            rows = [(1.0, 2.0, 0.0, "", 0.0)]
+        table = Table(rows=[] if "HD 3" in query else rows, names=names, masked=True, dtype=(*"fff", "O", "f"))
+        if "HD 2" in query:
+            for column in ("plx_value", "sp_type", "V"):
+                table[column].mask = True
+        return table
+
+    _simbad(monkeypatch, answer)
+    star = looked_up("Barnard's other star")
+    assert (star.ra_deg, star.dec_deg, star.distance_pc, star.magnitude, star.spectral_type, star.source) == (
+        10.5, -3.25, 20.0, 7.5, "K2V", "SIMBAD",
+    )  # fmt: skip
+    assert "ident.id = 'Barnard''s other star'" in asked[0]
+    bare = looked_up("HD 2")
+    assert (bare.name, bare.distance_pc, bare.magnitude, bare.spectral_type) == ("HD 2", None, None, None)
+    with refused("target", "SIMBAD"):
+        looked_up("HD 3")
+
+
+def test_network_failure_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Simulate a network that fails, one that never answers, and missing astroquery."""
+
+    def fails(_: str) -> None:
+        raise ConnectionError("no route to host")
+
+    with monkeypatch.context() as patch:
+        _simbad(patch, fails)
+        with refused("target", "10"):
+            looked_up("HD 1")
+    with monkeypatch.context() as patch:
+        done = threading.Event()
+        _simbad(patch, lambda _: done.wait(60))
+        patch.setattr("mauvecl.host.orbit.targets.TIMEOUT_S", 0.1)
+        with refused("target", "0.1"):
+            looked_up("HD 1")
+        done.set()
+    monkeypatch.setitem(sys.modules, "astroquery.simbad", None)
+    with refused("target"):
+        looked_up("HD 1")

@@ -1,16 +1,12 @@
-"""Detectors whose pixels differ: effects of a map, its files, and refusals."""
+"""Detectors whose pixels differ: effects of a map, and its files."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
-from refusals import refused
 
-from mauvecl.host.expectation import Expectation, expect
-from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.host.instrument.pixel_map import PixelMap
-from mauvecl.host.stars.source import Source
+from mauvecl import Expectation, Instrument, PixelMap, Source, expect
 
 
 def seen(payload: Instrument) -> Expectation:
@@ -49,29 +45,3 @@ def test_written_maps_are_read_back(tmp_path: Path) -> None:
     assert payload.pixel_map is not None
     assert payload.pixel_map.digest == made.digest
     assert payload.sources["pixel_map"] == made.source
-
-
-def test_files_that_are_not_maps_raise(tmp_path: Path) -> None:
-    path = tmp_path / "map.ecsv"
-    for text, refusal in (
-        (None, ("file",)),
-        ("nonsense", ("file",)),
-        ("# %ECSV 1.0\n# ---\n# datatype:\n# - {name: heat, datatype: float64}\nheat\n1.0\n", ("pixel_map", "'heat'")),
-        ("# %ECSV 1.0\n# ---\n# datatype:\n# - {name: pixel, datatype: int64}\npixel\n0\n", ("pixel_map",)),
-        (
-            "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: pixel, datatype: int64}\n# - {name: dark, datatype: float64}\n"
-            "pixel dark\n1 1.0\n",
-            ("pixel", "0", "1", "2"),
-        ),
-        (
-            "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: dark, unit: K, datatype: float64}\ndark\n1.0\n",
-            ("dark", "'K'"),
-        ),
-    ):
-        if text is not None:
-            path.write_text(text)
-        with refused(*refusal):
-            PixelMap.read(path)
-    PixelMap(dark=np.ones(7)).write(path)
-    with refused("pixel_map", "7", "2048"):
-        Instrument.load("mauve").with_(pixel_map=path)

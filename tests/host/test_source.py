@@ -2,25 +2,37 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from pathlib import Path
+from typing import Any
 
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.table import Table
 from refusals import refused
 
-from mauvecl.host.expectation import expect
-from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.host.stars import bands, catalogue
-from mauvecl.host.stars.band_names import ALIASES
-from mauvecl.host.stars.blackbody import blackbody
-from mauvecl.host.stars.source import Source
+import mauvecl
+from mauvecl import Blackbody, Instrument, Source, expect
 
 DATA = Path(__file__).parents[1] / "data"
-LIBRARY = Path(catalogue.__file__).parent / "library"
 FLAM = u.erg / (u.s * u.cm**2 * u.AA)
-NAMES = [str(name) for name in catalogue.library_table()["name"]]
+BANDS = {
+    table.meta["name"]: table
+    for path in (Path(mauvecl.__file__).parent / "host" / "stars" / "library" / "bands").iterdir()
+    for table in [Table.read(path, format="ascii.ecsv")]
+}
+SYSTEMS = ("catalogue", "vega", "ab")
+
+
+def blackbody(nm: np.ndarray, kelvin: float) -> np.ndarray:
+    return Blackbody(kelvin).flux(nm)
+
+
+def ratio(one: Source, other: Source, band: str) -> float:
+    """Return the ratio of the photons of two stars in a band."""
+    return float(10 ** (0.4 * (other.magnitude(band) - one.magnitude(band))))
 
 
 @pytest.fixture(scope="module")
@@ -32,82 +44,31 @@ def grid() -> np.ndarray:
     return np.arange(170.0, 1100.0, 1.0)
 
 
-def test_library_is_small_and_complete() -> None:
-    assert 25 <= len(NAMES) <= 40
-    assert {"B0V", "B2IV", "G2V", "K2.5V", "M3V", "Sun", "Vega"} <= set(NAMES)
-    assert sum(path.stat().st_size for path in LIBRARY.rglob("*") if path.is_file()) < 2e6
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_each_spectrum_is_usable_and_has_an_origin(name: str) -> None:
-    entry = catalogue.embedded(name)
-    assert entry is not None
-    assert all(entry[field] for field in ("origin", "citation", "licence", "treatment", "uv_quality"))
-    source = Source.from_library(name)
-    assert source.wavelength_nm[0] <= 180
-    assert source.wavelength_nm[-1] >= 1050
-    # No zeros where Mauve sees, but for two bins of two Pickles classes that their header names.
-    dark = (source.flux_flam <= 0) & (source.wavelength_nm > 200) & (source.wavelength_nm < 700)
-    assert dark.sum() == 0 or (dark.sum() <= 2 and "zero in 2 bins" in entry["treatment"])
-    header = catalogue.spectrum_table(entry["file"]).meta
-    assert {key: header[key] for key in ("origin", "citation", "licence", "uv_quality")} == {
-        key: entry[key] for key in ("origin", "citation", "licence", "uv_quality")
-    }
-
-
-def test_ultraviolet_quality_of_known_stars() -> None:
-    """Compare HD 40307 from HST with an independent reduction: 2.1e-4, 4.6e-3 and 0.069 of its visual flux."""
-    star = Source.from_library("K3V")
-    assert star.name == "K2.5V"
-
-    def mean(low: float, high: float) -> float:
-        inside = (star.wavelength_nm > low) & (star.wavelength_nm < high)
-        return float(star.flux_flam[inside].mean())
-
-    for (low, high), ratio in (((190, 210), 2.1e-4), ((240, 260), 4.6e-3), ((290, 310), 0.069)):
-        assert mean(low, high) / mean(540, 560) == pytest.approx(ratio, rel=0.05)
-
-
-def test_names_ignore_case_and_blanks() -> None:
-    assert Source.from_library(" g2v ").name == "G2V"
-    assert Source.from_library("hd 40307").name == "K2.5V"
-
-
-@pytest.mark.parametrize("band", ALIASES)
+@pytest.mark.parametrize("band", BANDS)
 @pytest.mark.parametrize("name", ["B2IV", "G2V", "K3V"])
 def test_photometry_equals_synphot(name: str, band: str) -> None:
-    """Compare photons to the last bit and magnitudes to 1e-13 with synphot, also for spectra that end in the band."""
+    """Compare magnitudes to 1e-13 with synphot, also for spectra that end in the band."""
     from synphot import Empirical1D, Observation, SpectralElement, units
 
-    whole, vega, record = Source.from_library(name), Source.from_library("Vega").to_synphot(), bands.band(band)
-    element = SpectralElement(Empirical1D, points=record.wavelength_nm * u.nm, lookup_table=record.throughput)
-    through = np.cumsum(record.throughput)
+    whole, vega, record = Source.from_library(name), Source.from_library("Vega").to_synphot(), BANDS[band].meta
+    nm_of_band, throughput = (np.asarray(BANDS[band][column], float) for column in BANDS[band].colnames)
+    element = SpectralElement(Empirical1D, points=nm_of_band * u.nm, lookup_table=throughput)
+    through = np.cumsum(throughput)
     # Where the spectrum ends within the band, one that is there leaves 0.5 % of its throughput out.
-    last = record.wavelength_nm[np.searchsorted(through, 0.995 * through[-1])]
+    last = nm_of_band[np.searchsorted(through, 0.995 * through[-1])]
     inside = whole.wavelength_nm < max(last, 751.0)
     for source in (whole, Source.from_arrays(whole.wavelength_nm[inside], whole.flux_flam[inside])):
-        nm, flux = source.wavelength_nm, source.flux_flam
-        grid = np.union1d(nm, record.wavelength_nm) * 10.0
+        grid = np.union1d(source.wavelength_nm, nm_of_band) * 10.0
         with warnings.catch_warnings():
             # It tells that it tapers.
             warnings.simplefilter("ignore")
             seen = Observation(source.to_synphot(), element, binset=grid, force="taper")
-        assert bands.photons(nm, flux, band) == seen.integrate().value
-        for system in bands.SYSTEMS:
-            ab = system == "ab" or (system == "catalogue" and record.system == "AB")
+        for system in SYSTEMS:
+            ab = system == "ab" or (system == "catalogue" and record["system"] == "AB")
             exact = seen.effstim(u.ABmag if ab else units.VEGAMAG, vegaspec=vega, wavelengths=seen.binset).value
-            exact += record.vega if system == "catalogue" and not ab else 0.0
+            exact += float(record["vega"]) if system == "catalogue" and not ab else 0.0
             assert source.magnitude(band, system) == pytest.approx(exact, abs=1e-13)
     assert whole.at_magnitude(5.0, band).magnitude(band) == pytest.approx(5.0, abs=1e-9)
-
-
-@pytest.mark.parametrize("kelvin", [1000.0, 5772.0, 10_000.0, 200_000.0])
-def test_blackbody_equals_astropy_to_the_last_bit(kelvin: float) -> None:
-    from astropy.modeling.physical_models import BlackBody
-
-    unit = u.erg / (u.s * u.cm**2 * u.AA * u.sr)
-    model = BlackBody(temperature=kelvin * u.K, scale=1.0 * unit)
-    assert np.array_equal(blackbody(grid(), kelvin), np.pi * model(grid() * u.nm).to_value(unit))
 
 
 def test_vega_has_its_catalogued_magnitude_and_ten_is_fainter(sun: Source) -> None:
@@ -115,25 +76,19 @@ def test_vega_has_its_catalogued_magnitude_and_ten_is_fainter(sun: Source) -> No
     vega = Source.from_library("Vega")
     for band, catalogued in (("B", 0.03), ("V", 0.03), ("TESS", 0.0), ("Gaia G", 0.023), ("GALEX NUV Vega", 0.0)):
         assert vega.magnitude(band) == pytest.approx(catalogued, abs=1e-9)
-    for band in ALIASES:
+    for band in BANDS:
         assert vega.magnitude(band, "vega") == pytest.approx(0.0, abs=1e-9)
     for band in ("Kepler", "GALEX NUV"):
         assert vega.magnitude(band) == vega.magnitude(band, "ab")
     np.testing.assert_allclose(sun.at_magnitude(9.9).flux_flam, 0.1 * sun.at_magnitude(7.4).flux_flam, rtol=1e-9)
 
 
-@pytest.mark.parametrize("system", bands.SYSTEMS)
-def test_scaling_to_a_magnitude_in_any_system(sun: Source, system: bands.System) -> None:
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_scaling_to_a_magnitude_in_any_system(sun: Source, system: Any) -> None:
     star = sun.at_magnitude(7.4, "Kepler", system)
     assert star.magnitude("Kepler", system) == pytest.approx(7.4, abs=1e-9)
-    assert (
-        star.scale
-        == {
-            "catalogue": "Magnitudes in Kepler are as in catalogues: AB.",
-            "vega": "Magnitudes in Kepler have Vega at 0, unlike catalogues'.",
-            "ab": "Magnitudes in Kepler are AB.",
-        }[system]
-    )
+    wanted = {"catalogue": "as in catalogues: AB", "vega": "have Vega at 0", "ab": "are AB"}[system]
+    assert wanted in star.scale
     # The flare's photons do not hang on what a magnitude means.
     np.testing.assert_allclose(
         star.flaring(0.24).flux_flam * (sun.flux_flam[0] / star.flux_flam[0]), sun.flaring(0.24).flux_flam
@@ -164,8 +119,7 @@ def test_flares_rise_by_their_amplitude(sun: Source, band: str, amplitude: float
         sun.flaring(amplitude / 4, 12_000, band=band, geometry="replaces", photosphere_temperature=5800),
     ):
         expected = amplitude if "added" in flare.history[-1] else amplitude / 4
-        photons = [bands.photons(s.wavelength_nm, s.flux_flam, band) for s in (sun, flare)]
-        assert photons[1] / photons[0] - 1 == pytest.approx(expected, abs=1e-9)
+        assert ratio(flare, sun, band) - 1 == pytest.approx(expected, abs=1e-9)
 
 
 def test_added_flare_is_a_blackbody(sun: Source) -> None:
@@ -180,8 +134,7 @@ def test_replacing_flare_hides_photosphere(sun: Source) -> None:
     """Compare with the exact area-weighted sum of two blackbodies, for a star that is a blackbody."""
     cool, hot, filling = (blackbody(grid(), t) for t in (5000.0, 10_000.0, 5000.0))
     star = Source.from_arrays(grid(), cool)
-    ratio = bands.photons(grid(), hot, "Kepler") / bands.photons(grid(), cool, "Kepler")
-    f = 0.1 / (ratio - 1)
+    f = 0.1 / (ratio(Source.from_arrays(grid(), hot), star, "Kepler") - 1)
     flare = star.flaring(0.1, 10_000, geometry="replaces", photosphere_temperature=5000)
     np.testing.assert_allclose(flare.flux_flam, (1 - f) * filling + f * hot, rtol=1e-9)
 
@@ -197,16 +150,6 @@ def test_replacing_flare_uses_the_photosphere_of_the_star(sun: Source) -> None:
     assert not np.array_equal(
         own.flux_flam, sun.flaring(0.1, geometry="replaces", photosphere_temperature=4783).flux_flam
     )
-    unknown = Source.from_arrays(sun.wavelength_nm, sun.flux_flam)
-    with refused("photosphere_temperature"):
-        unknown.flaring(0.1, geometry="replaces")
-
-
-def test_uncovered_band_raises() -> None:
-    short = Source.from_arrays(np.arange(175.0, 751.0), np.ones(576))
-    assert np.isfinite(short.magnitude("V"))
-    with refused("band", "175-750", "99%", "TESS"):
-        short.flaring(0.1, band="TESS")
 
 
 def test_dust_dims_the_blue_most(sun: Source) -> None:
@@ -237,10 +180,8 @@ def test_spectra_in_memory(sun: Source) -> None:
     np.testing.assert_allclose(Source.from_specutils(spectrum).flux_flam, sun.flux_flam)
     body = Source.from_synphot(SourceSpectrum(BlackBodyNorm1D, temperature=6000))
     inside = (body.wavelength_nm > 200) & (body.wavelength_nm < 700)
-    ratio = body.flux_flam[inside] / blackbody(body.wavelength_nm[inside], 6000.0)
-    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-3)
-    with refused("flux"):
-        Source.from_arrays(grid() * u.s, grid())
+    shape = body.flux_flam[inside] / blackbody(body.wavelength_nm[inside], 6000.0)
+    np.testing.assert_allclose(shape, shape[0], rtol=1e-3)
 
 
 GOOD = grid() * 1e-15
@@ -266,11 +207,6 @@ def test_short_spectra_raise_for_the_nominal_range(kept: slice, refusal: tuple[s
     np.testing.assert_array_equal(expect(star, narrow, exposure=5.0).source_electrons, whole.source_electrons)
 
 
-def test_missing_file_raises(tmp_path: Path) -> None:
-    with refused("file"):
-        Source.read(tmp_path / "no.txt")
-
-
 def test_sources_are_frozen_and_digested(sun: Source) -> None:
     with pytest.raises(ValueError, match="read-only"):
         sun.flux_flam[0] = 1.0
@@ -285,6 +221,7 @@ def test_other_numbers_of_the_span() -> None:
     finer = np.append(180.1, grid()[11:])
     short = Source.from_arrays(finer, np.interp(finer, grid(), hot), name="short")
     assert any("starts at 180.1 nm and is continued to 180 nm" in text for text in short.messages)
+    assert short.flux_flam[0] == pytest.approx(short.flux_flam[1:][np.abs(finer - finer[0]) <= 5.0].mean())
     mauve = Instrument.load("mauve")
     one, other = (expect(star.at_magnitude(5.0), mauve, exposure=5.0) for star in (whole, short))
     np.testing.assert_allclose(one.source_electrons, other.source_electrons, rtol=2e-4)
@@ -315,8 +252,6 @@ def test_extension_by_another_star(sun: Source) -> None:
         )
     with refused("extend"):
         Source.from_arrays(short[0], np.where(short[0] > 600, short[1], 0.0) - 1e-30, extend="G2V")
-    with refused("extend", "3000-3002", "0%", "200-700"):
-        Source.from_arrays([3000.0, 3001.0, 3002.0], [1.0, 1.0, 1.0], extend="G2V")
     whole = Source.from_arrays(sun.wavelength_nm, sun.flux_flam, extend="G2V")
     assert "reaches no farther and is not used" in whole.messages[-1]
 
@@ -352,28 +287,26 @@ def test_mean_too_far_below_zero_raises() -> None:
         expect(star.at_magnitude(2.0), Instrument.load("mauve"), exposure=50.0)
 
 
-def test_standard_error_equals_the_scatter_of_means() -> None:
-    """Compare with the scatter of 200 spectra with white noise.
+def test_stated_error_of_a_mean_equals_the_scatter_of_means() -> None:
+    """Compare the error in the refusal of a mean far below zero with the scatter of the means of 100 spectra.
 
-    The standard deviation of 200 draws is accurate to 5 %, and the reported error, a mean over 20 of them, to 3 %. The
-    limits of 0.75 and 1.25 lie beyond four standard deviations: false failures of any of ten pixels in < 1e-3 of seeds.
+    The standard deviation of 100 draws is accurate to 7 %, and the mean of 20 stated errors to 5 %. The limits of 0.7
+    and 1.3 lie beyond three standard deviations of their ratio: false failures for less than 3e-3 of seeds.
     """
-    from mauvecl.host.measured_noise import standard_error_per_second
-    from mauvecl.host.response import electrons_per_second
-
-    mauve = Instrument.load("mauve")
-    nm = np.arange(170.0, 800.0, 0.5)
+    mauve, nm = Instrument.load("mauve"), np.arange(170.0, 800.0, 0.5)
     rng = np.random.default_rng(5)
-    draws = [1e-12 + 1e-13 * rng.standard_normal(nm.size) for _ in range(200)]
-    means = np.array([electrons_per_second(mauve, nm, flux) for flux in draws])
-    reported = np.mean(
-        [standard_error_per_second(Source.from_arrays(nm, flux), mauve, "paper") for flux in draws[:20]], axis=0
-    )
-    ratio = (reported / means.std(axis=0))[100:1600:150]
-    assert (np.abs(ratio - 1) < 0.25).all(), ratio
 
+    def star(level: float) -> Source:
+        noise = 1e-11 * rng.standard_normal(nm.size)
+        return Source.from_arrays(nm, np.where(nm > 350.0, 2e-10, level) + noise)
 
-def test_nearly_equal_wavelengths_count_as_one() -> None:
-    nm = np.insert(grid(), 100, np.nextafter(grid()[100], 0))
-    with refused("wavelength"):
-        Source.from_arrays(nm, 1e-15 * nm)
+    drawn = [expect(star(2e-10), mauve, exposure=5000.0, sky=22.1).source_electrons for _ in range(100)]
+    scatter, ratios = np.std(drawn, axis=0), []
+    for _ in range(20):
+        with refused("bin_nm") as caught:
+            expect(star(-1e-10), mauve, exposure=5000.0)
+        at, error = (
+            float(re.search(words, str(caught.value))[1]) for words in (r"at ([\d.]+) nm", r"error of ([\d.e+]+)")
+        )
+        ratios.append(error / np.interp(at, mauve.wavelength_nm, scatter))
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.3)
