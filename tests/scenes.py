@@ -7,14 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.expectation import Expectation, expect
-from mauvecl.host.instrument.instrument import Instrument
+from mauvecl import SHAPES, Expectation, Instrument, Sky, Source, Stare, expect
 from mauvecl.host.neighbours import Neighbour, Neighbours
-from mauvecl.host.sky.zodiacal import Sky
-from mauvecl.host.stars.source import Source
-from mauvecl.lightcurve.flares.shapes import SHAPES, Shape
+from mauvecl.lightcurve.flares.shapes import Shape
 from mauvecl.lightcurve.stares.frame_components import Components
-from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.stares.stare_requests import StaresRequest
 
 Float = NDArray[np.float64]

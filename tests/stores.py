@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mauvecl.device.engine import Engine
+from mauvecl import Engine, Study
 from mauvecl.host.files import atomic
-from mauvecl.study.study import Study
 
 CHUNK, LAST = "star-1/quiescent/c/1/0", "star-1/flare-1/c/4/0"
 

@@ -8,8 +8,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 
-from mauvecl import Instrument, Source, Study
-from mauvecl.schema.errors import InputError
+from mauvecl import InputError, Instrument, Source, Study
 from mauvecl.schema.quantities import numbers
 
 

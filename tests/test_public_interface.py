@@ -18,14 +18,13 @@ from typing import Any
 from typer.main import get_command
 
 import mauvecl
+from mauvecl import Instrument, Study
 from mauvecl.answers.verbs import VERBS
 from mauvecl.cli.app import app
-from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.observations.mapping import FrameMapping
 from mauvecl.schema.fields import Unit, first
 from mauvecl.schema.section import fields_of
 from mauvecl.schema.tables import Column
-from mauvecl.study.study import Study
 
 FILE = Path(__file__).parent / "data" / "public_interface.txt"
 #: What is listed, with the least number of lines; fewer would mean that the listing lost sight of something.

@@ -16,19 +16,7 @@ from astropy.io import fits
 from astropy.table import QTable
 from commands import ended, run, started
 
-from mauvecl import (
-    CosmicRays,
-    Engine,
-    Normal,
-    Processes,
-    Source,
-    Study,
-    Uniform,
-    __version__,
-    detect,
-    expect,
-    simulate,
-)
+from mauvecl import CosmicRays, Engine, Normal, Processes, Source, Study, Uniform, __version__, detect, expect, simulate
 
 
 @pytest.fixture(scope="module")
