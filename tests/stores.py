@@ -12,7 +12,6 @@ import pytest
 from numpy.typing import NDArray
 
 from mauvecl import Engine, Study
-from mauvecl.host.files import atomic
 
 CHUNK, LAST = "star-1/quiescent/c/1/0", "star-1/flare-1/c/4/0"
 
@@ -87,4 +86,4 @@ def full_after(n_bytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
             raise OSError(28, "No space left on device")
         real(handle)
 
-    monkeypatch.setattr(atomic.os, "fsync", fsync)
+    monkeypatch.setattr(os, "fsync", fsync)

@@ -112,7 +112,7 @@ def test_energies_equal_those_of_the_light(name: str) -> None:
         scale = EnergyScale.of_star(star, 5.0, flare=spectrum, kind=kind)
         assert scale.erg_per_s == pytest.approx(energy, rel=5e-3), kind
     # The same energies are those of a simulated stare.
-    short = ["stare.duration_s=600", "observation.exposure_s=5"]
+    short = ["stare.duration_s=600", "observation.exposure_s=5", "stare.search=false"]
     (flare,) = stare(study_of(name).with_settings(short)).stares[0].flares
     duration = flare.event.equivalent_duration_s
     assert flare.bolometric_erg == pytest.approx(whole * duration, rel=5e-3)
@@ -127,7 +127,7 @@ def test_answers_take_any_spectrum(name: str) -> None:
     wanted = [expect(s, mauve, exposure=50.0) for s in (star, star.flaring(0.05, spectrum=TEXTS[name][1]))]
     (found,) = expectations(study)
     assert snr_of(*found) == pytest.approx(snr_of(*wanted), rel=1e-9)
-    one = study.with_settings(["stare.duration_s=600", "observation.exposure_s=5"])
+    one = study.with_settings(["stare.duration_s=600", "observation.exposure_s=5", "stare.search=false"])
     staring = stare(one).stares[0].staring
     quiet, lit = (x.source_electrons for x in expectations(one)[0])
     np.testing.assert_allclose(0.05 * staring.flare_electrons[0], lit - quiet, rtol=1e-6, atol=1e-9)
