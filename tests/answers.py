@@ -6,12 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from mauvecl.device.engine import Engine
-from mauvecl.results.detection.detection import Detection
+from mauvecl import Detection, Engine, Study
 from mauvecl.results.requests.requests import DetectRequest, Shard
 from mauvecl.results.shard_sums import DetectionSums
 from mauvecl.results.snr import Counts, SnrResult
-from mauvecl.study.study import Study
 
 #: Realisations: several shards, the last a short one.
 N = 30_000

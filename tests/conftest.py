@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 from scenes import instrument, star
 
-from mauvecl.device.engine import Engine
-from mauvecl.host.expectation import Expectation
+from mauvecl import Engine, Expectation
 from mauvecl.runs import shards
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from mauvecl.schema.errors import InputError
+from mauvecl import InputError
 
 _ANY = object()
 

@@ -7,14 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.expectation import Expectation, expect
-from mauvecl.host.instrument.instrument import Instrument
+from mauvecl import SHAPES, Expectation, Instrument, Sky, Source, Stare, expect
 from mauvecl.host.neighbours import Neighbour, Neighbours
-from mauvecl.host.sky.zodiacal import Sky
-from mauvecl.host.stars.source import Source
-from mauvecl.lightcurve.flares.shapes import SHAPES, Shape
 from mauvecl.lightcurve.stares.frame_components import Components
-from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.stares.stare_requests import StaresRequest
 
 Float = NDArray[np.float64]
@@ -62,7 +57,7 @@ def flaring_stares(method: Any = "cumulants", **more: Any) -> StaresRequest:
 
 
 def flare(
-    time_s: Float, frame_s: float, peak_s: float, half_width_s: float, shape: Shape = SHAPES["davenport2014"]
+    time_s: Float, frame_s: float, peak_s: float, half_width_s: float, shape: Any = SHAPES["davenport2014"]
 ) -> Float:
     """Return the mean of a flare of unit amplitude over each frame."""
     edges = np.column_stack([time_s - frame_s / 2, time_s + frame_s / 2])

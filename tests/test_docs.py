@@ -12,10 +12,9 @@ from typing import Any
 
 from typer.main import get_command
 
+from mauvecl import Instrument, Study
 from mauvecl.cli.app import app
-from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.observations.mapping import FrameMapping
-from mauvecl.study.study import Study
 
 ROOT = Path(__file__).parent.parent
 #: `mauvecl/results/detection/roc.py`, or with a name in it: `mauvecl/results/detection/roc.py: Roc`.

@@ -20,7 +20,7 @@ from astropy.io import fits
 from commands import run
 from layouts import documented_files
 
-from mauvecl.study.study import Study
+from mauvecl import Study
 
 ROOT = Path(__file__).parent.parent
 #: Appended to a verb's flags, so that it ends in seconds: what it prints has the same form.

@@ -29,7 +29,7 @@ from golden_inputs import write_inputs
 from marks import long_but
 from numpy.typing import NDArray
 
-from mauvecl.study.study import Study
+from mauvecl import Study
 from mauvecl.web.state import State
 
 GOLDEN = Path(__file__).parent / "data" / "golden"

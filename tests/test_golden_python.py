@@ -65,7 +65,7 @@ from mauvecl import (
     shortest_exposure,
     smallest_amplitude,
     what_matters,
-)  # fmt: skip
+)
 from mauvecl.device.selftest import digests
 from mauvecl.host.neighbours import Neighbour, Neighbours
 from mauvecl.host.stars.catalogue import names

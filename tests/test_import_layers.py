@@ -11,8 +11,6 @@ from typing import Any
 
 import pytest
 
-from mauvecl.answers.verbs import VERBS
-
 ROOT = Path(__file__).parent.parent
 #: Forbidden imports: upwards, upwards for types only, upwards inside a package, and pyopencl outside `device`.
 FORBIDDEN = {
@@ -34,32 +32,6 @@ FORBIDDEN = {
         "mauvecl.answers.signal.snr -> mauvecl.answers.limits.limits",
     ),
     "study/study.py": ("def late():\n    import pyopencl", "mauvecl.study.study -> pyopencl"),
-}
-#: Modules that import the study besides the verbs.
-TAKE_STUDIES = {
-    "answers.answer",
-    "answers.detection.unknown_table",
-    "answers.limits.assumptions",
-    "answers.verbs",
-    "cli.foresight",
-    "cli.question",
-    "cli.session",
-    "cli.verbs.about",
-    "mauvecl",
-    "store.bulk",
-    "store.description",
-    "store.layout",
-    "study.assumptions",
-    "study.cases",
-    "study.keys",
-    "study.stare_expectation",
-    "study.unknowns",
-    "web.closed_forms",
-    "web.commands",
-    "web.downloads",
-    "web.question",
-    "web.simulations",
-    "web.tabs.tab",
 }
 
 
@@ -99,15 +71,6 @@ def test_modules_form_no_circle() -> None:
     grimp = pytest.importorskip("grimp")
     graph = grimp.build_graph("mauvecl", cache_dir=None)
     TopologicalSorter({module: graph.find_modules_directly_imported_by(module) for module in graph.modules}).prepare()
-
-
-def test_only_verbs_and_their_surroundings_import_the_study() -> None:
-    """Answers take cases: besides the verbs themselves, only these import the study, for its type at least."""
-    grimp = pytest.importorskip("grimp")
-    graph = grimp.build_graph("mauvecl", cache_dir=None)
-    verbs = {f"mauvecl.answers.{verb.home}" for verb in VERBS.values()}
-    found = graph.find_modules_that_directly_import("mauvecl.study.study") - verbs
-    assert {module.removeprefix("mauvecl.") for module in found} == TAKE_STUDIES
 
 
 def packages_in(graph: Any, package: str) -> set[str]:

@@ -12,13 +12,11 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable, Table
+from commands import run
 from refusals import refused
 from scenes import star
-from typer.testing import CliRunner
 
-from mauvecl import Source
-from mauvecl.cli.app import app
-from mauvecl.host.stars.blackbody import blackbody
+from mauvecl import Blackbody, Source
 from mauvecl.host.stars.flare_table import flares_of, read_flares
 from mauvecl.study.sections import amplitudes_in
 
@@ -46,7 +44,7 @@ def test_stsynphot_spectrum_is_read(recwarn: pytest.WarningsRecorder) -> None:
     parser = pytest.importorskip("stsynphot.spparser")
     found = Source.from_synphot(parser.parse_spec("rn(bb(9000),box(5500,100),15,abmag)"))
     assert found.at_magnitude(8.0).magnitude("V") == pytest.approx(8.0, abs=1e-6)
-    body = Source.from_arrays(found.wavelength_nm, blackbody(found.wavelength_nm, 9000.0))
+    body = Source.from_arrays(found.wavelength_nm, Blackbody(9000.0).flux(found.wavelength_nm))
     np.testing.assert_allclose(found.at_magnitude(8.0).flux_flam, body.at_magnitude(8.0).flux_flam, rtol=1e-3)
 
 
@@ -93,12 +91,8 @@ def test_altaipony_table_is_read(tmp_path: Path) -> None:
     table = read_flares(file)
     np.testing.assert_array_equal(table["amplitude"], [0.081, 0.24, 0.081])
     np.testing.assert_array_equal(table["start"].to_value("d"), [1325.301, 1330.117, 1331.2])
-    done = CliRunner().invoke(
-        app,
-        ["detect", "--star", "G2V", "-m", "7.4", "--flares", str(file), "--flare-band", "TESS", "-n", "100000",
-         "--no-pictures", "--quiet", "-o", str(tmp_path / "out")],
-    )  # fmt: skip
-    assert done.exit_code == 0, done.output
+    words = ("--flares", file, "--flare-band", "TESS", "-n", "100000", "--no-pictures", "--quiet", "-o", "out")
+    run("detect", "--star", "G2V", "-m", "7.4", *words, folder=tmp_path)
     found = QTable.read(tmp_path / "out" / "detection.ecsv", format="ascii.ecsv")
     assert sorted(set(found["amplitude"])) == [0.081, 0.24], "each amplitude once"
 
@@ -145,10 +139,7 @@ def test_invalid_tables_of_flares_raise(tmp_path: Path, text: str) -> None:
 
 
 def test_fits_tables_are_valid(tmp_path: Path) -> None:
-    done = CliRunner().invoke(
-        app, ["simulate", "--star", "G2V", "-m", "7.4", "--no-pictures", "--quiet", "-o", str(tmp_path)]
-    )
-    assert done.exit_code == 0, done.output
+    run("simulate", "--star", "G2V", "-m", "7.4", "--no-pictures", "--quiet", "-o", ".", folder=tmp_path)
     file = tmp_path / "observation-1.fits"
     with fits.open(file) as hdus:
         assert hdus[1].columns["wavelength"].unit == "nm"

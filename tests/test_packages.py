@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import pytest
 
-from mauvecl.host.version import VERSION
+import mauvecl
 
 pytestmark = pytest.mark.long
 
@@ -38,6 +38,7 @@ FILES = (
 )
 MADE = ("__pycache__", "_build", "_generated", "jupyter_execute", ".ipynb_checkpoints", "*_cache", ".hypothesis",
         "node_modules")  # fmt: skip
+VERSION = mauvecl.__version__
 WHEEL = f"mauvecl-{VERSION}-py3-none-any.whl"
 SDIST = f"mauvecl-{VERSION}.tar.gz"
 BUILD = """import sys

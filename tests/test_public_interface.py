@@ -15,21 +15,19 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from study_keys import fields, metadata
 from typer.main import get_command
 
 import mauvecl
-from mauvecl.answers.verbs import VERBS
+from mauvecl import Instrument, Study
 from mauvecl.cli.app import app
-from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.observations.mapping import FrameMapping
-from mauvecl.schema.fields import Unit, first
-from mauvecl.schema.section import fields_of
-from mauvecl.schema.tables import Column
-from mauvecl.study.study import Study
 
 FILE = Path(__file__).parent / "data" / "public_interface.txt"
 #: What is listed, with the least number of lines; fewer would mean that the listing lost sight of something.
 LEAST = {"command": 500, "study": 150, "instrument": 30, "mapping": 10, "column": 300, "python": 300}
+#: Older names of functions.
+OLDER = {"detection_map": "map", "gaussian_report": "gaussian", "limiting_magnitude": "limit"}
 #: Classes that functions make, or that files fill: their constructors are not public.
 MADE = {"Detection", "Expectation", "Frames", "Instrument", "Source", "Study"}
 
@@ -48,8 +46,8 @@ def commands(command: Any, path: str = "mauvecl") -> Iterator[str]:
 
 def keys(section: Any, kind: str) -> Iterator[str]:
     """Yield each key of a file, with its unit."""
-    for path, field in fields_of(section):
-        unit = first(field, Unit)
+    for path, field in fields(section):
+        unit = metadata(field, "Unit")
         yield f"{kind} {'.'.join(path)}" + (f" [{unit.name}]" if unit and unit.name else "")
 
 
@@ -61,7 +59,7 @@ def columns() -> Iterator[str]:
             module = import_module(found.name)
             where = found.name.removeprefix("mauvecl.").rpartition(".")[0]
             for declared in vars(module).values():
-                if isinstance(declared, tuple) and declared and all(isinstance(one, Column) for one in declared):
+                if isinstance(declared, tuple) and declared and all(type(one).__name__ == "Column" for one in declared):
                     for one in declared:
                         yield f"column {where}: {one.name}" + (f" [{one.unit}]" if one.unit else "")
 
@@ -100,7 +98,7 @@ def python() -> Iterator[str]:
             yield from call(name, value)
         else:
             yield f"python {name}"
-    yield from (f"python {older}, now {verb.name}" for verb in VERBS.values() for older in verb.older)
+    yield from (f"python {older}, now {now}" for older, now in OLDER.items() if {older, now} <= set(mauvecl.__all__))
 
 
 def public_interface() -> list[str]:

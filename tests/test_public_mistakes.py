@@ -19,8 +19,8 @@ import pytest
 from test_validation import FUNCTIONS, PARAMETERS, accepted, annotation, anything, arguments, example, holds_arrays
 
 import mauvecl
+from mauvecl import InputError
 from mauvecl.device.errors import DeviceError
-from mauvecl.schema.errors import InputError
 
 #: Values of required parameters that are text, by name of the parameter.
 WORDS = {

@@ -13,7 +13,6 @@ import pytest
 from marks import long_but
 from refusals import refused
 
-import mauvecl
 from mauvecl import (
     Engine,
     Expectation,
@@ -124,27 +123,6 @@ def test_whole_numbers_can_be_floats_and_tuples_single_values(engine: Engine) ->
     np.testing.assert_array_equal(engine.realise(quiet, count=5.0, seed=1), engine.realise(quiet, count=5, seed=1))
 
 
-@pytest.mark.parametrize(
-    ("ask", "key", "value", "expected"),
-    [
-        (lambda e, q, f: e.detect("G2V", [f], realisations=100, seed=1), "quiet", "G2V", "an Expectation"),
-        (lambda e, q, f: e.detect(q, ["flare"], realisations=100, seed=1), "flares", "flare", "an Expectation"),
-        (lambda e, q, f: e.detect(q, [q, 0.24], realisations=100, seed=1), "flares", 0.24, "an Expectation"),
-        (lambda e, q, f: e.realise("G2V", count=3, seed=1), "expectation", "G2V", "an Expectation"),
-        (lambda e, q, f: e.detect(q, f, realisations=1.5, seed=1), "realisations", 1.5, "a whole number"),
-        (lambda e, q, f: e.detect(q, f, realisations="many", seed=1), "realisations", "many", "a whole number"),
-        (lambda e, q, f: Pool().snr("G2V", realisations=10, seed=1), "expectation", "G2V", "an Expectation"),
-        (lambda e, q, f: expect(7.4, "mauve", exposure=5), "source", 7.4, "a Source or text"),
-        (lambda e, q, f: expect("G2V", "mauve", exposure=5), "magnitude", None, "a magnitude"),
-        (lambda e, q, f: expect("G2V", 3, exposure=5), "instrument", 3, "an Instrument or text or a path"),
-        (lambda e, q, f: expect("G2V", "mauve", exposure=5, sky="dark"), "sky", "dark", "a Sky or 5 to 35 mag"),
-    ],
-)
-def test_impossible_calls_raise(engine: Engine, ask: Callable[..., Any], key: str, value: Any, expected: str) -> None:
-    with refused(key, value=value, expected=expected):
-        ask(engine, *pair())
-
-
 def test_names_are_accepted_for_stars_and_instruments() -> None:
     usual = expect(Source.from_library("Vega"), Instrument.load("mauve"), exposure=5, sky=Sky.of_brightness(22.1))
     assert expect("Vega", "mauve", exposure=5) == usual
@@ -192,7 +170,3 @@ def test_pictures_are_drawn_into_given_axes(engine: Engine, name: str) -> None:
         with refused("ax"):
             made.plot(ax=figure.add_axes((0, 0, 1, 1)), **how)
         plt.close(figure)
-
-
-def test_public_names_exist() -> None:
-    assert all(getattr(mauvecl, name) is not None for name in mauvecl.__all__)

@@ -10,7 +10,6 @@ from typing import Any
 import yaml
 
 from mauvecl import __version__
-from mauvecl.host.version import VERSION
 
 ROOT = Path(__file__).parent.parent
 
@@ -26,21 +25,20 @@ PROJECT: dict[str, Any] = tomllib.loads(text_of("pyproject.toml"))["project"]
 
 
 def test_version_is_semantic_and_the_same_everywhere() -> None:
-    assert re.fullmatch(r"\d+\.\d+\.\d+", VERSION)
-    assert __version__ == VERSION
-    assert CITATION["version"] == VERSION
-    assert yaml.safe_load(text_of("recipe/recipe.yaml"))["context"]["version"] == VERSION
+    assert re.fullmatch(r"\d+\.\d+\.\d+", __version__)
+    assert CITATION["version"] == __version__
+    assert yaml.safe_load(text_of("recipe/recipe.yaml"))["context"]["version"] == __version__
 
 
 def test_changelog_begins_with_what_is_unreleased_and_this_version() -> None:
     assert HEADINGS[0] == "Unreleased"
-    assert HEADINGS[1] == f"{VERSION} - {CITATION['date-released']}"
+    assert HEADINGS[1] == f"{__version__} - {CITATION['date-released']}"
     assert all(re.fullmatch(r"\d+\.\d+\.\d+ - \d{4}-\d{2}-\d{2}", one) for one in HEADINGS[1:])
 
 
 def test_classifier_says_stable_from_the_first_major_version_on() -> None:
     stable = "Development Status :: 5 - Production/Stable" in PROJECT["classifiers"]
-    assert stable == (int(VERSION.partition(".")[0]) >= 1)
+    assert stable == (int(__version__.partition(".")[0]) >= 1)
 
 
 def test_authors_are_those_of_the_licence() -> None:

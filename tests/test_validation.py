@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from refusals import refused
 
 import mauvecl
-from mauvecl import bulk
-from mauvecl.schema.errors import InputError
+from mauvecl import InputError, bulk
 from mauvecl.schema.fields import AnyUnit, Range, Unit, first
 from mauvecl.schema.records import Record
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
+import time
 
 import pytest
 
-from mauvecl.cli import console
-from mauvecl.cli.console import Meter, show_table
-from mauvecl.schema.tables import INTERVAL
+from mauvecl.cli.console import Meter
 
 
 class Clock:
@@ -16,7 +15,7 @@ class Clock:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 1e6
-        monkeypatch.setattr(console.time, "monotonic", lambda: self.now)
+        monkeypatch.setattr(time, "monotonic", lambda: self.now)
 
 
 @pytest.fixture
@@ -69,31 +68,3 @@ def test_meter_restarts_for_the_next_star(clock: Clock, capsys: pytest.CaptureFi
         "500 of 1000 realisations, 50 a second, 10 s left",
         "1000 of 2000 realisations, 100 a second, 10 s left",
     ]
-
-
-def test_empty_columns_are_omitted(capsys: pytest.CaptureFixture[str]) -> None:
-    show_table("title", ("a", "empty", "b"), [("1", "", "x"), ("2", "", "")])
-    reported = capsys.readouterr().out
-    assert "empty" not in reported
-    rows = [line.split() for line in reported.splitlines() if line.strip(" ─")]
-    assert rows == [["title"], ["a", "b"], ["1", "x"], ["2"]]
-
-
-@pytest.mark.parametrize("width", [10, 40, 80, 132])
-def test_narrow_terminal_truncates_nothing(
-    width: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", str(width))
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    columns = ("star", "flare", "threshold", INTERVAL, "closed form", "why")
-    cells = [(f"star {n}", f"{n} %", f"{n}12.345", f"[{n}, 77]", f"0.{n}", "a reason of many words") for n in range(3)]
-    show_table("title", columns, cells)
-    reported = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
-    assert "…" not in reported
-    for row in cells:
-        assert all(cell in reported for cell in row)
-    # What a row is begins each of its parts, and a value keeps its interval.
-    assert all(line.split()[0] in ("star", "title") for line in reported.splitlines() if line.strip(" ─"))
-    assert all("[0, 77]" in line for line in reported.splitlines() if "012.345" in line)
-    if width >= 80:
-        assert max(map(len, reported.splitlines())) <= width

@@ -13,20 +13,21 @@ from astropy.table import Table
 from refusals import refused
 
 import mauvecl
-from mauvecl import EnergyScale, Instrument, Source, Study, expect
-from mauvecl.host.stars.bands import photons
-from mauvecl.host.stars.flare_spectra import (
+from mauvecl import (
     BalmerFlare,
     Blackbody,
-    FlareSpectrum,
+    EnergyScale,
     FlareWithLines,
+    Instrument,
     ObservedFlare,
+    Source,
+    Study,
     TwoBlackbodies,
+    detect,
+    expect,
+    inject,
+    stare,
 )
-from mauvecl.lightcurve.flares.rates import band_factor
-from mauvecl.study.cases import Case, cases
-from mauvecl.study.stare_expectation import energy_of
-from mauvecl.study.surveys import survey_star
 
 DATA = Path(__file__).parent.parent / "data"
 FILE, QUIET = DATA / "spectra" / "ADLeo_912s.dat", DATA / "flares" / "adleo_quiescent2.dat"
@@ -34,7 +35,7 @@ OF_FILE: dict[str, Any] = {
     "file": str(FILE), "quiescent": str(QUIET), "wavelength_unit": "Angstrom", "continue_at_k": 9500.0
 }  # fmt: skip
 #: Section of a study for each spectrum, and the spectrum at 9000 K.
-TEXTS: dict[str, tuple[dict[str, Any], FlareSpectrum]] = {
+TEXTS: dict[str, tuple[dict[str, Any], Any]] = {
     "blackbody": ({}, Blackbody(9000.0)),
     "jump": ({"balmer_jump": 2.5, "electron_temperature_k": 8000.0}, BalmerFlare(9000.0, 2.5, 8000.0)),
     "two": ({"second_temperature_k": 25_000.0, "second_area": 0.1}, TwoBlackbodies(9000.0, 25_000.0, 0.1)),
@@ -67,15 +68,25 @@ def test_spectrum_of_a_study_round_trips_through_toml(name: str, tmp_path: Path)
     assert ("spectrum" in study.toml()) == (name != "blackbody")
 
 
+def expectations(study: Study) -> list[list[Any]]:
+    """Return the quiescent and the flaring expectation of each case."""
+    few = study.with_settings(["run={realisations=500, fap=0.3, statistics=['matched']}"])
+    return [[one.detection.quiet, *one.detection.flares] for one in detect(few).stars]
+
+
+def snr_of(quiet: Any, flare: Any) -> float:
+    return float(np.sqrt(np.sum((flare.signal_dn - quiet.signal_dn) ** 2 / quiet.variance_dn2)))
+
+
 @TOGETHER
 @pytest.mark.parametrize("band", ["Kepler", "GALEX NUV"])
 def test_amplitude_is_the_rise_of_photons_in_the_band(name: str, band: str) -> None:
     star, spectrum = Source.from_library("M3V").at_magnitude(9), TEXTS[name][1]
     lit = star.flaring(0.3, spectrum=spectrum, band=band)
-    quiet = np.interp(lit.wavelength_nm, star.wavelength_nm, star.flux_flam)
-    rise = photons(lit.wavelength_nm, lit.flux_flam, band) / photons(lit.wavelength_nm, quiet, band) - 1
-    assert rise == pytest.approx(0.3, rel=1e-9)
-    added = lit.flux_flam - quiet
+    # Magnitudes count photons. Narrow lines are sampled differently there.
+    rise = 10 ** (0.4 * (star.magnitude(band) - lit.magnitude(band))) - 1
+    assert rise == pytest.approx(0.3, rel=3e-3 if name in ("lines", "file") else 1e-9)
+    added = lit.flux_flam - np.interp(lit.wavelength_nm, star.wavelength_nm, star.flux_flam)
     shape = spectrum.flux(lit.wavelength_nm)
     used = shape > 0.01 * shape.max()
     np.testing.assert_allclose(added[used] / shape[used], (added[used] / shape[used])[0], rtol=1e-6)
@@ -89,11 +100,9 @@ def test_energies_equal_those_of_the_light(name: str) -> None:
     nm = lit.wavelength_nm
     added = lit.flux_flam - np.interp(nm, star.wavelength_nm, star.flux_flam)
     sphere = 4 * np.pi * (5.0 * 3.0856775814913674e18) ** 2
-    from mauvecl.host.stars.bands import band as find
-
-    kepler = find("Kepler")
-    fine = np.union1d(nm, kepler.wavelength_nm)
-    response = np.interp(fine, kepler.wavelength_nm, kepler.throughput / kepler.throughput.max(), 0, 0)
+    curve = Table.read(Path(mauvecl.__file__).parent / "host/stars/library/bands/kepler.ecsv")
+    fine = np.union1d(nm, curve["wavelength"])
+    response = np.interp(fine, curve["wavelength"], curve["throughput"] / curve["throughput"].max(), 0, 0)
     band = 10 * np.trapezoid(response * np.interp(fine, nm, added), fine) * sphere
     far = spectrum.grid(np.geomspace(20.0, 200_000.0, 30_001))
     share = np.trapezoid(added[(nm > 400) & (nm < 600)], nm[(nm > 400) & (nm < 600)])
@@ -102,32 +111,34 @@ def test_energies_equal_those_of_the_light(name: str) -> None:
     for kind, energy in (("band", band), ("bolometric", whole)):
         scale = EnergyScale.of_star(star, 5.0, flare=spectrum, kind=kind)
         assert scale.erg_per_s == pytest.approx(energy, rel=5e-3), kind
-    ratio = band_factor("Kepler", "bolometric", flare=spectrum)
-    assert ratio == pytest.approx(whole / band, rel=1e-2)
+    # The same energies are those of a simulated stare.
+    short = ["stare.duration_s=600", "observation.exposure_s=5", "stare.search=false"]
+    (flare,) = stare(study_of(name).with_settings(short)).stares[0].flares
+    duration = flare.event.equivalent_duration_s
+    assert flare.bolometric_erg == pytest.approx(whole * duration, rel=5e-3)
+    assert flare.band_erg == pytest.approx(band * duration, rel=5e-3)
 
 
 @TOGETHER
 def test_answers_take_any_spectrum(name: str) -> None:
-    """The closed-form S/N equals that of the flare's counts, and stares have the energies of the spectrum."""
+    """The closed-form S/N equals that of the flare's counts, and stares have the light of the spectrum."""
     study = study_of(name, amplitudes=[0.05])
     star, mauve = Source.from_library("M3V").at_magnitude(9), Instrument.load("mauve")
-    quiet, lit = (expect(s, mauve, exposure=50.0) for s in (star, star.flaring(0.05, spectrum=TEXTS[name][1])))
-    wanted = np.sqrt(np.sum((lit.signal_dn - quiet.signal_dn) ** 2 / quiet.variance_dn2))
-    seen, flare = Case(study).expectations
-    got = np.sqrt(np.sum((flare.signal_dn - seen.signal_dn) ** 2 / seen.variance_dn2))
-    assert got == pytest.approx(wanted, rel=1e-9)
-    one = study.with_settings(["stare.duration_s=600", "observation.exposure_s=5"])
-    case = Case(one)
-    staring, (event,) = case.stare_expectation, case.events
-    frames = [x.source_electrons for x in Case(one).expectations]
-    np.testing.assert_allclose(0.05 * staring.flare_electrons[0], frames[1] - frames[0], rtol=1e-6, atol=1e-9)
-    scale = EnergyScale.of_star(star, 5.0, flare=TEXTS[name][1])
-    energy = energy_of(case.study, case.source, event, "bolometric")
-    assert energy == pytest.approx(scale.erg_per_s * event.equivalent_duration_s, rel=1e-9)
+    wanted = [expect(s, mauve, exposure=50.0) for s in (star, star.flaring(0.05, spectrum=TEXTS[name][1]))]
+    (found,) = expectations(study)
+    assert snr_of(*found) == pytest.approx(snr_of(*wanted), rel=1e-9)
+    one = study.with_settings(["stare.duration_s=600", "observation.exposure_s=5", "stare.search=false"])
+    staring = stare(one).stares[0].staring
+    quiet, lit = (x.source_electrons for x in expectations(one)[0])
+    np.testing.assert_allclose(0.05 * staring.flare_electrons[0], lit - quiet, rtol=1e-6, atol=1e-9)
 
 
 def test_search_injects_the_flare_of_the_file() -> None:
-    found = {name: survey_star(Case(study_of(name))) for name in ("blackbody", "file", "jump")}
+    """Templates are those of a blackbody for a file, and of the spectrum otherwise; the file has more ultraviolet."""
+    few = ["stare.duration_s=2000", "injections={count=20, sizes=2, widths=2, fitted=0}", "search.nulls=0"]
+    found = {
+        name: inject(study_of(name).with_settings(few)).stars[0].surveyed for name in ("blackbody", "file", "jump")
+    }
     np.testing.assert_array_equal(found["file"].templates.directions, found["blackbody"].templates.directions)
     assert not np.array_equal(found["jump"].templates.directions, found["blackbody"].templates.directions)
     assert found["file"].unit_snr > found["blackbody"].unit_snr
@@ -144,20 +155,9 @@ def test_search_injects_the_flare_of_the_file() -> None:
 )
 def test_sweep_over_the_spectrum_is_answered(quantity: str, values: list[float], name: str) -> None:
     """More ultraviolet light at the same amplitude gives a higher S/N."""
-    study = study_of(name).model_copy(
-        update={
-            "sweep": mauvecl.study.questions.Sweep.model_validate({"axes": [{"quantity": quantity, "values": values}]})
-        }
-    )
-    snr = []
-    for case in cases(study):
-        quiet, lit = case.expectations
-        snr.append(float(np.sqrt(np.sum((lit.signal_dn - quiet.signal_dn) ** 2 / quiet.variance_dn2))))
+    study = study_of(name).with_settings([f"sweep.axes=[{{quantity='{quantity}', values={values}}}]"])
+    snr = [snr_of(*pair) for pair in expectations(study)]
     assert (np.diff(snr) > 0).all() if quantity != "line_scale" else snr[0] != snr[1]
-    nothing = study_of("blackbody")
-    if quantity != "balmer_jump":
-        with refused("second_area" if quantity.startswith("second") else "line_scale"):
-            nothing.at(quantity, values[-1])
 
 
 def test_lines_of_a_fixed_flux_do_not_scale() -> None:
@@ -169,11 +169,9 @@ def test_lines_of_a_fixed_flux_do_not_scale() -> None:
         nm = lit.wavelength_nm[near]
         extra = lit.flux_flam[near] - np.interp(nm, plain.wavelength_nm, plain.flux_flam)
         assert 10 * np.trapezoid(extra, nm) == pytest.approx(1e-12, rel=0.01)
-    with refused("flare_amplitude"):
-        star.flaring(1e-9, spectrum=fixed)
     study = study_of("blackbody").with_settings(['flare.spectrum.line_fluxes={"Mg II" = 1e-12}'])
     with refused("lines"):
-        _ = Case(study).stare_expectation
+        stare(study.with_settings(["stare.duration_s=600"]))
 
 
 def test_flare_file_is_located_from_an_answers_table(tmp_path: Path) -> None:
@@ -197,6 +195,6 @@ def test_flare_file_is_located_from_an_answers_table(tmp_path: Path) -> None:
 
 def test_replacing_photosphere_needs_a_surface() -> None:
     for name in ("jump", "two", "lines"):
-        assert Case(study_of(name, geometry="replaces")).expectations
+        assert expectations(study_of(name, geometry="replaces"))
     with refused("flare_geometry"):
-        _ = Case(study_of("file", geometry="replaces")).expectations
+        expectations(study_of("file", geometry="replaces"))

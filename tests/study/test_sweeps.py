@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from typing import Any
 
 import numpy as np
@@ -10,17 +9,23 @@ import pytest
 from scenes import instrument, star
 from scipy import stats
 
-from mauvecl.answers.detection.detect import detect
-from mauvecl.answers.detection.gaussian import ONE_SIGMA, beyond, coverage, gaussian_report
-from mauvecl.answers.detection.maps import detection_map
-from mauvecl.answers.limits.assumptions import what_matters
-from mauvecl.answers.limits.limits import limiting_magnitude
-from mauvecl.answers.signal.exposures import exposure_for
-from mauvecl.answers.signal.simulate import simulate
-from mauvecl.answers.signal.snr import snr
-from mauvecl.device.engine import Engine
-from mauvecl.study.cases import cases
-from mauvecl.study.study import PAPER_BUDGETS, Study
+from mauvecl import (
+    PAPER_BUDGETS,
+    Blackbody,
+    Engine,
+    FlareWithLines,
+    Instrument,
+    Sky,
+    Source,
+    Study,
+    TwoBlackbodies,
+    detect,
+    expect,
+    gaussian,
+    limit,
+    snr,
+)
+from mauvecl import BalmerFlare as Balmer
 
 
 def study(axes: list[dict[str, Any]], how: str = "product", **changes: Any) -> Study:
@@ -36,17 +41,70 @@ def study(axes: list[dict[str, Any]], how: str = "product", **changes: Any) -> S
 
 MAGNITUDES = {"quantity": "magnitude", "values": [6.0, 9.0]}
 EXPOSURES = {"quantity": "exposure", "values": [5.0, 50.0]}
+TWO = {"second_temperature_k": 4000.0, "second_area": 1.0}
+LINES = {"lines": {"H alpha": 0.1}}
+#: Two values of each quantity that a sweep may have, and what it changes in an observation of a G2V star and its flare.
+SWEPT: dict[str, tuple[Any, Any, str]] = {
+    "star": ("G2V", "M3V", "star"),
+    "magnitude": (6.0, 7.0, "magnitude"),
+    "amplitude": (0.1, 0.2, "amplitude"),
+    "flare_temperature": (8000.0, 12_000.0, "spectrum"),
+    "balmer_jump": (2.0, 3.0, "spectrum"),
+    "second_temperature": (5000.0, 6000.0, "spectrum"),
+    "second_area": (2.0, 3.0, "spectrum"),
+    "line_scale": (0.5, 2.0, "spectrum"),
+    "exposure": (5.0, 50.0, "exposure"),
+    "detector_temperature": (-10.0, 10.0, "instrument"),
+    "sky": (21.0, 22.0, "sky"),
+}
+SECTIONS = {"second_temperature": TWO, "second_area": TWO, "line_scale": LINES}
+#: The spectrum of the flare at a value.
+LIGHT = {
+    "flare_temperature": Blackbody,
+    "balmer_jump": lambda v: Balmer(10_000.0, v),
+    "second_temperature": lambda v: TwoBlackbodies(10_000.0, v, 1.0),
+    "second_area": lambda v: TwoBlackbodies(10_000.0, 4000.0, v),
+    "line_scale": lambda v: FlareWithLines(Blackbody(10_000.0), {"H alpha": 0.1 * v}),
+}
 
 
-def test_cells_are_all_combinations() -> None:
-    both = cases(study([MAGNITUDES, EXPOSURES]))
-    assert [tuple(case.at.values()) for case in both] == [(6, 5), (6, 50), (9, 5), (9, 50)]
-    assert all(case.star.magnitude == case.at["magnitude"] for case in both)
-    assert all(case.study.observation.exposure_s == case.at["exposure"] for case in both)
-    assert all(not case.study.sweep.axes for case in both)
-    listed = cases(study([MAGNITUDES, EXPOSURES], "list"))
-    assert [tuple(case.at.values()) for case in listed] == [(6, 5), (9, 50)]
-    assert [(case.at, case.study) for case in cases(study([]))] == [({}, study([]))]
+def test_every_quantity_is_swept() -> None:
+    axis = Study.model_json_schema()["$defs"]["Axis"]["properties"]["quantity"]["enum"]
+    assert set(SWEPT) == set(axis)
+
+
+@pytest.mark.parametrize("quantity", SWEPT)
+def test_sweep_gives_the_expectations_of_each_value(quantity: str, engine: Engine) -> None:
+    *values, part = SWEPT[quantity]
+    swept = study(
+        [{"quantity": quantity, "values": values}], flare={"amplitudes": [0.1], "spectrum": SECTIONS.get(quantity, {})}
+    )
+    found = detect(swept.with_settings(["run={realisations=1000, fap=0.2, statistics=['matched']}"]), engine)
+    assert [one.at for one in found.stars] == [{quantity: value} for value in values]
+    for value, one in zip(values, found.stars, strict=True):
+        given = {"star": "G2V", "magnitude": 7.4, "amplitude": 0.1, "exposure": 50.0, "instrument": None, "sky": 22.1}
+        given |= {part: value}
+        light = LIGHT[quantity](value) if part == "spectrum" else Blackbody(10_000.0)
+        quiet = Source.from_library(given["star"]).at_magnitude(given["magnitude"])
+        payload = Instrument.load("mauve")
+        if given["instrument"] is not None:
+            payload = payload.with_(temperature_c=given["instrument"])
+        how = {"exposure": given["exposure"], "sky": Sky.of_brightness(given["sky"])}
+        wanted = [expect(x, payload, **how) for x in (quiet, quiet.flaring(given["amplitude"], spectrum=light))]
+        for x, y in zip((one.detection.quiet, *one.detection.flares), wanted, strict=True):
+            np.testing.assert_allclose(x.source_electrons, y.source_electrons, rtol=1e-12)
+            np.testing.assert_allclose(x.recorded_dn, y.recorded_dn, rtol=1e-12)
+            np.testing.assert_allclose(x.variance_dn2, y.variance_dn2, rtol=1e-12)
+            assert x.n_frames == y.n_frames
+
+
+@pytest.mark.parametrize(
+    ("processes", "outside"), [({}, False), ({"detector_temperature": {"uniform": [20, 22]}}, True)]
+)
+def test_usual_unknowns_follow_the_swept_detector_temperature(processes: Any, outside: bool, engine: Engine) -> None:
+    axis = {"quantity": "detector_temperature", "values": [-10.0, 10.0]}
+    answer = detect(study([axis], nuisances={"usual": True}, processes=processes), engine)
+    assert any("OUTSIDE THE PRIOR" in message for message in answer.messages) == outside
 
 
 def test_sweep_is_read_back(tmp_path: Any) -> None:
@@ -57,16 +115,17 @@ def test_sweep_is_read_back(tmp_path: Any) -> None:
 
 
 def test_each_cell_equals_its_own_detection(engine: Engine) -> None:
-    """A cell of a sweep has the same bits as the cell alone; columns give the swept values."""
-    asked = study([MAGNITUDES, EXPOSURES])
-    found = detect(asked, engine)
-    assert list(found.table["magnitude"].value) == [6, 6, 9, 9]
-    assert list(found.table["exposure"].value) == [5, 50, 5, 50]
-    for k, case in enumerate(cases(asked)):
-        (alone,) = detect(case.study, engine).table
-        assert alone["probability"] == found.table["probability"][k]
-        assert alone["threshold"] == found.table["threshold"][k]
-    assert found.table["probability"][0] > found.table["probability"][2]
+    """A cell of a product or list has the same bits as the cell alone; columns give the swept values."""
+    found = detect(study([MAGNITUDES, EXPOSURES]), engine).table
+    assert list(found["magnitude"].value) == [6, 6, 9, 9]
+    assert list(found["exposure"].value) == [5, 50, 5, 50]
+    for row in found:
+        alone = study([]).at("magnitude", row["magnitude"].value).at("exposure", row["exposure"].value)
+        (same,) = detect(alone, engine).table
+        assert (same["probability"], same["threshold"]) == (row["probability"], row["threshold"])
+    assert found["probability"][0] > found["probability"][2]
+    listed = detect(study([MAGNITUDES, EXPOSURES], "list"), engine).table
+    assert list(listed["probability"]) == [found["probability"][0], found["probability"][3]]
     amplitudes = detect(study([{"quantity": "amplitude", "values": [0.01, 0.1]}]), engine).table
     assert list(amplitudes["amplitude"]) == [0.01, 0.1]
 
@@ -74,8 +133,7 @@ def test_each_cell_equals_its_own_detection(engine: Engine) -> None:
 def test_limits_follow_the_sweep(engine: Engine) -> None:
     """A colder detector and a longer exposure have fainter limits."""
     axes = [{"quantity": "detector_temperature", "values": [13.0, 21.0]}, EXPOSURES]
-    result = limiting_magnitude(study(axes), engine)
-    table = result.table
+    table = limit(study(axes), engine).table
     assert list(table["detector_temperature"].value) == [13, 13, 21, 21]
     value = table["magnitude"].value
     assert value[0] > value[2]
@@ -110,31 +168,25 @@ def test_snr_grows_with_exposure(engine: Engine) -> None:
     assert np.all(by_cell[6, 5] > by_cell[9, 5])
 
 
-def test_gaussian_coverage_is_exact(engine: Engine) -> None:
-    """Coverage from histograms equals that from the counts, and the nominal one for normal noise."""
-    (quiet,) = star(exposure=5.0, payload=instrument(part=True))
-    n = 20_000
-    result = engine.snr(quiet, realisations=n, seed=4)
-    raw = engine.realise(quiet, count=n, seed=4)
+def test_formula_holds_for_the_payload_and_fails_at_saturation(engine: Engine) -> None:
+    """The formula holds for the nominal payload and fails with a bias near zero, which clips counts."""
+    asked = study([MAGNITUDES, EXPOSURES])
+    answer = gaussian(asked, engine)
+    cells, elements = answer.cells, answer.elements
+    assert len(cells) == 4
+    assert np.all(np.abs(cells["fap_ratio"] - 1) < 1e-9)
+    assert np.all((cells["coverage_low"] > 0.66) & (cells["coverage_high"] < 0.71))
+    # Coverage from histograms equals that of the same realisations.
+    quiet = snr(asked, engine).stars[0].result.expectation
+    raw = engine.realise(quiet, count=20_000, seed=5)
     net = raw - quiet.n_frames * (quiet.bias_dn + quiet.dark_dn)
     known = quiet.n_frames * (quiet.read_noise_dn**2 + quiet.dark_variance_dn2)
     sigma = np.sqrt(quiet.gain_dn_per_electron * np.maximum(net, 0) + known)
     direct = np.mean(np.abs(net - quiet.recorded_light_dn) <= sigma, axis=0)
-    np.testing.assert_allclose(coverage(result), direct, atol=0.01)
-    assert coverage(result).mean() == pytest.approx(direct.mean(), abs=5e-4)
-    # The mean of 198 pixels has a standard error of 2.4e-4, and a DN is 1/49 of sigma.
-    assert direct.mean() == pytest.approx(ONE_SIGMA, abs=5e-3)
-
-
-@pytest.mark.long
-def test_formula_holds_for_the_payload_and_fails_at_saturation(engine: Engine) -> None:
-    """The formula holds for the nominal payload and fails with a bias near zero, which clips counts."""
-    asked = study([MAGNITUDES, EXPOSURES])
-    cells = gaussian_report(asked, engine).cells
-    assert len(cells) == 4
-    assert np.all(np.abs(cells["fap_ratio"] - 1) < 1e-9)
-    assert np.all((cells["coverage_low"] > 0.66) & (cells["coverage_high"] < 0.71))
-    clipped = gaussian_report(asked.with_instrument({"bias_dn": 5.0, "dark_scale_dn_per_s": 0.01}), engine).cells
+    first = (elements["magnitude"].value == 6) & (elements["exposure"].value == 5)
+    count = quiet.per_element(np.ones(quiet.wavelength_nm.size))
+    np.testing.assert_allclose(elements[first]["coverage"].value, quiet.per_element(direct) / count, atol=0.003)
+    clipped = gaussian(asked.with_instrument({"bias_dn": 5.0, "dark_scale_dn_per_s": 0.01}), engine).cells
     (faint,) = clipped[(clipped["magnitude"].value == 9) & (clipped["exposure"].value == 5)]
     assert abs(faint["snr_off_by"]) > 0.1
     assert faint["why"] == "clipping"
@@ -143,45 +195,25 @@ def test_formula_holds_for_the_payload_and_fails_at_saturation(engine: Engine) -
 
 @pytest.mark.parametrize("name", ["mauve", "mauve-electrons"])
 @pytest.mark.parametrize("temperature", [21.0, -30.0])
-@pytest.mark.parametrize("sigmas", [3.0, 5.0])
-def test_pixels_beyond_five_sigma_are_counted(name: str, temperature: float, sigmas: float) -> None:
+def test_pixels_beyond_five_sigma_are_counted(name: str, temperature: float, engine: Engine) -> None:
     """The saddle-point tail agrees with the exact sum over dark counts to 0.3 %; the distribution is skewed upward."""
-    (quiet,) = star(exposure=5.0, payload=instrument(name, part=True, temperature_c=temperature))
-    p, step = 90, float(quiet.dark_step_dn[90])
+    part = {"output_min_nm": 340.0, "output_max_nm": 350.0, "temperature_c": temperature}
+    asked = study([{"quantity": "exposure", "values": [5.0]}], observation={"instrument": name, "changes": part})
+    (cell,) = gaussian(asked, engine).cells
+    (quiet,) = star(exposure=5.0, payload=instrument(name, **part))
     poisson = quiet.photon_noise == "poisson"
-    # Both photons and dark current are then Poisson in electrons.
-    mean = quiet.dark_dn[p] / step + (quiet.source_electrons + quiet.sky_electrons)[p] * poisson
-    goal = sigmas * np.sqrt(quiet.variance_dn2[p] - 1 / 12)
-    photon = quiet.gain_dn_per_electron[p] * quiet.recorded_light_dn[p]
-    sd = np.sqrt(quiet.read_noise_dn[p] ** 2 + photon * (not poisson))
-    counts = np.arange(int(mean + 14 * np.sqrt(mean) + 30))
-    for side in (1, -1):
-        exact = stats.poisson.pmf(counts, mean) @ stats.norm.sf((goal - side * (counts - mean) * step) / sd)
-        found = beyond(quiet, side * sigmas)[p]
-        assert found == pytest.approx(exact, rel=3e-3)
-        assert (found > stats.norm.sf(sigmas)) == (side > 0)
-
-
-@pytest.mark.long
-def test_every_column_is_described_and_every_answer_knows_its_study(engine: Engine) -> None:
-    """Every column of every answer has a description, and each table contains the study that made it."""
-    asked = study([{"quantity": "sky", "values": [21.0, 22.0]}])
-    plain = study([]).with_settings(
-        ["map.x={quantity='magnitude',values=[7.0]}", "map.y={quantity='amplitude',values=[0.1]}"]
-    )
-    unknown = asked.model_copy(update={"unknowns": type(asked.unknowns)(draws=2)})
-    detected, seen, usual = detect(asked, engine), snr(asked, engine), gaussian_report(asked, engine)
-    limits, exposures = limiting_magnitude(unknown, engine), exposure_for(plain, 5.0, 300.0)
-    tables = [
-        (asked, [detected.table, detected.departures, detected.roc, detected.tails]),
-        (asked, [seen.pixel, seen.element, seen.noise_budget, usual.cells, usual.elements, usual.thresholds]),
-        (unknown, [limits.table, limits.draws]),
-        (exposures.study, [exposures.table]),
-        (plain, [what_matters(plain), simulate(plain).observations[0][2]]),
-    ]
-    found = detection_map(plain, engine)
-    tables.append((found.study, [found.table]))
-    for made_by, group in tables:
-        for table in group:
-            assert [name for name in table.colnames if not table[name].info.description] == []
-            assert Study.build(tomllib.loads(table.meta["study"]), "table") == made_by
+    found: dict[int, list[float]] = {1: [], -1: []}
+    for p in range(quiet.wavelength_nm.size):
+        step = float(quiet.dark_step_dn[p])
+        # Both photons and dark current are then Poisson in electrons.
+        mean = quiet.dark_dn[p] / step + (quiet.source_electrons + quiet.sky_electrons)[p] * poisson
+        goal = 5 * np.sqrt(quiet.variance_dn2[p] - 1 / 12)
+        photon = quiet.gain_dn_per_electron[p] * quiet.recorded_light_dn[p]
+        sd = np.sqrt(quiet.read_noise_dn[p] ** 2 + photon * (not poisson))
+        counts = np.arange(int(mean + 14 * np.sqrt(mean) + 30))
+        for side in (1, -1):
+            exact = stats.poisson.pmf(counts, mean) @ stats.norm.sf((goal - side * (counts - mean) * step) / sd)
+            found[side].append(float(exact / stats.norm.sf(5.0)))
+    assert cell["five_sigma_above"] == pytest.approx(max(found[1]), rel=3e-3)
+    assert cell["five_sigma_below"] == pytest.approx(min(found[-1]), rel=3e-3)
+    assert cell["five_sigma_above"] > 1 > cell["five_sigma_below"]

@@ -1,0 +1,307 @@
+"""What all verbs have in common: flags, help with examples, completion, values, stars, and narrow terminals."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.table import Table
+from commands import ended, run
+from refusals import refused
+from study_keys import fields, metadata
+from test_golden import GOLDEN, QUESTIONS
+from typer.main import get_command
+from typer.testing import CliRunner
+
+import mauvecl
+from mauvecl import Study
+from mauvecl.cli.app import app
+
+FILE = Path(__file__).parent.parent / "data" / "flags.json"
+TOP: dict[str, Any] = get_command(app).commands  # type: ignore[attr-defined]
+#: Every verb, and every verb of `library`.
+VERBS: dict[str, Any] = {
+    name: verb
+    for top, one in TOP.items()
+    for name, verb in {top: one, **{f"{top} {k}": v for k, v in getattr(one, "commands", {}).items()}}.items()
+}
+
+
+def options(verb: Any) -> list[Any]:
+    hidden = ("help", "install_completion", "show_completion")
+    return [one for one in verb.params if one.param_type_name == "option" and one.name not in hidden]
+
+
+def all_flags() -> dict[str, dict[str, Any]]:
+    """Return the options of every verb by their first name."""
+    return {
+        name: {
+            one.opts[0]: {
+                "names": [*one.opts, *one.secondary_opts],
+                "metavar": one.metavar,
+                "repeated": one.multiple,
+                "switch": one.is_flag,
+                "help": one.help,
+            }
+            for one in options(verb)
+        }
+        for name, verb in VERBS.items()
+    }
+
+
+def test_flags_equal_those_of_the_file() -> None:
+    """Compare with the file; `python tests/cli/test_help.py` accepts a change."""
+    assert all_flags() == json.loads(FILE.read_text(encoding="utf-8"))
+
+
+def test_each_flag_has_one_help_text() -> None:
+    """A flag has one help text, whatever the verb; only its default differs."""
+    said: dict[str, set[str]] = {}
+    for flags in all_flags().values():
+        for flag, about in flags.items():
+            assert about["help"], flag
+            said.setdefault(flag, set()).add(re.sub(r" \[[^][]*\]\.$", "", about["help"]))
+    assert {flag: texts for flag, texts in said.items() if len(texts) > 1} == {}
+    assert len(said) > 40
+
+
+@pytest.mark.parametrize("name", VERBS)
+def test_help_has_examples_and_fits_80_columns(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import typer.rich_utils
+
+    if hasattr(VERBS[name], "commands"):
+        return
+    monkeypatch.setattr(typer.rich_utils, "MAX_WIDTH", 80, raising=False)
+    monkeypatch.setenv("TERMINAL_WIDTH", "80")
+    shown = run(*name.split(), "--help", folder=tmp_path).stdout
+    examples = re.findall(rf"^ +(mauvecl {name}.*)$", shown.replace("\\\n", " "), re.MULTILINE)
+    assert examples
+    assert all(shlex.split(example)[0] == "mauvecl" for example in examples)
+    lines = shown.splitlines()
+    begun = [i for i, line in enumerate(lines) if line.strip().startswith("mauvecl ")]
+    for i in begun:
+        while lines[i].endswith("\\"):
+            assert len(lines[i]) <= 80
+            i += 1
+        assert len(lines[i]) <= 80, lines[i]
+
+
+def test_list_of_verbs_is_not_truncated() -> None:
+    """Check that the first sentence of each verb fits into 80 columns."""
+    shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "80"}).output
+    assert "Commands:" in shown
+    assert "..." not in shown.partition("Commands:")[2]
+
+
+#: Paths of the keys that each flag sets, by its parameter.
+KEYS: dict[str, list[tuple[str, ...]]] = {}
+for path, field in fields():
+    for flag in metadata(field, "Flag", every=True):
+        KEYS.setdefault(flag.parameter, []).append(path)
+
+
+@pytest.mark.parametrize("name", [name for name in QUESTIONS if (GOLDEN / name / "study.toml").exists()])
+def test_defaults_in_help_equal_those_of_the_study(name: str) -> None:
+    """Compare with the studies of the golden questions, in which a flag that is not given has its default."""
+    words = QUESTIONS[name].rpartition(" && ")[2].split()
+    verb, given = words[0], set(words)
+    study = Study.build(tomllib.loads((GOLDEN / name / "study.toml").read_text(encoding="utf-8")), name)
+    compared = 0
+    for option in options(VERBS[verb]):
+        reported = re.search(r"\[([^][]*)\]\.$", option.help or "")
+        keys = [key for key in KEYS.get(option.name, ()) if key[0] != "star"]
+        if reported is None or not keys or given & {*option.opts} or _is_set(keys, words):
+            continue
+        values = [_at(study, key) for key in keys]
+        number = re.match(r"-?[\d.]+", reported[1])
+        if number and all(isinstance(value, int | float) for value in values):
+            assert float(number[0]) in values, option.name
+            compared += 1
+        elif all(isinstance(value, str) for value in values):
+            assert any(value in reported[1] for value in values), option.name
+            compared += 1
+    assert compared > 0 or verb in ("calibrate", "analyse")
+
+
+def _is_set(keys: list[tuple[str, ...]], words: list[str]) -> bool:
+    return any(word.split("=")[0].startswith(".".join(key)) for key in keys for word in words)
+
+
+def _at(value: Any, path: tuple[str, ...]) -> Any:
+    for key in path:
+        value = getattr(value, key)
+    return value
+
+
+def test_bash_completes_verbs_and_flags() -> None:
+    for typed, wanted in (("mauvecl det", "detect"), ("mauvecl detect --magn", "--magnitude")):
+        words = {"COMP_WORDS": typed, "COMP_CWORD": str(len(typed.split()) - 1), "_MAUVECL_COMPLETE": "complete_bash"}
+        # The program's name decides the variable; the console script has it.
+        script = str(Path(sys.executable).parent / "mauvecl")
+        done = subprocess.run([script], capture_output=True, text=True, env=os.environ | words)
+        assert wanted in done.stdout.split(), done
+
+
+def test_every_verb_with_flares_takes_the_flags_of_their_spectrum() -> None:
+    flags = {flag for flag, keys in KEYS.items() if any(key[:2] == ("flare", "spectrum") for key in keys)}
+    assert len(flags) > 8
+    # `analyse` adds no flares: it takes the temperature of a blackbody that it looks for.
+    names = [{one.name for one in options(verb)} for name, verb in VERBS.items() if name != "analyse"]
+    taking = [one for one in names if "flare_temperature" in one]
+    assert len(taking) >= 8
+    assert all(one >= flags for one in taking)
+
+
+# Values
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e6", 10**6),
+        ("2.5e3", 2500),
+        (" 7000 ", 7000),
+        ("1E4", 10**4),
+        ("2000", 2000),
+        ("9007199254740993", 2**53 + 1),
+    ],
+)
+def test_counts_are_read(text: str, value: int, tmp_path: Path) -> None:
+    run("simulate", "--star", "G2V,M3V", "-m", "7,8", f"--seed={text}", "--no-pictures", folder=tmp_path)
+    study = Study.read(tmp_path / "mauvecl-simulate" / "study.toml")
+    assert study.run.seed == value
+    assert [(star.library, star.magnitude) for star in study.star] == [("G2V", 7.0), ("M3V", 8.0)]
+
+
+def test_every_numeric_flag_refuses_text(tmp_path: Path) -> None:
+    """Check that the message has flag, value and expectation for every numeric flag."""
+    flags = {
+        max(option.opts, key=len): name
+        for name, verb in TOP.items()
+        for option in getattr(verb, "params", ())
+        if (getattr(option, "metavar", None) or "").rstrip(",.") in ("NUMBER", "INTEGER")
+    }
+    assert len(flags) > 40
+    for flag, verb in sorted(flags.items()):
+        code, out, reported = ended(verb, flag, "many", folder=tmp_path)
+        assert (code, out) == (2, ""), (verb, flag)
+        assert reported.startswith(f"mauvecl: {flag} 'many', expected a "), reported
+        assert reported.count("\n") == 1
+
+
+# Stars
+
+
+def spectrum(folder: Path, name: str) -> str:
+    nm = np.linspace(170.0, 1150.0, 800)
+    np.savetxt(folder / name, np.transpose([nm, 1e-12 * np.exp(-(((nm - 560) / 250) ** 2))]))
+    return name
+
+
+#: The argument of `analyse` is a file of frames.
+OBSERVING = [name for name, one in TOP.items()
+             if {"study_file", "star"} <= {p.name for p in one.params} and name != "analyse"]  # fmt: skip
+
+
+@pytest.mark.parametrize("verb", OBSERVING)
+def test_star_is_accepted_in_place_of_the_study(verb: str, tmp_path: Path) -> None:
+    """Give every verb a star with a wrong magnitude, which its message names."""
+    for star in ("G2V,M3V", spectrum(tmp_path, "noname")):
+        code, _, reported = ended(verb, star, "-m", "99", folder=tmp_path)
+        assert (code, reported) == (2, "mauvecl: --magnitude 99.0, expected -30 to 40 mag\n"), star
+    code, _, reported = ended(verb, "G2V", "--star", "M3V", "-m", "7", folder=tmp_path)
+    assert (code, reported) == (2, "mauvecl: 'G2V' and --star are both stars, expected one of them\n")
+
+
+def test_given_star_becomes_the_star_of_the_study(tmp_path: Path) -> None:
+    for given in ("G2V", spectrum(tmp_path, "star.txt")):
+        run("exposure", given, "-m", "8", "--snr", "10", "--at", "300", "--no-pictures", folder=tmp_path)
+        (star,) = Study.read(tmp_path / "mauvecl-exposure" / "study.toml").star
+        assert (star.library or (star.file and star.file.name), star.magnitude) == (given, 8.0)
+    # A study is still one, whatever it is called.
+    (tmp_path / "mauvecl-exposure" / "study.toml").rename(tmp_path / "study")
+    assert "star V = 8" in run("exposure", "study", "--no-pictures", folder=tmp_path).stdout
+
+
+@pytest.mark.parametrize("name", ["AD Leo", "ad leo", "Proxima", "Proxima Cen", "EV Lac", "YZ CMi", "AU Mic", "GJ 388",
+                                  "CN Leo", "TRAPPIST-1", "eps Eri", "Barnard's star"])  # fmt: skip
+def test_spectrum_and_magnitude_are_proposed_for_a_well_known_star(name: str, tmp_path: Path) -> None:
+    """The proposal is one that can be asked."""
+    reported = run("simulate", "--star", name, folder=tmp_path, code=2).stderr
+    assert repr(name) in reported
+    found = re.search(r"(--star \S+) with (--magnitude \S+) ", reported)
+    assert found, reported
+    run("simulate", *shlex.split(f"{found[1]} {found[2]}"), "--no-pictures", folder=tmp_path)
+
+
+def test_every_listed_star_is_proposed() -> None:
+    listed = Table.read(Path(mauvecl.__file__).parent / "host/stars/library/well_known.ecsv")["name"]
+    # The library has these, of which GX And as GJ 15 A, its M1V.
+    for name in {str(name) for name in listed} - {"Vega", "HD 40307", "GJ 581", "GX And"}:
+        with refused("star", value=name):
+            Study.build({"star": [{"library": name}]}, "test").star[0].source()
+
+
+# Terminals
+
+
+def tables(text: str) -> list[list[str]]:
+    """Return the lines of the tables that a text shows, split at two blanks or more."""
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", text)
+    return [re.split(r"\s{2,}", line.strip()) for line in plain.splitlines() if line.startswith("  ")]
+
+
+@pytest.mark.parametrize("width", [10, 40, 80, 132])
+def test_narrow_terminal_truncates_nothing(width: int, tmp_path: Path) -> None:
+    words = ["detect", "--star", "G2V", "-m", "7.4", "-a", "0.01,0.02", "-n", "2000", "--fap", "0.1", "--no-pictures"]
+    words += ["--sweep", "exposure=5,50", "--quiet", "--output", str(tmp_path / "out")]
+    wide = tables(run(*words, folder=tmp_path).stdout)
+    env = {"COLUMNS": str(width), "FORCE_COLOR": "1"}
+    shown = CliRunner().invoke(app, words, env=env).output
+    narrow = tables(shown)
+    assert "…" not in shown
+    assert {cell for row in wide for cell in row} <= {cell for row in narrow for cell in row}
+    # What a row is begins each of its parts, and a value keeps its interval.
+    assert {row[0] for row in narrow if len(row) > 1} == {row[0] for row in wide if len(row) > 1}
+    for row in wide:
+        for value, interval in pairwise(row):
+            if interval.startswith("["):
+                assert any((value, interval) in pairwise(one) for one in narrow)
+    if width >= 80:
+        inside = [line for line in re.sub(r"\x1b\[[0-9;]*m", "", shown).splitlines() if line.startswith("  ")]
+        assert max(map(len, inside)) <= width
+
+
+@pytest.mark.parametrize(("changes", "shown"), [("{}", False), ("{bias_dn=5.0, dark_scale_dn_per_s=0.01}", True)])
+def test_empty_columns_are_omitted(changes: str, shown: bool, tmp_path: Path) -> None:
+    """The column of reasons is there only where the formula fails."""
+    words = "gaussian --star G2V -m 9 --exposure 5 -n 2000 --fap 0.1 --statistic chi2 --no-pictures --set"
+    done = run(*words.split(), f"observation.changes={changes}", folder=tmp_path)
+    assert any("why" in row for row in tables(done.stdout)) == shown
+
+
+@pytest.mark.long
+def test_parts_of_a_table_repeat_only_the_labels(tmp_path: Path) -> None:
+    """Print a year in 80 columns: each month occurs once, and each part repeats the names of the targets."""
+    words = ["visible", "--look-at", "eps Eri", "--start", "2027-01-01", "--days", "365", "--no-pictures"]
+    words += ["--output", str(tmp_path / "out")]
+    shown = CliRunner().invoke(app, words, env={"COLUMNS": "80", "FORCE_COLOR": "1"}).output
+    months = tables(shown.partition("Hours of exposure by month")[2])
+    for month in range(1, 13):
+        assert sum(f"2027-{month:02d}" in row for row in months) == 1
+    parts = [row for row in months if row[0] == "target"]
+    assert len(parts) == len([row for row in months if row[0] == "eps Eri"]) > 1
+
+
+if __name__ == "__main__":
+    FILE.write_text(json.dumps(all_flags(), indent=1) + "\n", encoding="utf-8")

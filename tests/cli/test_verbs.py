@@ -1,0 +1,354 @@
+"""Every verb that answers a study: its files, what it prints, its record, and what becomes of it on a full disk."""
+
+from __future__ import annotations
+
+import atexit
+import json
+import os
+import shlex
+import shutil
+import sys
+from functools import cache
+from pathlib import Path
+from tempfile import mkdtemp
+
+import pytest
+from astropy.table import Table
+from commands import Done, ended, run
+from golden_inputs import write_inputs
+from marks import long_but
+
+from mauvecl import Study, detect
+
+STAR = "--star G2V -m 7.4 --exposure 5"
+DRAWN = f"{STAR} -n 10000 --statistic chi2 --fap 0.01"
+#: Words after the verb.
+VERBS: dict[str, str] = {
+    "exposure": "--star G2V -m 7.4 --snr 300 --at 300",
+    "simulate": STAR,
+    "snr": f"{STAR} -n 2000",
+    "detect": DRAWN,
+    "limit": f"{DRAWN} --amplitude 0.5",
+    "map": f"{DRAWN} --x magnitude=6,7 --y amplitude=0.1,0.5",
+    "gaussian": f"{DRAWN} --sweep magnitude=6,9",
+    "stare": "--star G2V -m 7.4 --duration 60 --no-search",
+    "inject": "--star M3V -m 9 --distance 5 --duration 2000 -n 20 --set injections.sizes=2 --set injections.widths=2",
+    "measure": "--star M3V -m 9 -a 2 --fits 10",
+    "change": "--star M3V -m 9 --set change.trials=10 --set change.steps=2",
+    "calibrate": "standards.toml --knots 20",
+    "analyse": "flares.csv --mapping curve.toml --false-alarms 10 --alarms-per day",
+    "visible": "--look-at 'eps Eri' --start 2027-01-01 --days 2",
+    "plan": "targets.csv --hours 20 --start 2027-01-01 --days 20 --completeness 'closed form'",
+}
+#: Files besides study and record.
+FILES = {
+    "exposure": "exposure.ecsv exposure.png",
+    "simulate": "observation-1.ecsv observation-1.fits observation-1.png",
+    "snr": "noise-budget.ecsv noise-budget.png snr-element.ecsv snr-pixel.ecsv snr.png",
+    "detect": "departures.ecsv detection.ecsv detection.png roc.ecsv spectra.png tails.ecsv",
+    "limit": "limit.ecsv limit.png",
+    "map": "map.ecsv map.fits map.png",
+    "gaussian": "elements.ecsv gaussian.ecsv gaussian.png thresholds.ecsv",
+    "stare": "dynamic-spectrum-1.png events.ecsv light-curve-1.ecsv light-curve-1.fits light-curve-1.png stare.ecsv",
+    "inject": "completeness.ecsv completeness.png curves.png energies.png limits.ecsv search.ecsv",
+    "measure": "contours.png errors.png fit.png fits.ecsv measure.ecsv pulls.png",
+    "change": "change.ecsv change.png indices.ecsv indices.png magnitudes.ecsv",
+    "calibrate": "calibrate.ecsv dark.ecsv dark.png fits.ecsv instrument.toml instrument.zip photon-transfer.ecsv "
+    "photon-transfer.png pixel-map.ecsv residuals.png throughput-errors.ecsv throughput-factor.ecsv throughput.ecsv "
+    "throughput.png",
+    "analyse": "analyse.html completeness.ecsv events.ecsv frames.ecsv light-curve.png limits.ecsv noise.ecsv "
+    "noise.png process.ecsv residuals.png",
+    "visible": "assumptions.ecsv days.ecsv months.ecsv visible.ecsv visible.ics visible.png windows.ecsv",
+    "plan": "assumptions.ecsv days.ecsv energies.ecsv months.ecsv plan.ecsv plan.pdf plan.png stars.ecsv visible.png",
+}
+USUAL = "instrument mauve, detector at 21 deg C; sky of V = 22.1 mag/arcsec2; "
+FLARE = "flares of 10000 K, added to the star, amplitudes in the Kepler band; "
+ORBIT = "orbit of embedded elements; least angles: Earth's limb 25 deg, Sun 46 deg, Moon 25 deg"
+REST = "everything known but the noise; seed 1"
+#: What each verb states about the default study.
+STATED = {
+    "simulate": USUAL + REST,
+    "snr": USUAL + REST,
+    "exposure": USUAL[:-2],
+    "change": USUAL + "everything known but the noise",
+    "calibrate": USUAL[:-2],
+    "analyse": "flares of the shape davenport2014; noise as measured; seed 1",
+    "visible": ORBIT,
+    "plan": f"instrument mauve, detector at 21 deg C; {FLARE}{ORBIT}; {REST}",
+} | dict.fromkeys(("detect", "limit", "map", "gaussian", "stare", "inject", "measure"), USUAL + FLARE + REST)
+#: Verbs that draw. Every table of theirs describes its columns and holds its study; of the others one table does.
+DRAWING = {"snr", "detect", "limit", "map", "gaussian", "stare", "inject", "measure"}
+
+ALL = pytest.mark.parametrize("verb", long_but(VERBS, "exposure", "limit", "visible"))
+
+
+def words(verb: str) -> list[str]:
+    return [verb, *shlex.split(VERBS[verb])]
+
+
+@cache
+def answered(verb: str) -> tuple[Path, Done]:
+    """Ask a verb once for all tests; return the folder, whose answer is in `out`, and what was printed."""
+    folder = Path(mkdtemp(prefix=f"mauvecl-{verb}-"))
+    atexit.register(shutil.rmtree, folder)
+    write_inputs(folder, " ".join(words(verb)))
+    return folder, run(*words(verb), "--output", "out", folder=folder)
+
+
+@pytest.fixture
+def out(verb: str, tmp_path: Path) -> Path:
+    """Return a copy of an answer that a test may change."""
+    return shutil.copytree(answered(verb)[0] / "out", tmp_path / "out")
+
+
+@ALL
+def test_verb_writes_its_files_and_states_its_assumptions(verb: str) -> None:
+    folder, done = answered(verb)
+    written = [folder / "out" / name for name in (*FILES[verb].split(), "study.toml", "run.json")]
+    assert {*(folder / "out").iterdir()} == {*written}
+    assert all(path.name in done.stdout.splitlines()[-1] for path in written)
+    assert all(path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" for path in written if path.suffix == ".png")
+    (line,) = (text for text in done.stdout.splitlines() if text.startswith("Assumed: "))
+    assert line == f"Assumed: {STATED[verb]}."
+    assert "\x1b" not in done.stdout
+    record = json.loads(written[-1].read_text())
+    drawn = {"devices", "kernels"} if verb in DRAWING else set()
+    assert {"seed", "study", "inputs", "wall_time_s", "mauvecl", "messages"} | drawn <= set(record)
+    assert record["verb"] == verb
+    assert all(len(entry.get("source digest", "-" * 64)) == 64 for entry in record["inputs"])
+
+
+@ALL
+def test_written_study_gives_the_same_bits(verb: str) -> None:
+    """Ask again with the study that was written; with --json, standard output holds nothing else."""
+    folder, _ = answered(verb)
+    first, again = folder / "out", folder / "again"
+    asked = [*words(verb)] if verb == "analyse" else [verb, first / "study.toml"]
+    done = run(*asked, "--no-pictures", "--json", "-o", "again", folder=folder)
+    assert json.loads(done.stdout)["assumed"] == f"Assumed: {STATED[verb]}."
+    for path in again.glob("*.ecsv"):
+        assert path.read_text() == (first / path.name).read_text(), path.name
+        if path.stem == verb or (verb in DRAWING and path.stem != "events"):
+            assert Study.read(path) == Study.read(first / "study.toml")
+            table = Table.read(path)
+            assert [name for name in table.colnames if not table[name].info.description] == [], path.name
+    assert (again / "study.toml").read_text() == (first / "study.toml").read_text()
+
+
+def faults(out: Path, code: int = 1) -> list[tuple[str, str]]:
+    """Return the files that `mauvecl verify` finds at fault, with their states."""
+    found = json.loads(run("verify", out, "--json", folder=out.parent, code=code).stdout)
+    return [(one["file"], one["state"]) for one in found]
+
+
+@ALL
+def test_every_changed_or_missing_file_is_noticed(verb: str, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Check every verb, also without the packages for stores."""
+    for package in ("zarr", "h5py", "xarray"):
+        monkeypatch.setitem(sys.modules, package, None)
+    assert "agrees" in run("verify", out, folder=out.parent).stdout
+    for path in sorted(out.iterdir()):
+        content = path.read_bytes()
+        middle = len(content) // 2
+        for changed in (content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :], content + b"\n", b""):
+            path.write_bytes(changed)
+            assert [name for name, _ in faults(out)] == [path.name], path
+        path.unlink()
+        assert faults(out) == [(path.name, "missing")]
+        path.write_bytes(content)
+    assert faults(out, code=0) == []
+
+
+@pytest.mark.parametrize("verb", ["exposure"])
+def test_every_value_of_the_record_is_verified(out: Path) -> None:
+    """Change and remove each entry of the record, and digests together with their files."""
+    place = out / "run.json"
+    text = place.read_text(encoding="utf-8")
+    record = json.loads(text)
+    for key in record:
+        for other in ({**record, key: "other"}, {k: v for k, v in record.items() if k != key}):
+            place.write_text(json.dumps(other, indent=2) + "\n", encoding="utf-8")
+            assert "run.json" in dict(faults(out)), key
+    # The same values in another layout, and a key that is there twice.
+    for changed in (json.dumps(record), text.replace("{", '{"verb": "detect",', 1), text[:-3], "[]"):
+        place.write_text(changed, encoding="utf-8")
+        assert [name for name, _ in faults(out)] == ["run.json"]
+    place.write_text(text, encoding="utf-8")
+    # Other files have no effect; flags of stores are refused.
+    (out / "notes.txt").write_text("mine", encoding="utf-8")
+    assert faults(out, code=0) == []
+    assert "--repair" in run("verify", out, "--repair", folder=out, code=2).stderr
+    # Another answer replaces this one and its digests in the same folder.
+    run(*words("exposure"), "--no-pictures", "--set", "run.seed=5", "--output", out, folder=out)
+    assert faults(out, code=0) == []
+    assert json.loads(place.read_text(encoding="utf-8"))["record_digest"] != record["record_digest"]
+
+
+def test_study_of_the_user_is_not_an_answer(tmp_path: Path) -> None:
+    """Report nothing for a user's study and table, which no run wrote."""
+    (tmp_path / "study.toml").write_text("[run]\nfap = 0.01\n", encoding="utf-8")
+    header = "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: amplitude, datatype: float64}\n"
+    (tmp_path / "flares.ecsv").write_text(f"{header}amplitude\n0.1\n", encoding="utf-8")
+    assert "'.' is not a store of spectra" in run("verify", ".", folder=tmp_path, code=2).stderr
+
+
+def full_from(step: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Simulate a disk that is full after `step` files; return the names of the files that were tried."""
+    tried: list[str] = []
+
+    def fsync(handle: int) -> None:
+        tried.append(Path(f"/proc/self/fd/{handle}").readlink().name)
+        if len(tried) > step:
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    return tried
+
+
+@ALL
+def test_answer_is_printed_if_the_disk_is_full(verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Check that no file is incomplete and that an earlier table is unchanged."""
+    write_inputs(tmp_path, " ".join(words(verb)))
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / f"{verb}.ecsv").write_text("of an earlier run")
+    tried = full_from(0, monkeypatch)
+    code, shown, reported = ended(*words(verb), "--no-pictures", "--output", "out", "--json", folder=tmp_path)
+    assert code == 2, reported
+    assert "No space left on device" in reported
+    assert "more files" in reported
+    assert len(tried) > 1
+    assert json.loads(shown)
+    assert [(p.name, p.read_text()) for p in out.iterdir()] == [(f"{verb}.ecsv", "of an earlier run")]
+
+
+def test_each_file_is_whole_or_missing_if_the_disk_fills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Check that earlier files are complete and later ones unchanged."""
+    asked = (*words("simulate"), "--no-pictures", "--output")
+    plain = run(*asked, "whole", folder=tmp_path).stdout
+    whole = {p.name: p.read_bytes() for p in (tmp_path / "whole").iterdir()}
+    assert len(whole) >= 4
+    for step in range(len(whole)):
+        with monkeypatch.context() as patch:
+            tried = full_from(step, patch)
+            code, shown, reported = ended(*asked, str(step), folder=tmp_path)
+        assert code == 2
+        assert "No space left on device" in reported
+        there = {p.name: p.read_bytes() for p in (tmp_path / str(step)).iterdir()}
+        assert (len(tried), len(there)) == (len(whole), step)
+        # The run record holds the time.
+        assert all(there[name] == whole[name] for name in there if name.endswith((".ecsv", ".toml")))
+        assert shown.partition("Wrote")[0] == plain.partition("Wrote")[0]
+
+
+def test_full_file_system_keeps_earlier_files(small_disk: Path) -> None:
+    asked = (*words("simulate"), "--no-pictures", "--output", "out")
+    run(*asked, folder=small_disk)
+    before = {p.name: p.read_bytes() for p in (small_disk / "out").iterdir()}
+    (small_disk / "filler").write_bytes(bytes(os.statvfs(small_disk).f_bavail * os.statvfs(small_disk).f_bsize))
+    code, shown, reported = ended(*asked, "--exposure", "10", folder=small_disk)
+    assert code == 2
+    assert "observation-1.ecsv" in reported
+    assert "No space left on device" in reported
+    assert "One observation each" in shown
+    assert {p.name: p.read_bytes() for p in (small_disk / "out").iterdir()} == before
+
+
+def test_interruption_while_writing_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fsync(handle: int) -> None:
+        if ".fits" in Path(f"/proc/self/fd/{handle}").readlink().name:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    code, _, reported = ended(*words("simulate"), "--no-pictures", "--output", "out", folder=tmp_path)
+    assert code == 130
+    assert reported == (
+        "mauvecl: interrupted; observation-1.ecsv written to 'out', each file whole, and the same command writes all "
+        "of them\n"
+    )
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"observation-1.ecsv"}
+
+
+def test_output_folder_is_locked_while_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ask into the same folder while each file of another answer is written."""
+    refused: list[bool] = []
+
+    def fsync(handle: int) -> None:
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fsync", lambda handle: None)
+            code, _, reported = ended(*words("exposure"), "--no-pictures", "--output", "out", folder=tmp_path)
+        refused.append(code == 2 and "another" in reported)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    run(*words("detect"), "--no-pictures", "--output", "out", folder=tmp_path)
+    assert refused == [True] * 6
+    monkeypatch.undo()
+    run(*words("exposure"), "--no-pictures", "--output", "out", folder=tmp_path)
+
+
+def test_files_of_the_previous_run_are_removed(tmp_path: Path) -> None:
+    """Remove pictures and tables of the previous run, but not the files of the user."""
+    out = tmp_path / "out"
+    run("simulate", "--star", "G2V", "--star", "K3V", "-m", "7", "-t", "5", "-o", "out", folder=tmp_path)
+    assert {"observation-2.ecsv", "observation-2.png", "observation-1.png"} <= {path.name for path in out.iterdir()}
+    (out / "notes.txt").write_text("mine")
+    (out / "observation-2.fits").write_text("changed by hand")
+    run(*words("exposure"), "--no-pictures", "--output", "out", folder=tmp_path)
+    kept = {path.name for path in out.iterdir()}
+    assert kept == {"exposure.ecsv", "study.toml", "run.json", "notes.txt", "observation-2.fits"}
+
+
+@pytest.mark.parametrize("record", ["", "[]", '{"files": 3}', '{"files": {"../mine": "x"}}', '{"files": {"a": 1}}'])
+def test_foreign_record_removes_nothing(record: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "run.json").write_text(record)
+    (out / "a").write_text("mine")
+    (tmp_path / "mine").write_text("mine")
+    run(*words("exposure"), "--no-pictures", "--output", "out", folder=tmp_path)
+    assert (out / "a").read_text() == (tmp_path / "mine").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("setting", "stated"),
+    [
+        ("observation.instrument=mauve-electrons", "instrument mauve-electrons"),
+        ("observation.temperature_c=13", "detector at 13 deg C"),
+        ("observation.changes={light_loss=0.2}", "with another light_loss"),
+        ("sky={surface_brightness=20.5}", "sky of V = 20.5 mag/arcsec2"),
+        ("sky={none=true}", "no sky"),
+        ("sky={target='53.2 -9.5', time='2027-01-01'}", "sky at 53.2 -9.5, 2027-01-01 UTC"),
+        ("flare.temperature_k=9000", "flares of 9000 K"),
+        ("flare.band=TESS", "amplitudes in the TESS band"),
+        ("flare.geometry=replaces", "replacing photosphere"),
+        ("run.seed=7", "seed 7"),
+        ("nuisances.usual=true", "the usual unknowns drawn and marginalised"),
+        ("nuisances.dark=0.1", "marginalised: dark"),
+        ("processes.jitter.uniform=[0,0.05]", "drawn: jitter"),
+        ("stare.thermal.amplitude=0.5", "not used: stare.thermal"),
+        ("sweep.axes=[{quantity='sky', values=[20, 21]}]", "sky as swept"),
+        ("sweep.axes=[{quantity='detector_temperature', values=[13, 21]}]", "detector temperature as swept"),
+        ("sweep.axes=[{quantity='flare_temperature', values=[9000, 8000]}]", "flares of swept temperature"),
+    ],
+)
+def test_assumptions_follow_the_study(setting: str, stated: str) -> None:
+    few = ["run.realisations=500", "run.fap=0.5", "run.statistics=['matched']", "flare.amplitudes=[0.1]"]
+    usual, changed = (detect(Study().with_settings([*few, *one])).assumed for one in ([], [setting]))
+    assert stated not in usual
+    assert stated in changed
+    assert "\n" not in changed
+
+
+@pytest.mark.parametrize(
+    ("words", "stated"),
+    [
+        ("stare --star G2V -m 7 --duration 60 --no-search --thermal 0.5", "drawn: thermal"),
+        ("stare --star G2V -m 7 --duration 60 --no-search --set stare.jitters={light=0.01}", "drawn: jitters of light"),
+        ("limit --amplitude 0.5 --set unknowns.draws=2", "2 draws of the instrument's unknowns"),
+        ("visible --look-at 'eps Eri' --days 1 --sun 50", "Sun 50 deg"),
+    ],
+)
+def test_assumptions_of_other_verbs_follow_the_study(words: str, stated: str, tmp_path: Path) -> None:
+    few = ["-n", "2000", "--fap", "0.1", "--star", "G2V", "-m", "7"] if words.startswith("limit") else []
+    shown = run(*shlex.split(words), *few, "--no-pictures", folder=tmp_path).stdout
+    assert stated in next(line for line in shown.splitlines() if line.startswith("Assumed: "))

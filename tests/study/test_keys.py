@@ -1,0 +1,331 @@
+"""Keys of studies: their units, ranges and types wherever a value can be given, their paths, and older files."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import astropy.units as u
+import numpy as np
+import pytest
+from pydantic import BaseModel, ValidationError
+from refusals import refused
+from study_keys import fields, metadata, models_in
+
+from mauvecl import BalmerFlare, InputError, Instrument, Sky, Source, Study, TwoBlackbodies, detect, expect
+from mauvecl.web.state import State
+
+FIELDS = dict(fields())
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "plain"),
+    [
+        ("observation.exposure_s", 1 * u.min, 60.0),
+        ("observation.exposure_s", 86_400, 86_400.0),
+        ("observation.temperature_c", 300 * u.K, 26.85),
+        ("observation.temperature_c", None, None),
+        ("signal.wavelength_nm", 1 * u.PHz, 299.792458),
+        ("run.realisations", 5000.0, 5000),
+        ("run.fap", 10 * u.percent, 0.1),
+        ("measure.bands_nm", [[0.3, 0.4] * u.um], ((300.0, 400.0),)),
+        ("measure.bands_nm", [[0.3 * u.um, 400 * u.nm]], ((300.0, 400.0),)),
+        ("orbit.simbad", True, True),
+    ],
+)
+def test_values_in_range_are_plain_numbers(key: str, value: Any, plain: Any) -> None:
+    section, name = key.split(".")
+    found = getattr(getattr(Study.build({section: {name: value}}, "test"), section), name)
+    np.testing.assert_allclose(found, plain, rtol=1e-12) if plain is not None else None
+    assert type(found) is type(plain)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("observation.exposure_s", 0, "seconds above 0 and up to 86400"),
+        ("observation.exposure_s", 3 * u.kg, "seconds above 0 and up to 86400"),
+        ("observation.exposure_s", "a minute", "seconds above 0 and up to 86400"),
+        ("observation.exposure_s", float("nan"), "seconds above 0 and up to 86400"),
+        ("observation.temperature_c", 66, "-40 to 65 deg C"),
+        ("signal.wavelength_nm", -1 * u.um, "nm above 0"),
+        ("run.fap", 1, "a number above 0 and below 1"),
+        ("run.seed", -1, "a whole number from 0 to 18446744073709551615"),
+        ("run.realisations", 1.5, "a whole number"),
+        ("run.realisations", 0, "a whole number of at least 1"),
+        ("search.window_s", float("inf"), "seconds"),
+        ("measure.bands_nm.0.0", [[1, 2] * u.s], "nm above 0"),
+    ],
+)
+def test_other_values_raise(key: str, value: Any, expected: str) -> None:
+    section, name, *_ = key.split(".")
+    with refused(key, expected=expected):
+        Study.build({section: {name: value}}, "test")
+
+
+# Ranges of quantities
+
+#: Paths of the quantities that sweeps, maps and limits vary, except names.
+NUMERIC = {
+    quantity.name: path
+    for path, field in FIELDS.items()
+    if (quantity := metadata(field, "Quantity")) is not None and quantity.name != "star"
+}
+#: Names in the page's links.
+PAGE = {
+    "magnitude": "magnitude",
+    "amplitude": "amplitude_percent",
+    "exposure": "exposure_s",
+    "flare_temperature": "flare_temperature_k",
+    "detector_temperature": "temperature_c",
+    "sky": "sky_brightness",
+}
+
+
+def star() -> Source:
+    return Source.from_library("G2V")
+
+
+#: Python functions that take the quantity; lines cannot be scaled by an argument.
+CALLS: dict[str, Callable[[float], Any]] = {
+    "magnitude": lambda v: star().at_magnitude(v),
+    "amplitude": lambda v: star().flaring(v),
+    "flare_temperature": lambda v: star().flaring(0.1, v),
+    "balmer_jump": lambda v: BalmerFlare(1e4, v),
+    "second_temperature": lambda v: TwoBlackbodies(1e4, v, 0.1),
+    "second_area": lambda v: TwoBlackbodies(1e4, 2e4, v),
+    "exposure": lambda v: expect(star().at_magnitude(7.0), Instrument.load("mauve"), exposure=v),
+    "detector_temperature": lambda v: Instrument.load("mauve").with_(temperature_c=v),
+    "sky": Sky.of_brightness,
+}
+
+
+def reach(name: str) -> Any:
+    return metadata(FIELDS[NUMERIC[name]], "Range")
+
+
+def outside(name: str) -> list[float]:
+    """Return values just outside of both ends of a range."""
+    one = reach(name)
+    below = one.low if one.open_low else one.low - 1e-9 * max(abs(one.low), 1.0)
+    return [below, one.high if one.open_high else one.high * (1 + 1e-9)]
+
+
+def ends(name: str) -> list[float]:
+    one = reach(name)
+    return [1e-3 if one.open_low else one.low, 0.999 if one.open_high else one.high]
+
+
+def refuses(call: Callable[[], Any]) -> bool:
+    try:
+        call()
+    except InputError as error:
+        # Other errors, such as one of a spectrum that needs another key, do not name a range.
+        return any(word in (error.expected or "") for word in (" to ", "above", "at least", "up to"))
+    return False
+
+
+def test_all_quantities_are_tested() -> None:
+    assert set(NUMERIC) == {*CALLS, "line_scale"}
+    assert all(reach(name) is not None for name in NUMERIC)
+
+
+@pytest.mark.parametrize("name", NUMERIC)
+def test_keys_sweeps_and_maps_have_the_range(name: str) -> None:
+    key = ".".join(NUMERIC[name]).replace("star.", "star.0.")
+    for value in outside(name):
+        text = f"[{value!r}]" if name == "amplitude" else repr(value)
+        assert refuses(lambda: Study().with_settings([f"{key}={text}"])), (key, value)  # noqa: B023
+        for axis, place in (
+            (f"sweep.axes=[{{quantity={name!r},values=[{value!r}]}}]", "sweep.axes.0"),
+            (f"map.x={{quantity={name!r},values=[{value!r}]}}", "map.x"),
+        ):
+            with refused(f"{place}.values", value=value):
+                Study().with_settings(["map.y={quantity='star',values=['G2V']}", axis])
+        if name != "line_scale":
+            assert refuses(lambda: Study().at(name, value))  # noqa: B023
+    for value in ends(name):
+        swept = Study().with_settings([f"sweep.axes=[{{quantity={name!r},values=[{value!r}]}}]"])
+        assert swept.sweep.axes[0].points() == (value,)
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_python_arguments_have_the_range(name: str) -> None:
+    assert all(refuses(lambda: CALLS[name](value)) for value in outside(name))  # noqa: B023
+    assert not any(refuses(lambda: CALLS[name](value)) for value in ends(name))  # noqa: B023
+
+
+@pytest.mark.parametrize("name", PAGE)
+def test_page_has_the_range(name: str) -> None:
+    scale = 100 if name == "amplitude" else 1
+    for values, faulty in ((outside(name), True), (ends(name), False)):
+        for value in values:
+            state = State()
+            state.follow(f"?{PAGE[name]}={scale * value!r}")
+            assert (PAGE[name] in state.faults) == faulty, (value, state.faults)
+
+
+def test_keys_of_one_kind_share_a_range() -> None:
+    """All temperatures of stars and flares have one range, and the detector's its own, wherever it is a key."""
+    found: dict[str, set[tuple[float, float]]] = {"K": set(), "deg_C": set()}
+    for field in FIELDS.values():
+        unit, one = metadata(field, "Unit"), metadata(field, "Range")
+        if one is not None and unit is not None and unit.name in found:
+            found[unit.name].add((one.low, one.high))
+    assert found == {"K": {(1_000, 200_000)}, "deg_C": {(-40, 65)}}
+    prior = "processes.detector_temperature={{normal=[20, 1], between=[{}, {}]}}"
+    for low, high in ((-41, 25), (15, 66)):
+        with refused("detector_temperature", expected="-40 to 65"):
+            detect(Study().with_settings(["run.realisations=100000", prior.format(low, high)]))
+
+
+# Types
+
+
+def models(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
+    """Yield a model and all models of its fields."""
+    yield model
+    for field in model.model_fields.values():
+        for inner in models_in(field.annotation):
+            yield from models(inner)
+
+
+def types(annotation: Any) -> set[Any]:
+    """Return the types of single values in an annotation."""
+    parts = get_args(annotation)[:1] if hasattr(annotation, "__metadata__") else get_args(annotation)
+    return set().union(*map(types, parts)) if parts else {annotation}
+
+
+#: Numeric keys of studies and instruments by their model.
+NUMBERS = {
+    model: names
+    for root in (Study, Instrument)
+    for model in models(root)
+    if (names := [name for name, field in model.model_fields.items()
+                  if types(field.annotation) & {int, float} and bool not in types(field.annotation)])
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("model", sorted(NUMBERS, key=lambda one: one.__name__))
+def test_booleans_as_numbers_raise(model: type[BaseModel]) -> None:
+    """All numeric keys of studies and instruments reject booleans of Python and NumPy, alone and in lists."""
+    for name in NUMBERS[model]:
+        for value in (True, False, np.True_, [True], [0.5, True], (False,)):
+            with pytest.raises(ValidationError) as error:
+                model.model_validate({name: value})
+            assert any(fault["loc"][0] == name for fault in error.value.errors()), (name, value)
+
+
+def test_numeric_keys_are_found() -> None:
+    names = {f"{model.__name__}.{name}" for model, numeric in NUMBERS.items() for name in numeric}
+    assert {"Star.bin_nm", "Flare.amplitudes", "Run.seed", "Instrument.read_noise_dn", "Axis.values"} <= names
+    assert len(names) > 100
+
+
+# Paths
+
+
+def holds_path(kind: Any) -> bool:
+    return kind is Path or any(map(holds_path, get_args(kind)))
+
+
+#: Every key that holds a path.
+FILES = """
+star = [{ file = "F", neighbours = "F" }]
+flare.spectrum = { file = "F", quiescent = "F" }
+nuisances.own.stray = { file = "F", sd = 0.1 }
+run.weights.own = "F"
+stare = { thermal.file = "F", variability.file = "F", throughput.file = "F", sky.file = "F" }
+events = [{ peak_s = 1, peak = 1, shape_file = "F" }]
+orbit.tle = "F"
+plan.targets = [{ name = "AU Mic", rates_file = "F", neighbours = "F" }]
+data = { file = "F", mapping = "F" }
+calibrate.observations = [{ frames = "F", mapping = "F", spectrum = "F", magnitude = 5 }]
+change = { file = "F", of = ["spectrum"] }
+"""
+
+
+def paths_in(value: Any) -> Iterator[Path]:
+    """Yield the paths that a study holds."""
+    if isinstance(value, Path):
+        yield value
+    elif isinstance(value, dict | list | tuple):
+        for one in value.values() if isinstance(value, dict) else value:
+            yield from paths_in(one)
+
+
+def test_paths_are_relative_to_the_study_file_and_absolute_in_its_text(tmp_path: Path) -> None:
+    keys = {".".join(path) for path, field in FIELDS.items() if holds_path(field.annotation)}
+    (tmp_path / "study.toml").write_text(FILES.replace('"F"', '"there/f.txt"'))
+    (tmp_path / "there").mkdir()
+    light = np.transpose([np.linspace(150.0, 1200.0, 500), np.ones(500)])
+    np.savetxt(tmp_path / "there" / "f.txt", light)
+    study = Study.read(tmp_path / "study.toml")
+    found = list(paths_in(study.model_dump()))
+    assert set(found) == {tmp_path / "there" / "f.txt"}
+    assert len(found) == len(keys) == FILES.count('"F"')
+    absolute = tomllib.loads(study.toml())
+    assert str(absolute).count(str(tmp_path / "there" / "f.txt")) == len(keys)
+    # Read elsewhere, the text gives the same study.
+    assert Study.build(absolute, "elsewhere") == study
+
+
+# Older files
+
+#: Written by the version in which limits, curves and cooling had classes for their text.
+OLDER = """
+[[star]]
+library = "M3V"
+magnitude = 9.0
+
+[stare]
+duration_s = 600.0
+orbit_s = 5680.0
+
+[stare.thermal]
+amplitude = 0.5
+phase = 1.0
+
+[stare.sky]
+points = [[0.0, 0.0], [600.0, 0.1]]
+
+[[events]]
+peak_s = 100.0
+peak = 0.5
+temperature_k = 12000.0
+
+[events.cooling]
+end_k = 6000.0
+fold_s = 300.0
+
+[orbit.limits]
+earth_limb_deg = 20.0
+sun_deg = "none"
+moon_deg = "None"
+declination_deg = "none"
+normal_cone_deg = 39.1
+anomaly = [[-90.0, -50.0], [40.0, -50.0], [0.0, 0.0]]
+"""
+
+
+def test_study_of_an_older_version_is_read_and_keeps_its_keys() -> None:
+    given = tomllib.loads(OLDER)
+    study = Study.build(given, "text")
+    limits, stare = study.orbit.limits, study.stare
+    assert (limits.earth_limb_deg, limits.sun_deg, limits.moon_deg, limits.declination_deg) == (20, None, None, None)
+    assert (limits.normal_cone_deg, limits.anomaly) == (39.1, ((-90, -50), (40, -50), (0, 0)))
+    assert stare.thermal is not None
+    assert (stare.thermal.amplitude, stare.thermal.phase, stare.thermal.points) == (0.5, 1.0, None)
+    assert stare.sky is not None
+    assert stare.sky.points == ((0, 0), (600, 0.1))
+    assert study.events[0].cooling is not None
+    assert (study.events[0].cooling.end_k, study.events[0].cooling.fold_s) == (6000.0, 300.0)
+    written = tomllib.loads(study.toml())
+    usual = Study().orbit.limits.model_dump(mode="json")
+    assert written["orbit"]["limits"] == usual | given["orbit"]["limits"] | {"moon_deg": "none"}
+    assert written["stare"]["thermal"] == given["stare"]["thermal"]
+    assert written["stare"]["sky"] == {"phase": 0.0} | given["stare"]["sky"]
+    assert written["events"][0] == {"energy": "bolometric"} | given["events"][0]
+    assert Study.build(written, "text") == study
