@@ -8,9 +8,7 @@ import pytest
 from refusals import refused
 
 import mauvecl
-from mauvecl import Study
-from mauvecl.device.engine import Engine
-from mauvecl.device.stare_engine import Stares
+from mauvecl import Engine, Stares, Study
 from mauvecl.noise.unknowns import PROCESSES
 
 FEW = ["star=[{library='G2V', magnitude=7.4}]", "run={realisations=10_000, fap=0.01, statistics=['matched']}"]

@@ -12,10 +12,9 @@ from answers import FEW, QUICK
 from astropy.table import QTable
 
 import mauvecl
-from mauvecl import Study
+from mauvecl import Engine, Study
 from mauvecl.answers.verbs import VERBS
 from mauvecl.cli.console import show_view
-from mauvecl.device.engine import Engine
 from mauvecl.schema.tables import Column, View, records, stacked, table_of
 from mauvecl.web.tabs import TABS
 from mauvecl.web.tabs.tab import FIXED, Tab

@@ -6,16 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from answers import of_kind
 from refusals import refused
 
+from mauvecl import Engine, Study, exposure_for
 from mauvecl.answers.signal import exposures
-from mauvecl.answers.signal.exposures import exposure_for, snr_at
+from mauvecl.answers.signal.exposures import snr_at
 from mauvecl.cli.console import show_view
-from mauvecl.device.engine import Engine
-from mauvecl.schema.messages import of_kind
 from mauvecl.schema.tables import Column
 from mauvecl.study.cases import Case
-from mauvecl.study.study import Study
 
 
 def study(magnitude: float = 7.4, **observation: float) -> Study:

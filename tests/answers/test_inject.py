@@ -6,18 +6,14 @@ import json
 
 import numpy as np
 import pytest
+from answers import of_kind
 from commands import run
 from refusals import refused
 
-from mauvecl.answers.stares.inject import inject
-from mauvecl.device.engine import Engine
-from mauvecl.device.stare_engine import Stares
+from mauvecl import Engine, LocalWorkers, Pool, Stares, Study, inject
 from mauvecl.lightcurve.search.injected_completeness import InjectedCompleteness
 from mauvecl.runs.checkpoint import Checkpoint
-from mauvecl.runs.pool import LocalWorkers, Pool
-from mauvecl.schema.messages import of_kind
 from mauvecl.statistics.intervals import clopper_pearson
-from mauvecl.study.study import Study
 
 SMALL = {
     "star": [{"library": "G2V", "magnitude": 7.4, "distance_pc": 14.0}],

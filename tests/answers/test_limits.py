@@ -7,19 +7,25 @@ from typing import Any
 
 import numpy as np
 import pytest
+from answers import of_kind
 from astropy.table import QTable
 from marks import long_but
 from refusals import refused
 
-from mauvecl.answers.limits.assumptions import what_matters
-from mauvecl.answers.limits.limits import STEPS, limiting_magnitude, shortest_exposure, smallest_amplitude
+from mauvecl import (
+    Engine,
+    LocalWorkers,
+    Pool,
+    Study,
+    limiting_magnitude,
+    shortest_exposure,
+    smallest_amplitude,
+    what_matters,
+)
+from mauvecl.answers.limits.limits import STEPS
 from mauvecl.answers.limits.search import LimitSearch
-from mauvecl.device.engine import Engine
-from mauvecl.runs.pool import LocalWorkers, Pool
-from mauvecl.schema.messages import of_kind
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.cases import Case
-from mauvecl.study.study import Study
 
 STATISTICS = ("chi2", "chi2_element", "matched", "uv_excess")
 

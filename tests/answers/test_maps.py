@@ -6,13 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from answers import of_kind
 from astropy.table import QTable
 
-from mauvecl.answers.detection.maps import detection_map
-from mauvecl.device.engine import Engine
-from mauvecl.schema.messages import of_kind
+from mauvecl import Engine, Study, detection_map
 from mauvecl.study.cases import Case
-from mauvecl.study.study import Study
 
 N = 20_000
 

@@ -11,10 +11,9 @@ from commands import ended, run
 from refusals import refused
 from scipy import stats
 
-from mauvecl import Engine, Study, measure
+from mauvecl import Engine, Pool, Study, measure
 from mauvecl.answers.measurements.measure import COLUMNS, THROUGHPUT_COLUMN, MeasureAnswer
 from mauvecl.host.stars.bands import photons
-from mauvecl.runs.pool import Pool
 from mauvecl.study.cases import Case
 
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 
 import pytest
+from answers import of_kind
 from marks import long_but
 
-from mauvecl.answers.signal.simulate import simulate
+from mauvecl import Study, simulate
 from mauvecl.host.files.json_text import json_text
-from mauvecl.schema.messages import of_kind
 from mauvecl.study.cases import Case
 from mauvecl.study.messages import collect_messages
-from mauvecl.study.study import Study
 
 
 def test_rounding_that_invalidates_closed_forms_is_reported() -> None:

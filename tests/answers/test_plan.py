@@ -5,22 +5,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from answers import of_kind
 from astropy.table import QTable, Table
 from refusals import refused
 from scipy import stats
 
-from mauvecl import Study, plan
+from mauvecl import EnergyScale, Study, plan
 from mauvecl.answers.campaigns.plan import PlanAnswer
 from mauvecl.answers.campaigns.plan_lines import target_lines
 from mauvecl.answers.campaigns.planned import TargetObservation
 from mauvecl.answers.campaigns.planned_injections import injection_case
 from mauvecl.answers.files import write_study, write_table
 from mauvecl.host.stars.spectral_types import nearest_spectrum, subtype
-from mauvecl.lightcurve.flares.energies import EnergyScale, quiescent_luminosity
+from mauvecl.lightcurve.flares.energies import quiescent_luminosity
 from mauvecl.lightcurve.flares.rates import davenport2019
 from mauvecl.lightcurve.search.completeness import Completeness
 from mauvecl.lightcurve.stares.orbit_stare import stare_along
-from mauvecl.schema.messages import of_kind
 from mauvecl.schema.tables import records
 from mauvecl.study.cases import Case
 from mauvecl.study.orbits import read_targets

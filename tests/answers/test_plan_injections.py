@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from mauvecl import Study
-from mauvecl.answers.campaigns.plan import plan
+from mauvecl import Study, inject, plan
 from mauvecl.answers.campaigns.planned import TargetObservation, closed_form
 from mauvecl.answers.campaigns.planned_injections import found_by_energy, injection_case
-from mauvecl.answers.stares.inject import inject
 from mauvecl.lightcurve.flares.rates import PowerLaw
 from mauvecl.lightcurve.search.completeness import Completeness, DurationLaw
 from mauvecl.lightcurve.search.yields import fit_power_law, recovered_per_day

@@ -7,21 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from answers import small
+from answers import of_kind, small
 from marks import long_but
 from typer.testing import CliRunner
 
-from mauvecl.answers.detection.detect import detect
-from mauvecl.answers.detection.maps import detection_map
-from mauvecl.answers.limits.limits import limiting_magnitude
-from mauvecl.answers.signal.simulate import simulate
-from mauvecl.answers.signal.snr import snr
+from mauvecl import Engine, InputError, Study, detect, detection_map, limiting_magnitude, simulate, snr
 from mauvecl.cli.app import app
-from mauvecl.device.engine import Engine
 from mauvecl.noise.unknowns import PROCESSES
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.messages import of_kind
-from mauvecl.study.study import Study
 
 #: Priors that contain the expectation's own value, and that do not.
 PRIORS = {

@@ -7,26 +7,28 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from answers import of_kind
 
-from mauvecl.answers.campaigns.plan import plan
-from mauvecl.answers.detection.detect import detect
-from mauvecl.answers.detection.gaussian import gaussian_report
-from mauvecl.answers.detection.maps import detection_map
-from mauvecl.answers.limits.limits import limiting_magnitude
-from mauvecl.answers.measurements.measure import measure
-from mauvecl.answers.signal.exposures import exposure_for
-from mauvecl.answers.signal.simulate import simulate
-from mauvecl.answers.signal.snr import snr
-from mauvecl.answers.stares.inject import inject
-from mauvecl.answers.stares.stare import stare
-from mauvecl.device.engine import Engine
-from mauvecl.device.stare_engine import Stares
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.messages import of_kind
+from mauvecl import (
+    Engine,
+    InputError,
+    Stares,
+    Study,
+    detect,
+    detection_map,
+    exposure_for,
+    gaussian_report,
+    inject,
+    limiting_magnitude,
+    measure,
+    plan,
+    simulate,
+    snr,
+    stare,
+)
 from mauvecl.store.bulk import realise_file
 from mauvecl.study.cases import Case
 from mauvecl.study.messages import collect_messages
-from mauvecl.study.study import Study
 
 Messages = Callable[[Study, Engine, Path], list[str]]
 

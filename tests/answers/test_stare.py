@@ -10,16 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from answers import of_kind
 from astropy.io import fits
 from astropy.table import QTable
 from commands import run
 
-from mauvecl.answers.stares.stare import StareAnswer, stare
-from mauvecl.device.engine import Engine
-from mauvecl.device.stare_engine import Stares
-from mauvecl.schema.messages import of_kind
+from mauvecl import Engine, Stares, Study, stare
+from mauvecl.answers.stares.stare import StareAnswer
 from mauvecl.study.cases import Case
-from mauvecl.study.study import Study
 
 #: A G2V star for five minutes with a gap and a flare.
 SHORT = Study().with_settings(

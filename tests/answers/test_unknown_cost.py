@@ -10,30 +10,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from answers import twice
+from answers import of_kind, twice
 from commands import ended, run
 from refusals import refused
 from scenes import instrument
 
+from mauvecl import Engine, Nuisances, Sky, Source, Study, detect, detection_map, expect, limiting_magnitude
 from mauvecl.answers.detection.chance_with_unknowns import chance_with_unknowns
-from mauvecl.answers.detection.detect import detect
-from mauvecl.answers.detection.maps import detection_map
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
 from mauvecl.answers.detection.unknown_table import power, unknown_table
-from mauvecl.answers.limits.limits import limiting_magnitude
 from mauvecl.cli.question import nuisances_of
-from mauvecl.device.engine import Engine
-from mauvecl.host.expectation import expect
-from mauvecl.host.sky.zodiacal import Sky
-from mauvecl.host.stars.source import Source
 from mauvecl.noise.scene import prepare
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, PROCESSES
 from mauvecl.results.requests.requests import DetectRequest
-from mauvecl.schema.messages import of_kind
-from mauvecl.statistics.nuisances import Nuisances
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.nuisances import NuisanceChoice
-from mauvecl.study.study import Study
 from mauvecl.web.fields import points
 from mauvecl.web.state import State
 

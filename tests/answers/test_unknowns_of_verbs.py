@@ -10,13 +10,10 @@ import numpy as np
 import pytest
 from answers import small
 
+from mauvecl import Engine, InputError, Stares, Study
 from mauvecl.answers.verbs import VERBS
-from mauvecl.device.engine import Engine
-from mauvecl.device.stare_engine import Stares
 from mauvecl.noise.unknowns import ADDITIVE, NUISANCES, PROCESSES, STARE_CHANGES, STARE_PROCESSES
-from mauvecl.schema.errors import InputError
 from mauvecl.study.assumptions import unused_unknowns
-from mauvecl.study.study import Study
 
 #: Normal priors that stares accept, near the expectation's values.
 PRIORS: dict[str, dict[str, Any]] = {

@@ -11,11 +11,10 @@ from answers import FEW, QUICK
 from marks import long_but
 
 import mauvecl
-from mauvecl import Study
+from mauvecl import Engine, Study
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.verbs import VERBS
 from mauvecl.cli.app import app
-from mauvecl.device.engine import Engine
 
 
 @pytest.mark.parametrize("name", VERBS)

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from mauvecl import Study, visible
+from mauvecl import Sky, Study, visible
 from mauvecl.answers.campaigns.calendars import Entry, calendar_bytes
 from mauvecl.answers.campaigns.visible import SEEN_H, VisibleAnswer
-from mauvecl.host.sky.zodiacal import Sky
 
 NAMES = ("eps Eri", "AU Mic", "EK Dra")
 

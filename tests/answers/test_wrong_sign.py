@@ -6,13 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from answers import small
+from answers import of_kind, small
 
-from mauvecl.answers.detection.detect import detect
-from mauvecl.answers.detection.maps import detection_map
-from mauvecl.answers.limits.limits import limiting_magnitude
-from mauvecl.device.engine import Engine
-from mauvecl.schema.messages import of_kind
+from mauvecl import Engine, detect, detection_map, limiting_magnitude
 
 NUISANCES: dict[str, dict[str, Any]] = {
     "known": {},

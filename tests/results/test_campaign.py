@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mauvecl.answers.detection.detect import detect
-from mauvecl.device.engine import Engine
+from mauvecl import Engine, Study, detect
 from mauvecl.results.detection.campaign import campaign, per_test
-from mauvecl.study.study import Study
 
 
 def test_day_of_single_frames_has_its_false_alarms() -> None:

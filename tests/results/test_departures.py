@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from answers import STATISTICS
 from scenes import instrument, star
 
-from mauvecl.device.engine import Engine
-from mauvecl.noise.comparison import Comparison
-from mauvecl.results.detection.departures import Departure, departures
-from mauvecl.statistics.registry import STATISTICS
+from mauvecl import Comparison, Engine, departures
+from mauvecl.results.detection.departures import Departure
 
 N = 500_000
 FAP = 1e-3

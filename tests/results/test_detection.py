@@ -6,20 +6,16 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from answers import STATISTICS
 from refusals import refused
 from scenes import instrument, star
 from scipy import stats
 
-from mauvecl.device.engine import Engine
-from mauvecl.host.expectation import expect
-from mauvecl.host.sky.zodiacal import Sky
-from mauvecl.host.stars.source import Source
+from mauvecl import Detection, Engine, Linear, Sky, Source, expect
 from mauvecl.results import numpy_kernels
 from mauvecl.results.counts.tally import Distribution, Grid, Tally
-from mauvecl.results.detection.detection import Detection
 from mauvecl.results.detection.roc import Roc
-from mauvecl.statistics.linear import Linear, Matched
-from mauvecl.statistics.registry import STATISTICS
+from mauvecl.statistics.linear import Matched
 from mauvecl.statistics.statistic import Setting
 
 N = 1_000_000

@@ -9,20 +9,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from answers import STATISTICS
 from refusals import refused
 from scenes import instrument, star
 
-from mauvecl.device.engine import Engine
-from mauvecl.host.expectation import Expectation
-from mauvecl.noise.comparison import Comparison
-from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
+from mauvecl import Comparison, CosmicRays, Detection, Engine, Expectation, Linear, Normal, Processes, Uniform
 from mauvecl.results.counts.tally import Distribution
-from mauvecl.results.detection.detection import Detection
 from mauvecl.results.requests.channels import plan_channels
 from mauvecl.results.snr import PERCENTAGES
 from mauvecl.statistics.intervals import central_counts
-from mauvecl.statistics.linear import Linear
-from mauvecl.statistics.registry import STATISTICS
 
 N, FAP = 4000, 0.05
 STUDIES = 8

@@ -12,11 +12,20 @@ import numpy as np
 import pytest
 import scipy
 
-from mauvecl import BalmerFlare, Expectation, Instrument, Nuisances, Source, TwoBlackbodies, expect
-from mauvecl.results.measurements.fit import fit, forecast
-from mauvecl.results.measurements.flare_model import FlareModel
+from mauvecl import (
+    BalmerFlare,
+    Expectation,
+    FlareModel,
+    Instrument,
+    Nuisances,
+    Source,
+    TwoBlackbodies,
+    expect,
+    fit,
+    fit_two_temperatures,
+    forecast,
+)
 from mauvecl.results.measurements.light_factor import Ratio
-from mauvecl.results.measurements.two_temperatures import fit_two_temperatures
 
 MAUVE = Instrument.load("mauve")
 FREE, SKY_SD, DARK_C = np.inf, 0.1, 0.5

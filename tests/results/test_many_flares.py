@@ -9,11 +9,9 @@ import pytest
 from answers import small
 from scenes import instrument, star
 
-from mauvecl.answers.detection import detect as module
-from mauvecl.answers.detection.detect import detect
-from mauvecl.device.engine import Engine
+from mauvecl import Detection, Engine, detect
+from mauvecl import detect as module
 from mauvecl.pictures import answers as pictures
-from mauvecl.results.detection.detection import Detection
 from mauvecl.results.requests.requests import DetectRequest, Shard
 from mauvecl.results.shard_sums import DetectionSums, pack_detection
 

@@ -13,10 +13,22 @@ import numpy as np
 import pytest
 import scipy
 
-from mauvecl import Engine, Expectation, Instrument, Nuisances, Source, expect
-from mauvecl.host.stars.flare_spectra import LINES_NM, BalmerFlare, ObservedFlare
-from mauvecl.results.measurements.fit import fit, fit_sums, forecast
-from mauvecl.results.measurements.flare_model import FlareModel, derived_values
+from mauvecl import (
+    BalmerFlare,
+    Engine,
+    Expectation,
+    FlareModel,
+    Instrument,
+    Nuisances,
+    ObservedFlare,
+    Source,
+    expect,
+    fit,
+    forecast,
+)
+from mauvecl.host.stars.flare_spectra import LINES_NM
+from mauvecl.results.measurements.fit import fit_sums
+from mauvecl.results.measurements.flare_model import derived_values
 from mauvecl.results.measurements.profile import Profile, _Thresholds, intervals
 from mauvecl.results.measurements.reduction import Reduction, drawn_sums
 

@@ -7,17 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from answers import of_kind
 from scenes import instrument, star
 
-from mauvecl.answers.detection.detect import detect
-from mauvecl.answers.detection.maps import detection_map
+from mauvecl import Engine, Expectation, Study, detect, detection_map
 from mauvecl.answers.limits.search import LimitSearch
-from mauvecl.device.engine import Engine
-from mauvecl.host.expectation import Expectation
 from mauvecl.results.requests.fap_checks import NoThresholdError
-from mauvecl.schema.messages import of_kind
 from mauvecl.study.cases import Case
-from mauvecl.study.study import Study
 
 N = 20_000
 PAYLOAD = instrument(part=True, output_min_nm=300.0, output_max_nm=310.0)

@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from answers import twice
+from answers import STATISTICS, twice
 from scipy import stats
 
-from mauvecl.device.engine import Engine
-from mauvecl.host.expectation import expect
-from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.host.sky.zodiacal import Sky
-from mauvecl.host.stars.source import Source
+from mauvecl import Engine, Instrument, Sky, Source, expect
 from mauvecl.results.requests.requests import DetectRequest
-from mauvecl.statistics.registry import STATISTICS
 
 SCENES = 80
 #: Of the thresholds, and again of the false alarms counted with other draws.

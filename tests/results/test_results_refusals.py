@@ -10,15 +10,23 @@ import pytest
 from refusals import Row, check
 from scenes import instrument, star
 
-from mauvecl import FlareModel, Instrument, Source, expect, fit, fit_two_temperatures
-from mauvecl.answers.detection.detect import detect
-from mauvecl.device.engine import Engine
-from mauvecl.noise.comparison import Comparison
-from mauvecl.noise.processes import Processes, Uniform
+from mauvecl import (
+    Comparison,
+    Detection,
+    Engine,
+    FlareModel,
+    Instrument,
+    Linear,
+    Processes,
+    Source,
+    Study,
+    Uniform,
+    detect,
+    expect,
+    fit,
+    fit_two_temperatures,
+)
 from mauvecl.results.detection.campaign import campaign
-from mauvecl.results.detection.detection import Detection
-from mauvecl.statistics.linear import Linear
-from mauvecl.study.study import Study
 
 PAYLOAD = instrument(part=True)
 MAUVE = Instrument.load("mauve")

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from answers import STATISTICS
 from refusals import refused
 from scenes import instrument, star
 from scipy import special
 
-from mauvecl.device.engine import Engine
-from mauvecl.noise.comparison import Comparison
-from mauvecl.noise.processes import Normal, Processes, Uniform
-from mauvecl.results.detection.detection import Detection
+from mauvecl import Comparison, Detection, Engine, Linear, Normal, Processes, Uniform
 from mauvecl.results.detection.tails import tail
-from mauvecl.statistics.linear import Linear
-from mauvecl.statistics.registry import STATISTICS
 
 #: A sixth of the pixels: brute force can then afford 1e7 draws, 30 of them beyond a threshold at 3e-6.
 PART = {"output_min_nm": 330.0, "output_max_nm": 360.0}
