@@ -7,10 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from mauvecl import Detection, Engine, Expectation, Study, simulate
+from mauvecl import Detection, Engine, Expectation, Study
+from mauvecl.study.cases import Case
 
+#: Questions, in the order of the command line.
+VERBS = ("simulate", "snr", "exposure", "detect", "limit", "map", "gaussian", "measure", "stare", "inject", "analyse",
+         "change", "calibrate", "visible", "plan")  # fmt: skip
 #: All statistics.
-STATISTICS = ("chi2", "chi2_element", "chi2_pair", "matched", "paper", "uv_excess")
+STATISTICS = ("chi2", "chi2_element", "chi2_pair", "matched", "uv_excess", "paper")
 #: Realisations: several shards, the last a short one.
 N = 30_000
 FEW = ["run.realisations=2000", "run.fap=0.1", 'run.statistics=["matched"]', 'star=[{library="G2V", magnitude=7.4}]',
@@ -56,7 +60,7 @@ def of_kind(messages: Iterable[str], kind: str) -> list[str]:
 
 def expectations(study: Study) -> list[Expectation]:
     """Return what a study expects of its star without and with each flare."""
-    return simulate(study, flaring=True).inputs
+    return Case(study).expectations
 
 
 def same_snr(ours: Any, theirs: Any) -> None:
