@@ -13,10 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.table import Table
-from commands import ended, run
-from refusals import refused
+from commands import run
 
-from mauvecl import Engine, FlareModel, Instrument, ObservedFlare, Source, Study, expect, fit
+from mauvecl import Engine, FlareModel, Instrument, ObservedFlare, Source, expect, fit
 
 DATA = Path(__file__).parent.parent / "data"
 FILES = {912: DATA / "spectra" / "ADLeo_912s.dat", 1497: DATA / "flares" / "ADLeo_1497s.dat"}
@@ -86,21 +85,6 @@ def test_command_line_measures_the_flare(tmp_path: Path) -> None:
     added = np.interp(grid, nm, flaring) - np.interp(grid, quiet_nm, quiet)
     (flux,) = (row for row in table if row["quantity"] == "flux 200-320 nm")
     assert flux["truth"] == pytest.approx(np.trapezoid(added, grid), rel=0.01)
-
-
-def test_flare_as_observed_has_no_other_amplitude(tmp_path: Path) -> None:
-    """Refuse a sweep over amplitudes, and a flare without a file."""
-    code, _, reported = ended(*ad_leo_words(912), "--sweep", "amplitude=0.1,0.2", folder=tmp_path)
-    assert code == 2
-    assert "amplitude" in reported
-    with refused("flare.spectrum.as_observed"):
-        Study().with_settings(["flare.spectrum.as_observed=true"])
-
-
-def test_skipped_wavelengths_ascend() -> None:
-    for wrong in ("[[368, 322]]", "[[322, 322]]"):
-        with refused("measure.skipped_nm"):
-            Study().with_settings([f"measure.skipped_nm={wrong}"])
 
 
 def test_skipped_pixels_are_ignored() -> None:

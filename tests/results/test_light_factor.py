@@ -25,7 +25,6 @@ from mauvecl import (
     fit_two_temperatures,
     forecast,
 )
-from mauvecl.results.measurements.light_factor import Ratio
 
 MAUVE = Instrument.load("mauve")
 FREE, SKY_SD, DARK_C = np.inf, 0.1, 0.5
@@ -144,29 +143,6 @@ def test_intervals_agree_with_brute_force(amplitude: float, sd: float) -> None:
         # Within 1.5 % of a standard error, of which chi-squared at the end tells.
         slope = abs(profile(float(end + 0.01 * error)) - profile(float(end - 0.01 * error))) / 0.02
         assert abs(profile(float(end)) - bottom - scipy.stats.chi2.isf(0.05, 1)) < 0.015 * slope + 0.01
-
-
-@pytest.mark.parametrize("bottom", [5.0, 1.5, 0.4])
-@pytest.mark.parametrize("top", [3.0, 0.5, -2.0])
-def test_ends_of_ratios_agree_with_a_scan(top: float, bottom: float) -> None:
-    """Compare with the ratios of all pairs of a fine grid that chi-squared allows, with a positive bottom."""
-    covariance = np.array([[1.0, 0.3], [0.3, 0.8]])
-    angle = np.linspace(-np.pi, np.pi, 200_001)
-    root = np.linalg.cholesky(covariance)
-    for left in (0.5, 3.84):
-        edge = np.array([[top], [bottom]]) + np.sqrt(left) * root @ [np.cos(angle), np.sin(angle)]
-        inside = edge[:, edge[1] > 0.0]
-        ratio = Ratio(*(np.array([one]) for one in (top, bottom, 1.0, 0.8, 0.3)))
-        low, high = (float(ratio.end(np.array([left]), sign)[0]) for sign in (-1.0, 1.0))
-        ratio_ends = inside[0] / inside[1]
-        reaches_zero = edge[1].min() <= 0.0
-        for end, other, side in ((low, ratio_ends.min(), -1.0), (high, ratio_ends.max(), 1.0)):
-            if np.isinf(end):
-                assert reaches_zero
-                assert np.sign(end) == side
-                assert abs(other) > 1e3
-            else:
-                assert end == pytest.approx(other, rel=1e-6, abs=1e-8)
 
 
 def test_single_frames_have_uniform_losses() -> None:
