@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import scipy
 
-from mauvecl import Blackbody, (
+from mauvecl import (
     BalmerFlare,
-    Engine,
+    Blackbody,
     Expectation,
     FlareModel,
     Instrument,
