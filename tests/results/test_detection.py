@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -72,47 +71,6 @@ def test_detection_probabilities_agree_with_the_closed_form(found: Detection, st
         grain = exact - theory.sf(cut + null.std / 512)
         assert abs(p.value - exact) < 4 * error + grain + 3 / N
         assert p.low <= p.value <= p.high
-
-
-@pytest.mark.long
-def test_flares_of_the_paper_are_ordered(found: Detection) -> None:
-    """Check that larger flares are detected more often, and the correct template most often (Neyman & Pearson)."""
-    probability = {s: [p.value for p in found.detection_probability(1e-3, s)] for s in STATISTICS}
-    for values in probability.values():
-        assert all(a <= b + 1e-3 for a, b in pairwise(values))
-    for statistic in set(STATISTICS) - {"matched"}:
-        assert all(m >= p - 1e-3 for m, p in zip(probability["matched"], probability[statistic], strict=True))
-    # Fewer numbers, less noise in their sum: elements see the smallest flare better than pixels do.
-    assert probability["chi2_element"][0] > 2 * probability["chi2"][0]
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("statistic", STATISTICS)
-def test_threshold_inverts_false_alarm_probability(found: Detection, statistic: str) -> None:
-    for fap in (0.5, 0.1, 1e-2, 1e-3, 1e-4):
-        cut = found.threshold(fap, statistic)
-        assert cut.low <= cut.value <= cut.high
-        back = found.false_alarm_probability(cut.value, statistic)
-        # A bin holds at most 1/512 of a standard deviation's worth.
-        assert fap * 0.96 - 2 / N < back.value <= fap
-        exact = found.closed_form(statistic).isf(fap)
-        assert cut.low - 1e-9 <= exact <= cut.high or abs(cut.value - exact) < 4 * (cut.high - cut.low) / 3.92
-
-
-@pytest.mark.long
-def test_roc_equals_its_definition(found: Detection) -> None:
-    curve = found.roc("matched", 1)
-    fap, probability = curve.fap, curve.probability
-    assert (fap[0], probability[0]) == (1.0, 1.0)
-    assert np.all(np.diff(fap) <= 0)
-    assert np.all(np.diff(probability) <= 0)
-    assert np.all(probability >= fap - 1e-3)
-    at = int(np.searchsorted(-fap, -1e-3))
-    assert probability[at] == pytest.approx(found.detection_probability(1e-3, "matched")[1].value, rel=0.01)
-    table = curve.table()
-    assert np.all((table["fap_low"] <= table["fap"]) & (table["fap"] <= table["fap_high"]))
-    assert np.all((table["probability_low"] <= table["probability"]) & (table["probability"] >= 0))
-    assert len(table) <= 201
 
 
 @pytest.mark.long

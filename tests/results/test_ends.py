@@ -154,6 +154,10 @@ def check_answers(found: Detection, statistic: str, k: int, null: Sorted, flare:
     assert p.low <= p.value <= p.high
     curve = found.roc(statistic, k)
     assert (curve.fap[0], curve.probability[0], curve.fap[-1], curve.probability[-1]) == (1.0, 1.0, 0.0, 0.0)
+    table = curve.table()
+    assert len(table) <= 201
+    for name in ("fap", "probability"):
+        assert ((table[f"{name}_low"] <= table[name]) & (table[name] <= table[f"{name}_high"])).all()
     for i in np.linspace(0, curve.fap.size - 1, 30).astype(int):
         x = curve.threshold[i]
         assert abs(round(curve.fap[i] * N) - null.at_or_above(x)) <= null.close(x)

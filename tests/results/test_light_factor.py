@@ -88,18 +88,6 @@ def test_intervals_cover_where_light_is_lost(
     np.testing.assert_allclose(scatter, ahead, rtol=5 * 1.3 / np.sqrt(1200) + 0.03)
 
 
-def test_light_that_the_star_alone_loses_was_not_enough() -> None:
-    """Check that a nuisance of the star's light alone misses the amplitude by the loss: the cases above tell."""
-    x = quiet()
-    m = FlareModel.of(star("M3V", 7.0), MAUVE, x)
-    lit = expect(star("M3V", 7.0).flaring(0.5, 10_000.0), MAUVE, exposure=50.0)
-    alone = Nuisances.of(x, {"star": FREE, "dark": FREE, "sky": SKY_SD}, own={"star": x.light_dn})
-    rng = np.random.default_rng(4202)
-    found = fit(drawn(lit, np.full(200, 0.975), rng), x, m, alone, levels=(0.95,))
-    inside = (found.low[0, :, 1] <= 0.5) & (found.high[0, :, 1] >= 0.5)
-    assert inside.mean() < 0.3
-
-
 @pytest.mark.parametrize("sd", [FREE, 0.02], ids=["free", "prior"])
 @pytest.mark.parametrize("amplitude", [0.5, 2.0])
 def test_intervals_agree_with_brute_force(amplitude: float, sd: float) -> None:

@@ -325,45 +325,6 @@ def test_limits_at_a_bound_have_nominal_coverage() -> None:
     assert (found.high[0, :, column] > 1.0).all()
 
 
-def test_sums_keep_the_information() -> None:
-    """Check that errors grow by 1e-4 at most, where 1 % would be allowed, at the nodes and between them."""
-    x = quiet()
-    for kelvin in (3100.0, 9500.0, 41_234.0):
-        m = model(jump=True, lines=("Mg II", "H beta"))
-        amplitudes = m.amplitudes(kelvin, 0.3, jump=1.7, lines=(1e-12, 0.0))
-        reported = forecast(x, m, kelvin, amplitudes)
-        slope = amplitudes[0] * m.hot_spline(np.log(kelvin), 1)
-        rows = np.vstack([m.hot_spline(np.log(kelvin)), m.fixed, slope])
-        variance = x.variance_dn2 + x.gain_dn_per_electron * m.counts(kelvin, amplitudes)
-        scale = np.linalg.norm(rows / np.sqrt(variance), axis=1)
-        white = rows / np.sqrt(variance) / scale[:, None]
-        inverse = np.linalg.inv(white @ white.T)
-        assert reported.errors[0] / kelvin == pytest.approx(np.sqrt(inverse[-1, -1]) / scale[-1], rel=1e-4)
-        assert reported.errors[1] == pytest.approx(np.sqrt(inverse[0, 0]) / scale[0], rel=1e-4)
-
-
-def test_saturated_pixels_do_not_count() -> None:
-    bright = Source.from_library("G2V").at_magnitude(1.0)
-    x = expect(bright, MAUVE, exposure=50.0)
-    m = FlareModel.of(bright, MAUVE, x)
-    lit = expect(bright.flaring(0.3, 9000.0), MAUVE, exposure=50.0)
-    assert lit.saturated.any()
-    found = fit(lit.recorded_dn, x, m)
-    assert found.estimates[0, 0] == pytest.approx(9000.0, rel=1e-3)
-    assert found.dof == pytest.approx(int((~lit.saturated).sum()) - 2, abs=60)
-
-
-def test_fit_does_not_depend_on_other_frames() -> None:
-    x, m = quiet(), model(jump=True)
-    raws = [drawn(x, m.counts(k, m.amplitudes(k, a, jump=2.0)), 3, 5) for k, a in ((8e3, 0.4), (2e4, 3.0), (5e3, 0.01))]
-    together = fit(np.concatenate(raws), x, m)
-    for k, raw in enumerate(raws):
-        alone = fit(raw[1], x, m)
-        place = 3 * k + 1
-        ratio = np.abs(together.estimates[place] - alone.estimates[0]) / alone.errors[0]
-        assert (ratio[np.isfinite(ratio)] < 0.05).all()
-
-
 @pytest.mark.long
 def test_intervals_agree_with_minos_and_emcee() -> None:
     """Compare the full likelihood of a flare with a Balmer jump, with unknown dark and star as parameters.
