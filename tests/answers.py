@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
-from mauvecl import Detection, Engine, Study
-from mauvecl.results.requests.requests import DetectRequest, Shard
-from mauvecl.results.shard_sums import DetectionSums
-from mauvecl.results.snr import Counts, SnrResult
+from mauvecl import Detection, Engine, Expectation, Study
+from mauvecl.study.cases import Case
 
+#: Questions, in the order of the command line.
+VERBS = ("simulate", "snr", "exposure", "detect", "limit", "map", "gaussian", "measure", "stare", "inject", "analyse",
+         "change", "calibrate", "visible", "plan")  # fmt: skip
+#: All statistics.
+STATISTICS = ("chi2", "chi2_element", "chi2_pair", "matched", "uv_excess", "paper")
 #: Realisations: several shards, the last a short one.
 N = 30_000
 FEW = ["run.realisations=2000", "run.fap=0.1", 'run.statistics=["matched"]', 'star=[{library="G2V", magnitude=7.4}]',
@@ -44,23 +48,26 @@ def same(ours: Detection, theirs: Detection) -> None:
         np.testing.assert_array_equal(kept.realisations, theirs._samples[key].realisations)
 
 
-def twice(engine: Engine, request: DetectRequest) -> tuple[Detection, Detection]:
-    """Return an answer and the same with further realisations; both share one plan, which takes longer than drawing."""
-    return _counted(engine, request, request.start), _counted(engine, request, request.start + request.realisations)
+def twice(engine: Engine, quiet: Expectation, flares: list[Expectation], n: int, **how: Any) -> list[Detection]:
+    """Return an answer, and the same with as many further realisations."""
+    return [engine.detect(quiet, flares, realisations=n, start=start, **how) for start in (0, n)]
 
 
-def _counted(engine: Engine, request: DetectRequest, start: int) -> Detection:
-    sums = DetectionSums(request)
-    for part in range(request.parts):
-        sums.add(part, engine.count(request, Shard(part, start, request.realisations)))
-    return sums.answer()
+def of_kind(messages: Iterable[str], kind: str) -> list[str]:
+    """Return the messages of a kind, which programs compare in place of the sentence."""
+    return [one for one in messages if getattr(one, "kind", "") == kind]
 
 
-def same_snr(ours: SnrResult, theirs: SnrResult) -> None:
+def expectations(study: Study) -> list[Expectation]:
+    """Return what a study expects of its star without and with each flare."""
+    return Case(study).expectations
+
+
+def same_snr(ours: Any, theirs: Any) -> None:
     same_counts(ours.counts, theirs.counts)
 
 
-def same_counts(ours: Counts, theirs: Counts) -> None:
+def same_counts(ours: Any, theirs: Any) -> None:
     for name in ("pixel", "element", "clipped", "n"):
         np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
     for kind, far in ours.far.items():

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import json
+import tomllib
 
 import numpy as np
 import pytest
+from answers import of_kind
 from commands import run
 from refusals import refused
+from scipy import stats
 
-from mauvecl.answers.stares.inject import inject
-from mauvecl.device.engine import Engine
-from mauvecl.device.stare_engine import Stares
-from mauvecl.lightcurve.search.injected_completeness import InjectedCompleteness
-from mauvecl.runs.checkpoint import Checkpoint
-from mauvecl.runs.pool import LocalWorkers, Pool
-from mauvecl.schema.messages import of_kind
-from mauvecl.statistics.intervals import clopper_pearson
-from mauvecl.study.study import Study
+from mauvecl import Stares, Study, inject
 
 SMALL = {
     "star": [{"library": "G2V", "magnitude": 7.4, "distance_pc": 14.0}],
@@ -69,7 +64,7 @@ def test_tables_are_consistent(found):
         30 * -np.expm1(-found.stars[0].surveyed.survey.stare.observed_s / 86_400)
     )
     assert not of_kind(found.messages, "false alarms")
-    assert Study.build(__import__("tomllib").loads(found.study.toml()), "text") == found.study
+    assert Study.build(tomllib.loads(found.study.toml()), "text") == found.study
 
 
 def test_files_and_pictures_are_written(found, tmp_path):
@@ -77,31 +72,6 @@ def test_files_and_pictures_are_written(found, tmp_path):
     assert names == {"limits.ecsv", "completeness.ecsv", "search.ecsv", "study.toml"}
     assert Study.read(tmp_path / "limits.ecsv") == found.study
     assert found.plot(tmp_path / "map.png").stat().st_size > 10_000
-
-
-class Stop(Exception):  # noqa: N818
-    """An interruption."""
-
-
-@pytest.mark.long
-def test_resumed_run_gives_the_same_answer(found, tmp_path):
-    """Keep some peaks and draw the others on two devices of different form; all bits agree."""
-
-    def stop(done, total):
-        if done > total / 3:
-            raise Stop
-
-    with pytest.raises(Stop), Checkpoint(tmp_path, "inject", study(), patience_s=0) as checkpoint:
-        inject(study(), Pool(checkpoint=checkpoint), progress=stop)
-    widths = iter((16, 1))
-    workers = LocalWorkers([None, "0"], make=lambda device, progress: Engine(device, width=next(widths)))
-    with Checkpoint(tmp_path, "inject", study(), patience_s=0, resume=True) as checkpoint:
-        again = inject(study(), Pool(workers, checkpoint=checkpoint))
-        assert checkpoint.resumed >= 3, "the null, and two peaks"
-    workers.close()
-    assert (again.stars[0].injected.critical == found.stars[0].injected.critical).all()
-    assert np.array_equal(again.stars[0].fitted.energy_ratio, found.stars[0].fitted.energy_ratio, equal_nan=True)
-    assert again.stars[0].simulated == found.stars[0].simulated
 
 
 @pytest.mark.long
@@ -166,22 +136,36 @@ def test_cosmic_rays_and_saturation_are_reported(stares):
     assert of_kind(plain.messages, "saturated")
 
 
-def test_intervals_widen_if_positions_differ():
-    """Compare with the binomial interval for equal positions, and with that of positions for all or nothing."""
-    rng = np.random.default_rng(2)
-    alike = InjectedCompleteness((1.0,), np.array([0.5]), np.ones((1, 1)), rng.random((1, 20, 100)))
-    exact = clopper_pearson(round(alike.completeness[0, 0] * 2000), 2000)
-    assert alike.completeness_high[0, 0] - alike.completeness_low[0, 0] < 1.6 * (exact.high - exact.low)
-    whole = np.repeat(rng.random((1, 20, 1)), 100, axis=2)
-    apart = InjectedCompleteness((1.0,), np.array([0.5]), np.ones((1, 1)), whole)
-    assert apart.completeness_high[0, 0] - apart.completeness_low[0, 0] > 0.35
-    # Quantiles have the same: of 2000 even draws the median is known to 0.022 each way.
-    half = alike.limit(0.5, 0)
-    assert half.low < 0.5 < half.high
-    assert half.high - half.low < 0.08
-    never = InjectedCompleteness((1.0,), np.array([0.5]), np.ones((1, 1)), np.full((1, 4, 5), np.inf))
-    assert never.limit(0.5, 0).value == np.inf
-    assert never.never(0) == 1.0
+def test_intervals_widen_as_positions_differ(found):
+    """Draws of one position share its noise: as many trials are independent as explain the scatter of positions."""
+    one, widened = found.stars[0].injected, 0
+    sizes = found.completeness["size"].value.reshape(one.completeness.shape)
+    for row, (critical, size) in enumerate(zip(one.critical, sizes, strict=True)):
+        for column, edge in enumerate(size):
+            each = np.mean(critical <= edge, axis=1)
+            share = each.mean()
+            assert one.completeness[row, column] == pytest.approx(share)
+            width = one.completeness_high[row, column] - one.completeness_low[row, column]
+            scatter = each.var(ddof=1) / each.size
+            trials = min(critical.size, share * (1 - share) / scatter) if scatter > 0 else critical.size
+            # Whole trials and whole counts of them.
+            low, high = (clopper_pearson(share, max(n, 1)) for n in (1.2 * trials + 1, 0.8 * trials - 1))
+            assert low <= width <= high
+            widened += trials < 0.6 * critical.size
+    assert widened
+    for half_width in (None, *range(len(one.critical))):
+        limit = one.limit(0.5, half_width)
+        which = one.critical if half_width is None else one.critical[half_width]
+        assert limit.low <= limit.value <= limit.high
+        assert np.mean(which <= limit.value) == pytest.approx(0.5, abs=2 / which.shape[-1])
+
+
+def clopper_pearson(share: float, n: int) -> float:
+    """Return the width of the exact interval of a share of n trials."""
+    k = share * n
+    low = 0.0 if k == 0 else stats.beta.ppf(0.025, k, n - k + 1)
+    high = 1.0 if k == n else stats.beta.ppf(0.975, k + 1, n - k)
+    return high - low
 
 
 @pytest.mark.long
@@ -198,17 +182,3 @@ def test_inject_command_writes_its_files(tmp_path):
     assert {"limits.ecsv", "completeness.png", "curves.png", "energies.png", "run.json"} <= {
         p.name for p in tmp_path.iterdir()
     }
-
-
-def test_sizes_can_be_energies():
-    """Accept sizes in erg, which exceed the range of all other numbers."""
-    asked = Study().with_settings(["injections.low=1e33", "injections.high=1e35"])
-    assert (asked.injections.low, asked.injections.high) == (1e33, 1e35)
-
-
-def test_impossible_size_raises_before_any_search(monkeypatch, stares):
-    near = SMALL["star"][0]
-    asked = study(star=[near, {**near, "distance_pc": None}], injections={"of": "energy"})
-    monkeypatch.setattr("mauvecl.answers.stares.inject.survey_star", lambda *_: pytest.fail("searched"))
-    with refused("injections.of", value="energy"):
-        inject(asked, stares)

@@ -6,13 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from answers import expectations, of_kind
 from astropy.table import QTable
 
-from mauvecl.answers.detection.maps import detection_map
-from mauvecl.device.engine import Engine
-from mauvecl.schema.messages import of_kind
-from mauvecl.study.cases import Case
-from mauvecl.study.study import Study
+from mauvecl import Engine, Study, detection_map
 
 N = 20_000
 
@@ -35,7 +32,7 @@ AMPLITUDE = {"quantity": "amplitude", "start": 0.02, "stop": 0.5, "steps": 4, "l
 
 def alone(asked: Study, engine: Engine, x: float | str, y: float | str) -> list[float]:
     one = asked.at(asked.map.x.quantity, x).at(asked.map.y.quantity, y)
-    quiet, flare = Case(one).expectations
+    quiet, flare = expectations(one)
     found = engine.detect(quiet, [flare], realisations=N, seed=9, statistics=("chi2", "matched"))
     return [found.detection_probability(1e-2, s)[0].value for s in ("chi2", "matched")]
 

@@ -1,33 +1,223 @@
-"""Messages of answers."""
+"""What answers say: saturation, priors beside the expectation, flares that lower a statistic, stars without light."""
 
 from __future__ import annotations
 
 import json
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from answers import expectations, of_kind, small
+from commands import ended, run
 from marks import long_but
 
-from mauvecl.answers.signal.simulate import simulate
-from mauvecl.host.files.json_text import json_text
-from mauvecl.schema.messages import of_kind
-from mauvecl.study.cases import Case
-from mauvecl.study.messages import collect_messages
-from mauvecl.study.study import Study
+import mauvecl
+from mauvecl import Engine, InputError, Stares, Study, detect, detection_map, limit, simulate
+
+G2V = {"star": [{"library": "G2V", "magnitude": 7.4}]}
+INJECTIONS = {"count": 10, "sizes": 2, "widths": 2, "positions": 4}
+SHORT = {"stare": {"duration_s": 600.0}, "injections": INJECTIONS, "search": {"nulls": 0}}
+
+
+def map_of(amplitudes: list[float], exposures: list[float]) -> dict[str, Any]:
+    axes = {"x": {"quantity": "amplitude", "values": amplitudes}, "y": {"quantity": "exposure", "values": exposures}}
+    return {"map": axes}
+
+
+def said(verb: str, study: Study, engine: Engine, folder: Path) -> list[str]:
+    """Return the messages of a verb, or the sentence of its refusal."""
+    if verb == "realise":
+        (folder / "study.toml").write_text(study.toml())
+        code, out, reported = ended("realise", "study.toml", "-n", "10", "--output", "out.zarr", folder=folder)
+        assert code in (0, 2), reported
+        return (out + reported).splitlines()
+    if verb == "simulate":
+        return list(simulate(study, flaring=True).messages)
+    try:
+        return list(getattr(mauvecl, verb)(study, Stares() if verb in ("stare", "inject") else engine).messages)
+    except InputError as refusal:
+        return [str(refusal)]
+
+
+#: Verb and what its study needs.
+SATURATED: dict[str, tuple[str, dict[str, Any]]] = {
+    verb: (verb.split()[0], needs)
+    for verb, needs in {
+        "simulate": {},
+        "snr": {},
+        "exposure": {"signal": {"snr": 10.0, "wavelength_nm": 320.0}},
+        "detect": {},
+        "limit of amplitude": {"limit": {"of": "amplitude"}},
+        "limit of exposure": {"limit": {"of": "exposure"}},
+        # It searches its own star: one that no bright one satisfies.
+        "limit of magnitude": {"limit": {"of": "magnitude"}, "flare": {"amplitudes": [1e-5]}},
+        "map": map_of([1e-4, 12.0], [5.0, 10.0]),
+        "gaussian": {"sweep": {"axes": [{"quantity": "exposure", "values": [5.0]}]}},
+        "measure": {"measure": {"fits": 10}},
+        "stare": SHORT,
+        "inject": SHORT,
+        "realise": {},
+    }.items()
+}
+
+
+def hot_star(magnitude: float, low_nm: float, **sections: Any) -> Study:
+    """Return a study of a hot star on part of the pixels."""
+    data: dict[str, Any] = {
+        "star": [{"library": "A0V", "magnitude": magnitude, "distance_pc": 7.7}],
+        "flare": {"amplitudes": [0.01]},
+        "observation": {"exposure_s": 5.0, "changes": {"output_min_nm": low_nm, "output_max_nm": 340.0}},
+        "run": {"realisations": 10_000, "seed": 3, "fap": 0.01, "statistics": ["matched"]},
+    }
+    return Study.build(data | sections, "test")
+
+
+@pytest.mark.parametrize("name", SATURATED)
+@pytest.mark.parametrize("low_nm", [250.0, 300.0])
+def test_star_that_saturates_is_reported(engine: Engine, tmp_path: Path, name: str, low_nm: float) -> None:
+    """Include stars that leave some pixels, few pixels and none below saturation."""
+    verb, needs = SATURATED[name]
+    found = said(verb, hot_star(0.03, low_nm, **needs), engine, tmp_path)
+    assert any("saturate" in text.lower() for text in found), found
+
+
+@pytest.mark.parametrize("verb", ["simulate", "detect", "map", "realise", "gaussian"])
+def test_flare_that_saturates_alone_is_reported(engine: Engine, tmp_path: Path, verb: str) -> None:
+    """Check that the message names the flare if the star alone does not saturate."""
+    study = hot_star(3.3, 300.0, **(SATURATED[verb][1] | {"flare": {"amplitudes": [12.0]}}))
+    quiet, flare = expectations(study)
+    assert not of_kind(quiet.messages, "saturated")
+    assert flare.saturated.any()
+    found = said(verb, study, engine, tmp_path)
+    assert any("flare" in text and "saturate" in text.lower() for text in found), found
+
+
+def test_many_messages_are_summarised(engine: Engine) -> None:
+    """Summarise the saturating flares of 64 cells: a common message, a dozen single ones, and one for the rest."""
+    study = hot_star(3.3, 300.0, **map_of([12.0 + 0.1 * n for n in range(32)], [5.0, 10.0]))
+    assert len(of_kind(detection_map(study, engine).messages, "saturated")) == 14
+
+
+#: Priors that contain the expectation's own value, and that do not.
+PRIORS = {
+    "jitter": ([0.0, 0.05], [0.01, 0.05]),
+    "detector_temperature": ([13.0, 22.0], [5.0, 20.0]),
+    "light_loss": ([0.34, 0.5], [0.35, 0.5]),
+    "pointing_loss": ([0.0, 0.05], [0.1, 0.2]),
+    "qe_scale": ([0.9, 1.1], [1.05, 1.2]),
+    "sky_level": ([0.5, 1.0], [1.1, 2.0]),
+}
+OF_PRIORS: dict[str, dict[str, Any]] = {
+    "simulate": {},
+    "snr": {},
+    "detect": {},
+    "map": map_of([0.05, 0.24], [50.0]),
+    "limit": {"limit": {"of": "magnitude", "power": 0.5}},
+    "realise": {"run": {"realisations": 10_000}},
+}
+
+
+# Far from the expectation no limit settles, which is refused: one prior near it.
+@pytest.mark.parametrize(
+    ("verb", "name"),
+    long_but(
+        ((v, n) for v in OF_PRIORS for n in PRIORS if v not in ("limit", "realise") or n == "light_loss"),
+        *(("detect", n) for n in PRIORS),
+        *((v, "light_loss") for v in OF_PRIORS if v not in ("detect", "limit")),
+    ),
+)
+def test_prior_that_excludes_the_expectation_is_reported(engine: Engine, tmp_path: Path, verb: str, name: str) -> None:
+    for ends, is_told in zip(PRIORS[name], (False, True), strict=True):
+        folder = tmp_path / str(is_told)
+        folder.mkdir()
+        study = small(**(G2V | OF_PRIORS[verb] | {"processes": {name: {"uniform": ends}}}))
+        found = [text for text in said(verb, study, engine, folder) if "outside the prior" in text.lower()]
+        assert len(found) == is_told
+        assert all(name in text for text in found)
+
+
+def test_prior_that_excludes_a_swept_value_is_reported(engine: Engine) -> None:
+    """Use a prior that contains the study's temperature and one of two swept ones."""
+    sweep = {"axes": [{"quantity": "detector_temperature", "values": [20.0, 10.0]}]}
+    prior = {"detector_temperature": {"uniform": [18.0, 22.0]}}
+    (sentence,) = of_kind(detect(small(**G2V, processes=prior, sweep=sweep), engine).messages, "outside the prior")
+    assert "has 10:" in sentence
+
+
+@pytest.mark.parametrize("of", ["amplitude", "magnitude", "exposure"])
+def test_unconverged_limit_names_the_prior(engine: Engine, of: str) -> None:
+    study = small(
+        **G2V,
+        flare={"amplitudes": [0.24]},
+        run={"realisations": 10_000, "seed": 3, "fap": 0.01, "statistics": ["chi2"]},
+        processes={"light_loss": {"uniform": [0.6, 0.7]}},
+        limit={"of": of, "power": 0.5},
+    )
+    with pytest.raises(InputError) as error:
+        limit(study, engine)
+    for fact in ("light_loss", "0.6 to 0.7", "0.34"):
+        assert fact in str(error.value)
+
+
+UNKNOWN: dict[str, dict[str, Any]] = {
+    "known": {},
+    "light": {"nuisances": {"light": "free"}},
+    "both": {"nuisances": {"light": "free", "dark": "free"}},
+}
+
+
+def cool_flare(temperature_k: float, unknown: str, **sections: Any) -> Study:
+    """Return a study of a flare whose temperature decides whether it lowers `uv_excess`."""
+    return small(
+        **G2V,
+        flare={"amplitudes": [0.3], "temperature_k": temperature_k},
+        observation={"exposure_s": 50.0},
+        run={"realisations": 10_000, "seed": 3, "fap": 0.01, "statistics": ["uv_excess", "matched"]},
+        **UNKNOWN[unknown],
+        **sections,
+    )
+
+
+@pytest.mark.parametrize("unknown", UNKNOWN)
+@pytest.mark.parametrize("temperature_k", [3000.0, 4000.0, 6000.0, 10_000.0, 20_000.0])
+def test_lowered_statistic_is_reported_if_simulation_lowers_it(
+    engine: Engine, unknown: str, temperature_k: float
+) -> None:
+    """Compare with simulated means that differ by more than five standard errors; fails once in 1e6 seeds."""
+    answer = detect(cool_flare(temperature_k, unknown), engine)
+    (one,) = answer.stars
+    named = {text.split(" falls by ")[0].split()[-1] for text in of_kind(answer.messages, "wrong sign")}
+    for statistic in ("uv_excess", "matched"):
+        null, flare = (one.detection.distribution(statistic, k) for k in (None, 0))
+        gap, error = flare.mean - null.mean, np.hypot(flare.std, null.std) / 100
+        if abs(gap) > 5 * error:
+            assert (statistic in named) == (gap < 0), (statistic, gap)
+    assert named <= {"uv_excess"}
+    if unknown == "both" and temperature_k in (4000.0, 10_000.0):
+        # Both cases are among those above, and a lowered statistic detects nothing.
+        assert bool(named) == (temperature_k == 4000.0)
+        assert not named or answer.table["probability"][0] < 0.01 < 0.9 < answer.table["probability"][1]
+
+
+@pytest.mark.parametrize("temperature_k", [4000.0, 10_000.0])
+def test_maps_and_limits_report_a_wrong_sign_as_detect_does(engine: Engine, temperature_k: float) -> None:
+    """Compare the messages of all cells of a map with `detect`, and the stated cause of an impossible limit."""
+    lowered = temperature_k == 4000.0
+    asked = cool_flare(temperature_k, "both", **map_of([0.2, 0.3], [5.0, 50.0]))
+    of_map = of_kind(detection_map(asked, engine).messages, "wrong sign")
+    assert ["uv_excess falls with the flare in 4 of 4 cells" in text for text in of_map] == [True] * lowered
+    # Of magnitudes, one so bright that most pixels saturate turns the sign.
+    for of in ("amplitude", "exposure"):
+        found = limit(cool_flare(temperature_k, "both", limit={"of": of, "power": 0.5}), engine)
+        assert [one.statistic for one in found.limits] == ["uv_excess", "matched"][lowered:]
+        assert ["WRONG SIGN" in text for text in found.failed] == [True] * lowered
 
 
 def test_rounding_that_invalidates_closed_forms_is_reported() -> None:
-    quiet = {"observation.changes={read_noise_dn=0.1}", "observation.temperature_c=-40"}
-    asked = Study().with_changes({}, [{"library": "G2V", "magnitude": 12.0}])
-    for settings, is_told in ((quiet, True), ((), False)):
-        x, *_ = Case(asked.with_settings(sorted(settings))).expectations
-        assert bool(of_kind(collect_messages([x]), "rounding")) == is_told
-
-
-def test_json_has_no_nan_and_no_infinity() -> None:
-    assert json.loads(json_text({"a": [float("nan"), 1.5], "b": {"c": (float("inf"), "NaN")}})) == {
-        "a": [None, 1.5],
-        "b": {"c": [None, "NaN"]},
-    }
+    asked = Study().with_settings(["star=[{library='G2V', magnitude=12}]"])
+    quiet = asked.with_settings(["observation.changes={read_noise_dn=0.1}", "observation.temperature_c=-40"])
+    assert [bool(of_kind(simulate(one).messages, "rounding")) for one in (asked, quiet)] == [False, True]
 
 
 @pytest.mark.parametrize(
@@ -37,5 +227,12 @@ def test_json_has_no_nan_and_no_infinity() -> None:
 def test_star_without_light_is_reported(magnitude: float, dark: bool) -> None:
     """Report a star that makes less than one electron in an exposure, since its S/N is 0."""
     study = Study().with_settings([f"star=[{{library = 'G2V', magnitude = {magnitude}}}]"])
-    messages = simulate(study).messages
-    assert bool(of_kind(messages, "no light")) == dark
+    assert bool(of_kind(simulate(study).messages, "no light")) == dark
+
+
+def test_json_has_no_nan(tmp_path: Path) -> None:
+    """A single fit has a bias and no scatter, which is null and not the number NaN that JSON lacks."""
+    words = ("measure", "--star", "M3V", "-m", "7", "-a", "0.5", "--fits", "1", "--no-pictures", "--json")
+    rows = json.loads(run(*words, folder=tmp_path).stdout, parse_constant=pytest.fail)["rows"]
+    assert {row["scatter"] for row in rows} == {None}
+    assert all(np.isfinite(row["bias"]) for row in rows)

@@ -7,19 +7,16 @@ import json
 import re
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from answers import expectations, of_kind
 from astropy.io import fits
 from astropy.table import QTable
 from commands import run
 
-from mauvecl.answers.stares.stare import StareAnswer, stare
-from mauvecl.device.engine import Engine
-from mauvecl.device.stare_engine import Stares
-from mauvecl.schema.messages import of_kind
-from mauvecl.study.cases import Case
-from mauvecl.study.study import Study
+from mauvecl import Engine, Stares, Study, stare
 
 #: A G2V star for five minutes with a gap and a flare.
 SHORT = Study().with_settings(
@@ -42,7 +39,7 @@ def stares() -> Stares:
 
 
 @pytest.fixture(scope="module")
-def found(stares) -> StareAnswer:
+def found(stares) -> Any:
     return stare(SHORT, stares)
 
 
@@ -51,7 +48,7 @@ def test_spectra_summed_over_frames_equal_exposures_of_the_engine(stares):
     study = SHORT.with_settings(["stare.gaps=[]", "stare.duration_s=50", "flare.amplitudes=[0]"])
     study = study.model_copy(update={"stare": study.stare.model_copy(update={"thermal": None, "number": 3})})
     one = stare(study, stares).stares[0]
-    exposure, *_ = Case(study.with_settings(["observation.exposure_s=50"])).expectations
+    exposure, *_ = expectations(study.with_settings(["observation.exposure_s=50"]))
     raw = Engine().realise(exposure, start=3, count=1, seed=study.run.seed, mode="frames")[0]
     net = raw - 10 * (exposure.bias_dn + exposure.dark_dn)
     elements = np.bincount(exposure.element, net)
@@ -263,13 +260,14 @@ def test_study_file_with_curves_shapes_and_events_is_read(tmp_path, stares):
     study = Study.read(tmp_path / "study.toml")
     assert Study.build(tomllib.loads(study.toml()), "again").toml() == study.toml()
     found = stare(study, stares)
-    np.testing.assert_allclose(Case(study).stare.star[[0, -1]], [1 + 0.03 * 2.5 / 300, 1 + 0.03 * 297.5 / 300])
+    staring = found.stares[0].staring.stare
+    np.testing.assert_allclose(staring.star[[0, -1]], [1 + 0.03 * 2.5 / 300, 1 + 0.03 * 297.5 / 300])
     first, second = found.stares[0].flares
     assert first.bolometric_erg == pytest.approx(1e33, rel=1e-9)
     # Own shape: a triangle of 40 s with a peak of one.
     assert second.event.equivalent_duration_s == pytest.approx(2.0)
     assert second.event.peak == pytest.approx(0.1)
-    assert Case(study).stare.unknowns[0].name == "light drift"
+    assert staring.unknowns[0].name == "light drift"
 
 
 @pytest.mark.long
@@ -284,14 +282,11 @@ def test_two_flares_of_the_documentation_have_their_values(stares):
     assert second.bolometric_erg == pytest.approx(1e31, rel=1e-9)
 
 
-def test_unknowns_of_a_stare_are_drawn_if_requested():
-    plain, usual = (
-        Case(SHORT).stare,
-        Case(SHORT.with_settings(["nuisances.usual=true", "stare.offsets.sky=0.05"])).stare,
-    )
-    assert not plain.unknowns
-    assert usual.light_jitter == pytest.approx(0.0144, abs=1e-4)
-    spread = {unknown.name: unknown.sd for unknown in usual.unknowns}
+def test_unknowns_of_a_stare_are_drawn_if_requested(stares, found):
+    usual = stare(SHORT.with_settings(["nuisances.usual=true", "stare.offsets.sky=0.05"]), stares).stares[0]
+    assert not found.stares[0].staring.stare.unknowns
+    assert usual.staring.stare.light_jitter == pytest.approx(0.0144, abs=1e-4)
+    spread = {unknown.name: unknown.sd for unknown in usual.staring.stare.unknowns}
     assert spread == {"sky offset": 0.05, "star drift": 0.01, "temperature sine": 0.5, "temperature cosine": 0.5}
 
 

@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
+from answers import STATISTICS
 from refusals import refused
 from scenes import instrument, star
 from scipy import stats
 
-from mauvecl.device.engine import Engine
-from mauvecl.host.expectation import expect
-from mauvecl.host.sky.zodiacal import Sky
-from mauvecl.host.stars.source import Source
-from mauvecl.results import numpy_kernels
-from mauvecl.results.counts.tally import Distribution, Grid, Tally
-from mauvecl.results.detection.detection import Detection
-from mauvecl.results.detection.roc import Roc
-from mauvecl.statistics.linear import Linear, Matched
-from mauvecl.statistics.registry import STATISTICS
-from mauvecl.statistics.statistic import Setting
+from mauvecl import Detection, Engine, Linear, Sky, Source, expect
 
 N = 1_000_000
 #: The paper's G2V star, with flares around the edge of detection for one statistic or another.
@@ -33,7 +24,7 @@ def found(engine: Engine) -> Detection:
     return engine.detect(quiet, flares, realisations=N, seed=20, statistics=tuple(STATISTICS))
 
 
-def ks_probability(d: Distribution, sf: object) -> float:
+def ks_probability(d: Any, sf: object) -> float:
     """Return the probability of the Kolmogorov-Smirnov test at the edges of filled bins, 32 per standard deviation."""
     filled = np.flatnonzero(d.counts)
     # The last edge, too: all values in one bin are no distribution.
@@ -83,47 +74,6 @@ def test_detection_probabilities_agree_with_the_closed_form(found: Detection, st
 
 
 @pytest.mark.long
-def test_flares_of_the_paper_are_ordered(found: Detection) -> None:
-    """Check that larger flares are detected more often, and the correct template most often (Neyman & Pearson)."""
-    probability = {s: [p.value for p in found.detection_probability(1e-3, s)] for s in STATISTICS}
-    for values in probability.values():
-        assert all(a <= b + 1e-3 for a, b in pairwise(values))
-    for statistic in set(STATISTICS) - {"matched"}:
-        assert all(m >= p - 1e-3 for m, p in zip(probability["matched"], probability[statistic], strict=True))
-    # Fewer numbers, less noise in their sum: elements see the smallest flare better than pixels do.
-    assert probability["chi2_element"][0] > 2 * probability["chi2"][0]
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("statistic", STATISTICS)
-def test_threshold_inverts_false_alarm_probability(found: Detection, statistic: str) -> None:
-    for fap in (0.5, 0.1, 1e-2, 1e-3, 1e-4):
-        cut = found.threshold(fap, statistic)
-        assert cut.low <= cut.value <= cut.high
-        back = found.false_alarm_probability(cut.value, statistic)
-        # A bin holds at most 1/512 of a standard deviation's worth.
-        assert fap * 0.96 - 2 / N < back.value <= fap
-        exact = found.closed_form(statistic).isf(fap)
-        assert cut.low - 1e-9 <= exact <= cut.high or abs(cut.value - exact) < 4 * (cut.high - cut.low) / 3.92
-
-
-@pytest.mark.long
-def test_roc_equals_its_definition(found: Detection) -> None:
-    curve = found.roc("matched", 1)
-    fap, probability = curve.fap, curve.probability
-    assert (fap[0], probability[0]) == (1.0, 1.0)
-    assert np.all(np.diff(fap) <= 0)
-    assert np.all(np.diff(probability) <= 0)
-    assert np.all(probability >= fap - 1e-3)
-    at = int(np.searchsorted(-fap, -1e-3))
-    assert probability[at] == pytest.approx(found.detection_probability(1e-3, "matched")[1].value, rel=0.01)
-    table = curve.table()
-    assert np.all((table["fap_low"] <= table["fap"]) & (table["fap"] <= table["fap_high"]))
-    assert np.all((table["probability_low"] <= table["probability"]) & (table["probability"] >= 0))
-    assert len(table) <= 201
-
-
-@pytest.mark.long
 @pytest.mark.parametrize("flare", range(len(AMPLITUDES)))
 def test_area_under_the_roc_equals_its_closed_form(found: Detection, flare: int) -> None:
     """Compare with Phi(d / sqrt(2)) within 4 half-widths of DeLong's interval; fails in 6e-15 of seeds."""
@@ -134,19 +84,18 @@ def test_area_under_the_roc_equals_its_closed_form(found: Detection, flare: int)
     assert area.low <= area.value <= area.high
 
 
-def test_delong_interval_agrees_with_repeated_draws() -> None:
+def test_delong_interval_agrees_with_repeated_draws(engine: Engine) -> None:
     """Check that 178 of 200 intervals contain the exact area; fails once in 1e4 new seeds."""
-    rng, grid, held = np.random.default_rng(8), Grid(0, 0.0, 1.0), 0
-    exact = stats.norm.cdf(1.0 / np.sqrt(2.0))
-    for _ in range(200):
-        parts = []
-        for centre in (0.0, 1.0):
-            tally = Tally([grid])
-            values = rng.normal(centre, 1.0, (1, 400)).astype(np.float32)
-            tally.add(*numpy_kernels.tally(values, Grid.pack([grid]))[:2], 400)
-            parts.append(tally.distribution(0))
-        area = Roc.of(*parts).area
-        held += area.low <= exact <= area.high
+    quiet, flare = star(amplitudes=(0.015,), payload=instrument(output_min_nm=300.0, output_max_nm=310.0))
+    held = 0
+    for seed in range(200):
+        found = engine.detect(quiet, [flare], realisations=400, seed=seed, statistics="matched")
+        if seed == 0:
+            null, with_flare = (found.closed_form("matched", f) for f in (None, 0))
+            gap = (with_flare.mean - null.mean) / np.hypot(null.std, with_flare.std)
+            assert 0.3 < gap < 1.5
+        area = found.roc("matched", 0).area
+        held += area.low <= stats.norm.cdf(gap) <= area.high
     assert held >= 178
     assert stats.binom.cdf(177, 200, 0.95) < 3e-4
 
@@ -211,16 +160,18 @@ def test_wider_wings_than_the_grid_are_counted(engine: Engine) -> None:
 def test_own_weights_define_a_statistic(engine: Engine) -> None:
     """Give the matched filter as weights, and compare other weights with their normal distribution."""
     quiet, *flares = star(amplitudes=AMPLITUDES)
-    used = np.ones(quiet.wavelength_nm.size, bool)
-    twin = Linear("twin", Matched().weights_per_dn(Setting(quiet, used), flares[1]))
-    slope = Linear("slope", np.linspace(-1.0, 2.0, used.size))
+    delta = flares[1].signal_dn - quiet.signal_dn
+    twin = Linear("twin", delta / quiet.variance_dn2 / np.sqrt(np.sum(delta**2 / quiet.variance_dn2)))
+    slope = Linear("slope", np.linspace(-1.0, 2.0, delta.size))
     found = engine.detect(
         quiet, flares, realisations=N, seed=3, statistics=("matched", twin, "uv_excess", slope, "chi2")
     )
     assert found.statistics == ("matched", "twin", "uv_excess", "slope", "chi2")
     for flare in (None, 1):
         ours, wanted = found.distribution("twin", flare), found.distribution("matched", flare, template=1)
-        np.testing.assert_array_equal(ours.counts, wanted.counts)
+        # The weights differ in their last bits.
+        assert (ours.mean, ours.std) == pytest.approx((wanted.mean, wanted.std), rel=1e-5, abs=1e-5)
+        assert np.abs(ours.counts.astype(int) - wanted.counts).sum() < 0.01 * N
         for name in ("slope", "uv_excess"):
             d = found.distribution(name, flare)
             assert ks_probability(d, found.closed_form(name, flare).sf) > 1e-6

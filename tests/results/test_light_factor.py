@@ -12,11 +12,19 @@ import numpy as np
 import pytest
 import scipy
 
-from mauvecl import BalmerFlare, Expectation, Instrument, Nuisances, Source, TwoBlackbodies, expect
-from mauvecl.results.measurements.fit import fit, forecast
-from mauvecl.results.measurements.flare_model import FlareModel
-from mauvecl.results.measurements.light_factor import Ratio
-from mauvecl.results.measurements.two_temperatures import fit_two_temperatures
+from mauvecl import (
+    BalmerFlare,
+    Expectation,
+    FlareModel,
+    Instrument,
+    Nuisances,
+    Source,
+    TwoBlackbodies,
+    expect,
+    fit,
+    fit_two_temperatures,
+    forecast,
+)
 
 MAUVE = Instrument.load("mauve")
 FREE, SKY_SD, DARK_C = np.inf, 0.1, 0.5
@@ -80,18 +88,6 @@ def test_intervals_cover_where_light_is_lost(
     np.testing.assert_allclose(scatter, ahead, rtol=5 * 1.3 / np.sqrt(1200) + 0.03)
 
 
-def test_light_that_the_star_alone_loses_was_not_enough() -> None:
-    """Check that a nuisance of the star's light alone misses the amplitude by the loss: the cases above tell."""
-    x = quiet()
-    m = FlareModel.of(star("M3V", 7.0), MAUVE, x)
-    lit = expect(star("M3V", 7.0).flaring(0.5, 10_000.0), MAUVE, exposure=50.0)
-    alone = Nuisances.of(x, {"star": FREE, "dark": FREE, "sky": SKY_SD}, own={"star": x.light_dn})
-    rng = np.random.default_rng(4202)
-    found = fit(drawn(lit, np.full(200, 0.975), rng), x, m, alone, levels=(0.95,))
-    inside = (found.low[0, :, 1] <= 0.5) & (found.high[0, :, 1] >= 0.5)
-    assert inside.mean() < 0.3
-
-
 @pytest.mark.parametrize("sd", [FREE, 0.02], ids=["free", "prior"])
 @pytest.mark.parametrize("amplitude", [0.5, 2.0])
 def test_intervals_agree_with_brute_force(amplitude: float, sd: float) -> None:
@@ -135,29 +131,6 @@ def test_intervals_agree_with_brute_force(amplitude: float, sd: float) -> None:
         # Within 1.5 % of a standard error, of which chi-squared at the end tells.
         slope = abs(profile(float(end + 0.01 * error)) - profile(float(end - 0.01 * error))) / 0.02
         assert abs(profile(float(end)) - bottom - scipy.stats.chi2.isf(0.05, 1)) < 0.015 * slope + 0.01
-
-
-@pytest.mark.parametrize("bottom", [5.0, 1.5, 0.4])
-@pytest.mark.parametrize("top", [3.0, 0.5, -2.0])
-def test_ends_of_ratios_agree_with_a_scan(top: float, bottom: float) -> None:
-    """Compare with the ratios of all pairs of a fine grid that chi-squared allows, with a positive bottom."""
-    covariance = np.array([[1.0, 0.3], [0.3, 0.8]])
-    angle = np.linspace(-np.pi, np.pi, 200_001)
-    root = np.linalg.cholesky(covariance)
-    for left in (0.5, 3.84):
-        edge = np.array([[top], [bottom]]) + np.sqrt(left) * root @ [np.cos(angle), np.sin(angle)]
-        inside = edge[:, edge[1] > 0.0]
-        ratio = Ratio(*(np.array([one]) for one in (top, bottom, 1.0, 0.8, 0.3)))
-        low, high = (float(ratio.end(np.array([left]), sign)[0]) for sign in (-1.0, 1.0))
-        ratio_ends = inside[0] / inside[1]
-        reaches_zero = edge[1].min() <= 0.0
-        for end, other, side in ((low, ratio_ends.min(), -1.0), (high, ratio_ends.max(), 1.0)):
-            if np.isinf(end):
-                assert reaches_zero
-                assert np.sign(end) == side
-                assert abs(other) > 1e3
-            else:
-                assert end == pytest.approx(other, rel=1e-6, abs=1e-8)
 
 
 def test_single_frames_have_uniform_losses() -> None:

@@ -4,16 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from answers import twice
+from answers import STATISTICS, twice
 from scipy import stats
 
-from mauvecl.device.engine import Engine
-from mauvecl.host.expectation import expect
-from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.host.sky.zodiacal import Sky
-from mauvecl.host.stars.source import Source
-from mauvecl.results.requests.requests import DetectRequest
-from mauvecl.statistics.registry import STATISTICS
+from mauvecl import Engine, Instrument, Sky, Source, expect
 
 SCENES = 80
 #: Of the thresholds, and again of the false alarms counted with other draws.
@@ -54,8 +48,7 @@ def test_false_alarms_are_as_requested(engine: Engine) -> None:
         quiet, flare = scene(number)
         # A few frames are drawn one by one, rounded and clipped each.
         mode = "frames" if quiet.n_frames <= 5 else "auto"
-        request = DetectRequest.of(quiet, (flare,), N, number, tuple(STATISTICS), mode=mode)
-        first, fresh = twice(engine, request)
+        first, fresh = twice(engine, quiet, [flare], N, seed=number, statistics=STATISTICS, mode=mode)
         drawn_frames += first.scene.frames
         for statistic in STATISTICS:
             ours, theirs = first.distribution(statistic), fresh.distribution(statistic)
@@ -73,9 +66,3 @@ def test_false_alarms_are_as_requested(engine: Engine) -> None:
         assert 2 * stats.norm.sf(abs(total)) > 1e-6 / tests
         scatter = stats.chi2.cdf(np.sum(np.square(values)), SCENES)
         assert 2 * min(scatter, 1 - scatter) > 1e-6 / tests
-
-
-@pytest.mark.parametrize("number", [0, 1])
-def test_scenes_differ(number: int) -> None:
-    a, b = scene(number)[0], scene(number + 1)[0]
-    assert a.exposure_s != b.exposure_s or a.wavelength_nm[0] != b.wavelength_nm[0]

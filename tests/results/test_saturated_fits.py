@@ -9,7 +9,6 @@ import pytest
 import scipy
 
 from mauvecl import BalmerFlare, Engine, Expectation, FlareModel, Instrument, Source, expect, fit
-from tests.refusals import refused
 
 MAUVE = Instrument.load("mauve")
 
@@ -51,24 +50,6 @@ def test_intervals_cover_where_pixels_saturate(
     low, high = scipy.stats.binom.ppf(1e-6, n, 0.92), scipy.stats.binom.isf(1e-6, n, 0.98)
     assert ((low <= inside) & (inside <= high)).all(), dict(zip(found.names, inside / n, strict=True))
     assert scipy.stats.binom.sf(int((found.p_value < 0.01).sum()) - 1, n, 0.01) > 1e-6
-
-
-@pytest.mark.parametrize("amplitude", [50.0, 5000.0])
-def test_flares_that_saturate_every_pixel_are_refused(amplitude: float) -> None:
-    quiet, lit = exposures("K2.5V", 2.0, amplitude, 10_000.0, 1.0)
-    m = FlareModel.of(star("K2.5V", 2.0), MAUVE, quiet)
-    with refused("skipped_nm", expected="some that count"):
-        fit(lit.recorded_dn, quiet, m)
-
-
-@pytest.mark.parametrize("last_nm", [699.5, 699.3])
-def test_fewer_pixels_than_parameters_are_refused(last_nm: float) -> None:
-    quiet, _ = exposures("K2.5V", 8.0, 0.5, 10_000.0, 1.0)
-    m = FlareModel.of(star("K2.5V", 8.0), MAUVE, quiet)
-    count = int((quiet.wavelength_nm > last_nm).sum())
-    assert count in (1, 2)
-    with refused("skipped_nm", value=count, expected="2 parameters"):
-        fit(quiet.recorded_dn, quiet, m, skipped_nm=[(190.0, last_nm)])
 
 
 def test_exposures_with_and_without_saturated_pixels_are_fitted_together(engine: Engine) -> None:

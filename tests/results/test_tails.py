@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+from answers import STATISTICS
 from refusals import refused
 from scenes import instrument, star
 from scipy import special
 
-from mauvecl.device.engine import Engine
-from mauvecl.noise.comparison import Comparison
-from mauvecl.noise.processes import Normal, Processes, Uniform
-from mauvecl.results.detection.detection import Detection
-from mauvecl.results.detection.tails import tail
-from mauvecl.statistics.linear import Linear
-from mauvecl.statistics.registry import STATISTICS
+from mauvecl import Comparison, Detection, Engine, Expectation, Linear, Normal, Processes, Uniform
 
 #: A sixth of the pixels: brute force can then afford 1e7 draws, 30 of them beyond a threshold at 3e-6.
 PART = {"output_min_nm": 330.0, "output_max_nm": 360.0}
@@ -22,42 +19,55 @@ N = 10_000_000
 FREE = float("inf")
 
 
+def sampled(engine: Engine, scene: Any, fap: float, statistic: Any, *, seed: int, **how: Any) -> Any:
+    """Return the sampled threshold of a star, of which too few realisations are drawn to count them."""
+    quiet, *flares = scene
+    few = engine.detect(quiet, flares, realisations=100, seed=seed, statistics=(statistic,), tails="sampled", **how)
+    return few.tail(fap, getattr(statistic, "name", statistic))
+
+
+def check_tail(of: Any, found: Detection, fap: float, statistic: str, n: int) -> None:
+    """Compare a sampled threshold with the realisations beyond it, within 4.5 standard errors."""
+    beyond, expected = found.distribution(statistic).above(of.threshold.value), fap * n
+    assert abs(beyond - expected) < 4.5 * np.hypot(np.sqrt(expected), of.relative_error * expected)
+    assert of.relative_error <= 0.02
+    assert of.threshold.low < of.threshold.value < of.threshold.high
+
+
 @pytest.fixture(scope="module")
-def found(engine: Engine) -> Detection:
-    quiet, flare = star(amplitudes=(0.1,), payload=instrument(**PART))
-    return engine.detect(quiet, [flare], realisations=N, seed=11, statistics=tuple(STATISTICS), tails="sampled")
+def scene() -> list[Expectation]:
+    return star(amplitudes=(0.1,), payload=instrument(**PART))
+
+
+@pytest.fixture(scope="module")
+def found(engine: Engine, scene: list[Expectation]) -> Detection:
+    return engine.detect(scene[0], scene[1:], realisations=N, seed=11, statistics=STATISTICS)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("statistic", STATISTICS)
 @pytest.mark.parametrize("fap", [1e-2, 1e-4, 3e-6])
-def test_sampled_tail_agrees_with_brute_force(found: Detection, statistic: str, fap: float) -> None:
+def test_sampled_tail_agrees_with_brute_force(
+    engine: Engine, scene: list[Expectation], found: Detection, statistic: str, fap: float
+) -> None:
     """Count realisations beyond sampled thresholds: 18 values with |z| < 4.5 fail in 1e-4 of seeds."""
-    sampled = tail(found, fap, statistic, seed=3)
-    null = found.distribution(statistic)
-    beyond, expected = null.above(sampled.threshold.value), fap * N
-    error = np.hypot(np.sqrt(expected), sampled.relative_error * expected)
-    assert abs(beyond - expected) < 4.5 * error
-    assert sampled.relative_error <= 0.02
-    assert sampled.threshold.low < sampled.threshold.value < sampled.threshold.high
+    check_tail(sampled(engine, scene, fap, statistic, seed=3), found, fap, statistic, N)
 
 
-@pytest.fixture(scope="module")
-def plain(engine: Engine) -> Detection:
-    """Return a detection without dark and with 60 DN of noise, for which statistics are normal and chi-squared."""
-    payload = instrument(dark_scale_dn_per_s=0.0, read_noise_dn=60.0, **PART)
-    quiet, flare = star(amplitudes=(0.1,), payload=payload)
-    return engine.detect(quiet, [flare], realisations=100, seed=1, statistics=tuple(STATISTICS), tails="sampled")
+#: Without dark and with 60 DN of noise, statistics are normal and chi-squared.
+GAUSSIAN = {"dark_scale_dn_per_s": 0.0, "read_noise_dn": 60.0}
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("statistic", STATISTICS)
 @pytest.mark.parametrize("fap", [1e-3, 1e-6, 1e-9])
-def test_sampled_tail_agrees_with_the_exact_closed_form(plain: Detection, statistic: str, fap: float) -> None:
+def test_sampled_tail_agrees_with_the_exact_closed_form(engine: Engine, statistic: str, fap: float) -> None:
     """Compare within 4 standard errors."""
-    sampled = tail(plain, fap, statistic, seed=5)
-    exact = plain.closed_form(statistic).sf(sampled.threshold.value)
-    assert abs(exact / fap - 1) < 4 * sampled.relative_error
+    quiet, flare = star(amplitudes=(0.1,), payload=instrument(**GAUSSIAN, **PART))
+    of = sampled(engine, [quiet, flare], fap, statistic, seed=5)
+    plain = engine.detect(quiet, [flare], realisations=100, seed=1, statistics=(statistic,))
+    exact = plain.closed_form(statistic).sf(of.threshold.value)
+    assert abs(exact / fap - 1) < 4 * of.relative_error
 
 
 #: What is marginalised over, and what is drawn of it.
@@ -76,21 +86,19 @@ UNKNOWNS = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("case", UNKNOWNS)
-def test_sampled_tail_with_unknowns_agrees_with_brute_force(engine: Engine, case: str) -> None:
+def test_sampled_tail_with_unknowns_agrees_with_brute_force(
+    engine: Engine, scene: list[Expectation], case: str
+) -> None:
     """Count up to three statistics at two probabilities: 16 values with |z| < 4.5 fail in 1e-4 of seeds."""
     nuisances, processes = UNKNOWNS[case]
     n = 500_000
-    quiet, flare = star(amplitudes=(0.1,), payload=instrument(**PART))
-    how = {"nuisances": nuisances, "processes": processes, "tails": "sampled"}
+    how = {"nuisances": nuisances, "processes": processes}
     names = ("chi2", "chi2_element", "matched") if case != "all that is usual" else ("chi2", "matched")
-    found = engine.detect(quiet, [flare], realisations=n, seed=11, statistics=names, **how)
+    found = engine.detect(scene[0], scene[1:], realisations=n, seed=11, statistics=names, **how)
     for statistic in names:
+        # Of a hundred realisations, one in a hundred cannot be counted.
         for fap in (1e-2, 1e-4):
-            sampled = tail(found, fap, statistic, seed=3)
-            beyond, expected = found.distribution(statistic).above(sampled.threshold.value), fap * n
-            error = np.hypot(np.sqrt(expected), sampled.relative_error * expected)
-            assert abs(beyond - expected) < 4.5 * error
-            assert sampled.relative_error <= 0.02
+            check_tail(sampled(engine, scene, fap, statistic, seed=3, **how), found, fap, statistic, n)
 
 
 @pytest.mark.parametrize("statistic", ["chi2", "matched"])
@@ -117,14 +125,14 @@ def test_bins_do_not_move_a_sampled_threshold(engine: Engine, statistic: str) ->
 @pytest.mark.long
 def test_tail_intervals_have_nominal_coverage(engine: Engine) -> None:
     """Check that 50 of 60 intervals of 95 % contain the closed form; fails once in 2000 new seeds."""
-    payload = instrument(dark_scale_dn_per_s=0.0, read_noise_dn=60.0, output_min_nm=350.0, output_max_nm=360.0)
+    payload = instrument(**GAUSSIAN, output_min_nm=350.0, output_max_nm=360.0)
     quiet, flare = star(amplitudes=(0.1,), payload=payload)
-    plain = engine.detect(quiet, [flare], realisations=100, seed=1, statistics=("chi2", "matched"), tails="sampled")
     held = 0
-    for seed in range(30):
-        for statistic in ("chi2", "matched"):
-            t = tail(plain, 1e-7, statistic, seed=seed).threshold
-            held += t.low <= plain.closed_form(statistic).isf(1e-7) <= t.high
+    for statistic in ("chi2", "matched"):
+        exact = engine.detect(quiet, [flare], realisations=100, seed=1, statistics=(statistic,)).closed_form(statistic)
+        for seed in range(30):
+            t = sampled(engine, [quiet, flare], 1e-7, statistic, seed=seed).threshold
+            held += t.low <= exact.isf(1e-7) <= t.high
     assert held >= 50
     assert special.bdtr(49, 60, 0.95) < 5e-4
 
@@ -154,29 +162,25 @@ FEWER, ONE_IN = 1_000_000, 1e-4
 
 
 @pytest.fixture(scope="module", params=[Comparison(4), Comparison(1, True)], ids=["stack", "estimated"])
-def compared(request: pytest.FixtureRequest, engine: Engine) -> Detection:
-    """Return a detection with every statistic of the same draws."""
-    quiet, flare = star(amplitudes=(0.1,), payload=instrument(output_min_nm=345.0, output_max_nm=360.0))
-    how = {"statistics": tuple(STATISTICS), "comparison": request.param, "tails": "sampled"}
-    return engine.detect(quiet, [flare], realisations=FEWER, seed=12, **how)
+def compared(request: pytest.FixtureRequest, engine: Engine) -> tuple[Detection, list[Expectation], Comparison]:
+    """Return a detection with every statistic of the same draws, its star and flare, and what is compared."""
+    short = star(amplitudes=(0.1,), payload=instrument(output_min_nm=345.0, output_max_nm=360.0))
+    how = {"statistics": STATISTICS, "comparison": request.param}
+    return engine.detect(short[0], short[1:], realisations=FEWER, seed=12, **how), short, request.param
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("statistic", STATISTICS)
-def test_sampled_tail_agrees_for_every_comparison(compared: Detection, statistic: str) -> None:
+def test_sampled_tail_agrees_for_every_comparison(engine: Engine, compared: Any, statistic: str) -> None:
     """Compare 12 values at 1e-4 of 1e6 realisations: |z| < 4.5 fails in 1e-4 of seeds."""
-    sampled, expected = tail(compared, ONE_IN, statistic, seed=4), ONE_IN * FEWER
-    beyond = compared.false_alarm_probability(sampled.threshold.value, statistic).value * FEWER
-    assert abs(beyond - expected) < 4.5 * np.hypot(np.sqrt(expected), sampled.relative_error * expected)
+    found, short, comparison = compared
+    of = sampled(engine, short, ONE_IN, statistic, seed=4, comparison=comparison)
+    check_tail(of, found, ONE_IN, statistic, FEWER)
 
 
-def test_sum_in_dn_is_tilted_in_its_unit(engine: Engine) -> None:
+def test_sum_in_dn_is_tilted_in_its_unit(engine: Engine, scene: list[Expectation]) -> None:
     """Use weights of one DN each: |z| < 4.5 fails in 1e-5 of seeds."""
-    quiet, _ = star(amplitudes=(0.1,), payload=instrument(**PART))
-    own = Linear("own", np.ones(quiet.wavelength_nm.size))
-    n, fap = 400_000, 1e-3
-    how = {"comparison": Comparison(0, estimated=True), "tails": "sampled"}
-    found = engine.detect(quiet, [], realisations=n, seed=11, statistics=(own,), **how)
-    sampled = tail(found, fap, "own", seed=3)
-    beyond = found.distribution("own").above(sampled.threshold.value)
-    assert abs(beyond - fap * n) < 4.5 * np.hypot(np.sqrt(fap * n), sampled.relative_error * fap * n)
+    own = Linear("own", np.ones(scene[0].wavelength_nm.size))
+    how = {"comparison": Comparison(0, estimated=True)}
+    found = engine.detect(scene[0], [], realisations=400_000, seed=11, statistics=(own,), **how)
+    check_tail(sampled(engine, scene[:1], 1e-3, own, seed=3, **how), found, 1e-3, "own", 400_000)
