@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import re
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +14,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from tests.web.visits import Server, Talk, column, link
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
+NUMBER = r"(-?[\d.]+(?:e[+-]\d+)?)"
 HOSTILE = "![x](http://127.0.0.1:1/x.png) <img src=http://127.0.0.1:1/y.png>"
 M_DWARF = {"star": "M3V", "magnitude": "9", "amplitude_percent": "2", "exposure_s": "50"}
 UNKNOWN = ("nothing", "the usual")
@@ -43,10 +41,6 @@ def test_invalid_numbers_are_faults_and_ranges_include_their_ends(server: Server
     """Every field with a number says what it accepts, accepts it, and accepts nothing else."""
 
     async def work(talk: Talk) -> None:
-        async def entered(text: Callable[[str], str | None]) -> dict[str, str]:
-            chosen = {name: given for name in numbers if (given := text(name)) is not None}
-            return await faults_of_all(talk, words, chosen)
-
         found = await faults_of_all(talk, words, dict.fromkeys(words["fields"], "seven"))
         numbers = {
             name: why.partition(", expected ")[2]
@@ -55,38 +49,32 @@ def test_invalid_numbers_are_faults_and_ranges_include_their_ends(server: Server
         }
         assert len(numbers) == 29
         for text in ("7,4", "1e999", "nan", "inf", "-inf", "1_0", "0x10", "٣", "1e400000"):
-            found = await entered(lambda name, text=text: text)  # type: ignore[misc]
+            found = await faults_of_all(talk, words, dict.fromkeys(numbers, text))
             assert {name for name, accepted in numbers.items() if accepted not in found.get(name, "")} == set(), text
         assert (
             found["seed"] == "'1e400000' is not a whole number, expected a whole number from 0 to 18446744073709551615"
         )
         # What may be left out is empty on a new page.
         for text in ("", " "):
-            found = await entered(lambda name, text=text: text)  # type: ignore[misc]
+            found = await faults_of_all(talk, words, dict.fromkeys(numbers, text))
             for name, accepted in numbers.items():
                 needed = words["fields"][name] != ""
                 assert (found.get(name) == f"nothing is entered, expected {accepted}") == needed, name
-        number = r"(-?[\d.]+(?:e[+-]\d+)?)"
-        for closed, opened, sign in (
-            (rf"^(?:a whole number from )?{number} to ", rf"above {number}", -1),
-            (rf" (?:to|up to) {number}", rf"below {number}", 1),
+        for low, closed, opened, sign in (
+            (True, rf"^(?:a whole number from )?{NUMBER} to ", rf"above {NUMBER}", -1),
+            (False, rf" (?:to|up to) {NUMBER}", rf"below {NUMBER}", 1),
         ):
-
-            def end(name: str, form: str, beyond: int = 0) -> str | None:
-                at = re.search(form, numbers[name])
-                if at is None or not beyond:
-                    return at and at[1]
-                # Whole numbers of any size.
-                return str(int(at[1]) + beyond) if at[1].isdigit() else f"{float(at[1]) + beyond:.17g}"
-
-            accepted = {name for name in numbers if end(name, closed)}
-            found = await entered(lambda name: end(name, closed))
-            assert not [name for name in accepted if "out of range" in found.get(name, "")]
-            for form, beyond in ((closed, sign), (opened, 0), (opened, sign)):
-                refused = {name for name in numbers if end(name, form, beyond)}
-                found = await entered(lambda name: end(name, form, beyond))
-                assert {name for name in refused if "out of range" not in found.get(name, "")} == set(), (form, beyond)
-                assert refused
+            for form, beyond, refused in ((closed, 0, False), (closed, sign, True), (opened, 0, True)):
+                ends = {name: at[1] for name, accepted in numbers.items() if (at := re.search(form, accepted))}
+                assert len(ends) > 1, (low, form)
+                if beyond:
+                    # Whole numbers of any size.
+                    ends = {
+                        n: str(int(x) + sign) if x.isdigit() else f"{float(x) + sign:.17g}" for n, x in ends.items()
+                    }
+                found = await faults_of_all(talk, words, ends)
+                wrong = {name for name in ends if ("out of range" in found.get(name, "")) != refused}
+                assert wrong == set(), (form, beyond)
 
     server.visited(work)
 
@@ -353,7 +341,7 @@ STATISTICS = ("matched", "chi2", "chi2_element", "chi2_pair", "uv_excess", "pape
 
 @pytest.mark.parametrize("statistic", long_but(STATISTICS, "matched", "chi2"))
 def test_curve_and_map_show_the_closed_form(server: Server, statistic: str) -> None:
-    """Also between computed points: the curve within 1 %, the map within 0.06 mag; its labels stand on their contours."""
+    """Also between computed points: the curve within 1 %, the map within 0.06 mag; labels stand on contours."""
 
     def asked(magnitude: float, percent: float) -> str:
         return link(statistic=statistic, amplitude_percent=f"{percent:.9g}", magnitude=f"{magnitude:.9g}")

@@ -48,7 +48,7 @@ SHOWN = {tab: {*names.split()} for tab, names in tomllib.loads((DATA / "shown.to
 def valued(data: Any, key: str) -> Any:
     """Return a value of a study's data by its dotted key, of the first of several."""
     for part in key.split("."):
-        data = data[0] if isinstance(data, list) else data
+        data = (data or [{}])[0] if isinstance(data, list) else data
         data = data.get(part) if isinstance(data, dict) else None
     return data
 
