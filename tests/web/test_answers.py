@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import re
+import tomllib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from tests.web.visits import Server, Talk, column, link
 NUMBER = r"(-?[\d.]+(?:e[+-]\d+)?)"
 HOSTILE = "![x](http://127.0.0.1:1/x.png) <img src=http://127.0.0.1:1/y.png>"
 M_DWARF = {"star": "M3V", "magnitude": "9", "amplitude_percent": "2", "exposure_s": "50"}
+TEXTS = tomllib.loads((Path(__file__).parents[1] / "data" / "web" / "texts.toml").read_text(encoding="utf-8"))
 UNKNOWN = ("nothing", "the usual")
 
 
@@ -79,91 +82,18 @@ def test_invalid_numbers_are_faults_and_ranges_include_their_ends(server: Server
     server.visited(work)
 
 
-#: Texts that are refused: fields, the tab, the field with the fault and a part of what it says.
-REFUSED: list[tuple[dict[str, str], str, str, str]] = [
-    ({"targets": "AU Mik"}, "plan", "targets", "AU Mic"),
-    ({"targets": "no such star"}, "plan", "targets", "expected a name such as"),
-    ({"targets": "AU Mic\n400 95"}, "plan", "targets", "(target 2) is unknown"),
-    ({"targets": "AU Mic\nAU Mic"}, "plan", "targets", "named twice"),
-    ({"targets": "name,rates_file\nAU Mic,/etc/passwd"}, "plan", "targets", "rates_file"),
-    ({"targets": "name,neighbours\nAU Mic,/etc/passwd"}, "plan", "targets", "neighbours"),
-    ({"targets": "name,V\nAU Mic,bright"}, "plan", "targets", "bright"),
-    ({"targets": "name,V\nAU Mic"}, "plan", "targets", "cells"),
-    ({"targets": "name\n"}, "plan", "targets", "holds 0 targets"),
-    ({"targets": "\n".join(f"10 {n}" for n in range(31))}, "plan", "targets", "at most 30"),
-    ({"targets": "x" * 4000}, "plan", "targets", "too long"),
-    ({"start": "tomorrow"}, "plan", "start", "a day such as 2027-01-31"),
-    ({"start": "1989-12-31"}, "plan", "start", "from 1990 to 2099"),
-    *[
-        ({"lines": text}, "detection", "lines", "expected")
-        for text in ("Mg II", "Mg II=x", "spots=0.1", "Mg II=0.1, mg ii=0.2", "Mg II=-1")
-    ],
-    ({"balmer_jump": "2.5", "second_temperature_k": "30000"}, "detection", "balmer_jump", "Second area"),
-    ({"star": "Proxima"}, "detection", "star", "'Proxima' has no spectrum in the library"),
-    ({"star": "uploaded star"}, "detection", "star", "its file again: links do not hold it"),
-    ({"own_unknown": "uploaded spectrum"}, "detection", "own_unknown", "its file again"),
-    ({"own_unknown": "200 1, 100 1"}, "detection", "own_unknown", "ascending"),
-    ({"own_unknown": "200 1 1"}, "detection", "own_unknown", "pairs of nm and DN"),
-    ({"frames": "uploaded file"}, "analyse", "frames", "its file again"),
-    ({"sky": "target and time", "target": "bogus"}, "detection", "target", "Sky target = 'bogus', expected a name"),
-    ({"sky": "target and time", "time": "tomorrow"}, "detection", "time", "Time, UTC = 'tomorrow', expected a UTC"),
-    ({"sky": "target and time"}, "detection", "time", "Time, UTC is empty, expected a UTC time"),
-    ({"time": "x" * 1000}, "detection", "time", "is too long"),
-    ({"fap": "0.0001", "realisations": "100000"}, "detection", "realisations", "expected at least 100"),
-    ({"fap": "1e-6", "realisations": "1000000"}, "detection", "realisations", "expected at least 100"),
-    ({"unknown": "the usual", "statistic": "paper"}, "detection", "statistic", "cannot be marginalised"),
-    ({"neighbours": "name,separation,magnitude,file\nB,8,9,/etc/passwd\n"}, "detection", "neighbours", "file"),
-    ({"neighbours": "# %ECSV 1.0\n# ---\nname separation\nB 8\n"}, "detection", "neighbours", "ECSV"),
-    ({"neighbours": "name,separation,magnitude\nB,8\n"}, "detection", "neighbours", "cells"),
-    ({"pointing_rate": "1", "pointing_depth": "120"}, "completeness", "pointing_depth", "120"),
-]
-#: Texts that are accepted: fields, the tab, and words of the answer.
-ACCEPTED: list[tuple[dict[str, str], str, str]] = [
-    *[
-        ({"star": given}, "detection", f"on {words}")
-        for given, words in (
-            ("GJ581", "an M3V star (spectrum of GJ 581)"),
-            ("  hd  40307 ", "a K2.5V star (spectrum of HD 40307)"),
-            ("K3V", "a K2.5V star (spectrum of HD 40307)"),
-            ("m3v", "an M3V star (spectrum of GJ 581)"),
-            ("vega", "a star like Vega"),
-            ("Sun", "a star like the Sun"),
-            ("M3", "an M3V star (spectrum of GJ 581)"),
-            ("GX And", "an M1V star (spectrum of GJ 15A)"),
-            ("A0V", "an A0V star"),
-            ("blackbody 9000 K", "a blackbody of 9000 K"),
-            ("power law -2", "a power law of index -2"),
-        )
-    ],
-    ({"targets": ""}, "visibility", "no target yet; 365 days from 2027-01-01"),
-    ({"targets": "  \n"}, "visibility", "no target yet"),
-    ({"targets": "AU Mic\n\n  Proxima ", "days": "9"}, "visibility", "AU Mic, Proxima; 9 days from"),
-    ({"targets": "53.23, -9.46\nHD 1835"}, "visibility", "53.23, -9.46, HD 1835;"),
-    ({"targets": "19h22m00s -11d12m00s"}, "visibility", "19h22m00s -11d12m00s;"),
-    ({"targets": "name,V,ra,dec\nmine,9.5,10,-3\nAU Mic,,,"}, "visibility", "mine, AU Mic;"),
-    ({"target": "bogus", "time": "tomorrow"}, "detection", "chance to detect"),
-    (
-        {"sky": "target and time", "target": "290.68 +11.12", "time": "2026-09-01T12:00"},
-        "detection",
-        "chance to detect",
-    ),
-    ({"fap": "1e-6", "realisations": "100000 sampled"}, "detection", "probability of 1e-06"),
-    ({"star": "no such star", "targets": "eps Eri"}, "plan", "eps Eri"),
-]
-
-
 def test_texts_are_refused_at_their_field_or_accepted(server: Server) -> None:
     async def work(talk: Talk) -> None:
-        for entered, tab, field, part in REFUSED:
-            reported = await talk.answer(link(**entered), tab)
-            assert "answer" not in reported, entered
+        for row in TEXTS["refused"]:
+            reported = await talk.answer(link(**row["entered"]), row["tab"])
+            assert "answer" not in reported, row
             # An empty time or target is a fault of its own.
-            assert reported["faults"].keys() <= {field, "target", "time"}, entered
-            assert part in reported["faults"][field], entered
-        for entered, tab, part in ACCEPTED:
-            reported = await talk.answer(link(**entered), tab)
-            assert reported["faults"] == {}, entered
-            assert part in reported["answer"]["words"], entered
+            assert reported["faults"].keys() <= {row["field"], "target", "time"}, row
+            assert row["says"] in reported["faults"][row["field"]], row
+        for row in TEXTS["accepted"]:
+            reported = await talk.answer(link(**row["entered"]), row["tab"])
+            assert reported["faults"] == {}, row
+            assert row["says"] in reported["answer"]["words"], row
 
     server.visited(work)
 
