@@ -269,7 +269,7 @@ def test_pictures_state_what_the_answer_is(server: Server) -> None:
 STATISTICS = ("matched", "chi2", "chi2_element", "chi2_pair", "uv_excess", "paper")
 
 
-@pytest.mark.parametrize("statistic", long_but(STATISTICS, "matched", "chi2"))
+@pytest.mark.parametrize("statistic", long_but(STATISTICS, "matched"))
 def test_curve_and_map_show_the_closed_form(server: Server, statistic: str) -> None:
     """Also between computed points: the curve within 1 %, the map within 0.06 mag; labels stand on contours."""
 
