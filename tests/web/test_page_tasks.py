@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,11 +10,8 @@ import pytest
 from tests.web.visits import Server, fresh, settled, until
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from playwright.sync_api import Browser, Locator, Page
 
-pytest.importorskip("mauvecl.web.tabs")
 pytestmark = pytest.mark.long
 
 #: Stops of the keyboard on the way to a control at most.
@@ -87,13 +83,6 @@ class Keys(Mouse):
         self.clicks += 1
 
 
-@pytest.fixture(params=[Mouse, Keys])
-def visitor(request: pytest.FixtureRequest, browser: Browser, server: Server) -> Iterator[Mouse]:
-    page = fresh(browser, server.address, permissions=["clipboard-read", "clipboard-write"])
-    yield request.param(page)
-    page.context.close()
-
-
 def sentence(page: Page, part: str) -> str:
     """Return the limit in a sentence, once it has these words."""
     solved = page.locator("#solved", has_text=part)
@@ -102,7 +91,7 @@ def sentence(page: Page, part: str) -> str:
     return solved.inner_text()
 
 
-def test_which_flares_on_an_m_dwarf(visitor: Mouse) -> None:
+def which_flares_on_an_m_dwarf(visitor: Mouse) -> None:
     page = visitor.page
     visitor.type(page.get_by_label("Star", exact=True), "AU Mic")
     visitor.press(page.get_by_role("button", name="Use M1V at V = 8.81"))
@@ -112,27 +101,26 @@ def test_which_flares_on_an_m_dwarf(visitor: Mouse) -> None:
     assert visitor.clicks == 2
 
 
-def test_limiting_magnitude(visitor: Mouse) -> None:
+def limiting_magnitude(visitor: Mouse) -> None:
     page = visitor.page
     visitor.choose(page.get_by_label("Solve for", exact=True), "magnitude")
     assert "with everything known" in sentence(page, "to V = 8.14")
     assert visitor.clicks == 2
 
 
-def test_own_spectrum_in_angstrom(visitor: Mouse, tmp_path: Path) -> None:
-    """The same spectrum in nm and in Angstrom gives the same answer."""
+def own_spectrum_in_angstrom(visitor: Mouse) -> None:
+    """Upload the same spectrum in nm and in Angstrom, which give the same answer."""
     page = visitor.page
     nm = np.linspace(170.0, 1000.0, 400)
     flux = 1e-12 * np.exp(-(((nm - 500) / 150) ** 2))
     shown = []
     for unit, scale in (("nm", 1.0), ("Angstrom", 10.0)):
-        file = tmp_path / f"{unit}.csv"
         rows = "\n".join(f"{w:.6f},{f:.6e}" for w, f in zip(scale * nm, flux, strict=True))
-        file.write_text(f"wavelength ({unit}),flux (erg/s/cm2/Angstrom)\n{rows}\n")
+        text = f"wavelength ({unit}),flux (erg/s/cm2/Angstrom)\n{rows}\n"
         with page.expect_file_chooser() as asked:
             visitor.press(page.get_by_role("button", name="Use your own spectrum"))
-        asked.value.set_files(file)
-        page.locator("[data-uploaded=star]", has_text=file.name).wait_for()
+        asked.value.set_files({"name": f"{unit}.csv", "mimeType": "text/csv", "buffer": text.encode()})
+        page.locator("[data-uploaded=star]", has_text=f"{unit}.csv").wait_for()
         until(page, lambda: "your own star" in page.locator("#words-of").inner_text())
         settled(page)
         shown.append(page.locator("#facts").inner_text())
@@ -140,7 +128,7 @@ def test_own_spectrum_in_angstrom(visitor: Mouse, tmp_path: Path) -> None:
     assert visitor.clicks == 2, "one for each file"
 
 
-def test_plan_of_three_targets(visitor: Mouse) -> None:
+def plan_of_three_targets(visitor: Mouse) -> None:
     page = visitor.page
     visitor.turn("Plan")
     visitor.type(page.get_by_label("Target of target 1"), "AU Mic", "eps Eri", "YZ CMi")
@@ -152,7 +140,7 @@ def test_plan_of_three_targets(visitor: Mouse) -> None:
     assert visitor.clicks == 3
 
 
-def test_share_download_cite(visitor: Mouse) -> None:
+def share_download_cite(visitor: Mouse) -> None:
     page = visitor.page
     with page.expect_download() as coming:
         visitor.press(page.locator("#figure-excess").get_by_role("button", name="PNG"))
@@ -165,3 +153,17 @@ def test_share_download_cite(visitor: Mouse) -> None:
     visitor.press(page.get_by_role("button", name="Copy the BibTeX"))
     until(page, lambda: page.evaluate(copied).startswith("@software{mauvecl"))
     assert visitor.clicks == 4
+
+
+TASKS = (which_flares_on_an_m_dwarf, limiting_magnitude, plan_of_three_targets, share_download_cite,
+         own_spectrum_in_angstrom)  # fmt: skip
+
+
+@pytest.mark.parametrize("visitor", [Mouse, Keys])
+def test_newcomers_do_five_tasks(browser: Browser, server: Server, visitor: type[Mouse]) -> None:
+    page = fresh(browser, server.address, permissions=["clipboard-read", "clipboard-write"])
+    for task in TASKS:
+        page.goto(server.address)
+        settled(page)
+        task(visitor(page))
+    page.context.close()

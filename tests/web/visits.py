@@ -1,40 +1,55 @@
-"""What visitors do with the page in Chromium, for tests of it."""
+"""What visitors do with the page: servers, connections as the page's script makes them, and windows of Chromium."""
 
 from __future__ import annotations
 
+import asyncio
+import base64
+import json
+import os
+import re
 import shutil
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
+from urllib.parse import urlencode
+
+import numpy as np
+from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
+from tornado.websocket import websocket_connect
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
+T = TypeVar("T")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 #: Milliseconds: generous, for tests that share two cores.
 PATIENCE = 90_000
 
 
 class Server:
-    """Server that can be ended and started again at the same address."""
+    """Server of the page in a process of its own, which can be ended and started again at the same address."""
 
-    def __init__(self, log: Path) -> None:
-        self.log = log
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
+    def __init__(
+        self, log: Path, *more: str, program: str = "", address: str = "127.0.0.1", **environment: str
+    ) -> None:
+        self.log, self.environment = log, environment
+        with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as free:
+            free.bind((address, 0))
             self.port = free.getsockname()[1]
-        self.address = f"http://127.0.0.1:{self.port}/"
+        self.host = f"[{address}]:{self.port}" if ":" in address else f"{address}:{self.port}"
+        self.address = f"http://{self.host}/"
+        words = ["-m", "mauvecl", "serve", "--address", address, "--port", str(self.port), *more]
+        self.command = [sys.executable, *(["-c", program, address, str(self.port)] if program else words)]
         self.start()
 
     def start(self) -> None:
         with self.log.open("a") as out:
             before = self.log.stat().st_size
-            command = [sys.executable, "-m", "mauvecl", "serve", "--port", str(self.port)]
-            self.process = subprocess.Popen(command, stdout=out, stderr=out)
+            self.process = subprocess.Popen(self.command, stdout=out, stderr=out, env=os.environ | self.environment)
         while "mauvecl serves at" not in self.log.read_text()[before:]:
             assert self.process.poll() is None, self.log.read_text()
             time.sleep(0.1)
@@ -43,9 +58,168 @@ class Server:
         self.process.kill()
         self.process.wait(20)
 
+    def quiet(self) -> None:
+        """Check that the server has reported no fault: a visitor who leaves in mid-sentence is none."""
+        reported = self.log.read_text()
+        for word in ("mauvecl.web", "Traceback", "Warning", "ERROR"):
+            assert word not in reported, reported
+
+    def memory(self) -> float:
+        """Return the resident memory in MB."""
+        (kib,) = re.findall(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{self.process.pid}/status").read_text())
+        return int(kib) * 1024 / 1e6
+
+    def spent(self, *, readers: bool = False) -> float:
+        """Return the processor time of the server in s, or that of its processes that have read files."""
+        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
+        first = 13 if readers else 11
+        return (int(fields[first]) + int(fields[first + 1])) / 100
+
+    def visited(self, work: Callable[[Talk], Coroutine[Any, Any, T]]) -> T:
+        """Return what becomes of a new visitor's talk with the server."""
+
+        async def visit() -> T:
+            talk = await self.talk()
+            try:
+                return await work(talk)
+            finally:
+                talk.end()
+
+        return asyncio.run(asyncio.wait_for(visit(), 580))
+
+    async def talk(self, **headers: str) -> Talk:
+        """Return the connection of a new visitor, who has been greeted."""
+        headers = {"Origin": f"http://{self.host}"} | headers
+        found = Talk(
+            await websocket_connect(HTTPRequest(f"ws://{self.host}/live", headers=headers, request_timeout=60))
+        )
+        assert "hello" in await found.next()
+        return found
+
+    async def refuses_talk(self, **headers: str) -> int:
+        """Return the status with which a connection is refused."""
+        try:
+            await websocket_connect(HTTPRequest(f"ws://{self.host}/live", headers=headers, request_timeout=60))
+        except HTTPClientError as error:
+            return error.code
+        raise AssertionError("let in")
+
+    async def got(self, path: str = "", **headers: str) -> tuple[int, str]:
+        """Return status and text of a page."""
+        try:
+            answer = await AsyncHTTPClient().fetch(
+                HTTPRequest(self.address + path, headers=headers, request_timeout=60)
+            )
+        except HTTPClientError as error:
+            return error.code, (error.response.body or b"").decode() if error.response else ""
+        return answer.code, answer.body.decode(errors="replace")
+
+    def fetched(self, path: str = "", **headers: str) -> tuple[int, str]:
+        """Return status and text of a page, outside of a talk."""
+        return asyncio.run(self.got(path, **headers))
+
+    def words(self) -> dict[str, Any]:
+        """Return what the page tells its script: fields, tabs and what they read."""
+        _, html = self.fetched()
+        (text,) = re.findall(r'<script[^>]*type="application/json"[^>]*>(.*?)</script>', html, re.DOTALL)
+        return dict(json.loads(text))
+
+
+def link(**entered: str) -> str:
+    """Return a link of texts by field."""
+    return "?" + urlencode(entered)
+
+
+class Talk:
+    """Connection of a visitor that sends what the page's script would."""
+
+    def __init__(self, connection: Any) -> None:
+        self.connection, self._n = connection, 0
+
+    async def next(self) -> dict[str, Any]:
+        message = await asyncio.wait_for(self.connection.read_message(), 300)
+        assert message is not None, "the connection has ended"
+        return dict(json.loads(message))
+
+    async def say(self, what: str, **more: Any) -> int:
+        """Ask, and return the number of the question."""
+        self._n += 1
+        await self.connection.write_message(json.dumps({"ask": what, "n": self._n} | more))
+        return self._n
+
+    async def ask(self, what: str, *until: str, **more: Any) -> dict[str, Any]:
+        """Ask, and wait for a message of the answer that holds one of these words."""
+        n = await self.say(what, **more)
+        while True:
+            reported = await self.next()
+            if reported.get("n") == n and reported.keys() & {*until}:
+                return reported
+
+    async def answer(self, link: str = "", tab: str = "detection") -> dict[str, Any]:
+        """Return the message with the faults, or with the card, to which that with the pictures is added."""
+        reported = await self.ask("answer", "faults", link=link, tab=tab)
+        if "answer" in reported:
+            while "pictures" not in (drawn := await self.next()):
+                assert "refused" not in drawn, drawn
+            assert drawn["tab"] == tab
+            reported |= drawn
+        return reported
+
+    async def faults(self, link: str, tab: str = "detection") -> dict[str, str]:
+        return dict((await self.ask("answer", "faults", link=link, tab=tab))["faults"])
+
+    async def chances(self, link: str) -> list[float]:
+        """Return both chances of the card."""
+        return [one["value"] for one in (await self.answer(link))["answer"]["numbers"]]
+
+    async def solved(self, link: str) -> tuple[str, str]:
+        """Return the sentences on the chances of other payloads, and on the limit."""
+        payloads = (await self.ask("solve", "payloads", link=link))["payloads"]
+        return payloads, (await self.next())["solved"]
+
+    async def upload(
+        self, content: bytes, field: str = "star", name: str = "star.txt", link: str = ""
+    ) -> dict[str, Any]:
+        n = await self.say("upload", field=field, name=name, link=link)
+        await self.connection.write_message(content, binary=True)
+        while (reported := await self.next()).get("n") != n:
+            pass
+        return reported
+
+    async def file(self, **which: str) -> tuple[str, bytes]:
+        reported = await self.ask("file", "file", "refused", **which)
+        assert reported["file"], reported
+        return reported["file"], await asyncio.wait_for(self.connection.read_message(), 60)
+
+    async def simulate(self, kind: str, link: str) -> str:
+        """Simulate to the end, and return what is reported of it."""
+        return str((await self.ask("simulate", "ended", kind=kind, link=link))["ended"])
+
+    async def exported(self, link: str = "", tab: str = "detection") -> dict[str, dict[str, str]]:
+        """Return commands and programs by question."""
+        reported = await self.ask("export", "taken", "refused", link=link, tab=tab)
+        return {one["question"]: one for one in reported["taken"]}
+
+    async def ended(self) -> tuple[int, str]:
+        """Wait until the server ends the connection, and return code and reason."""
+        while await asyncio.wait_for(self.connection.read_message(), 30) is not None:
+            pass
+        return self.connection.close_code, str(self.connection.close_reason)
+
+    def end(self) -> None:
+        self.connection.close()
+
+
+def column(drawn: dict[str, Any], picture: str, source: str, name: str) -> Any:
+    """Return a column of a picture's data."""
+    packed = drawn["pictures"][picture]["sources"][source][name]
+    if not isinstance(packed, dict):
+        return packed
+    return np.frombuffer(base64.b64decode(packed["f4"]), "<f4").reshape(packed["shape"])
+
 
 def fresh(browser: Browser, address: str, **how: Any) -> Page:
-    """Yield a new visitor's page with its first answer; errors in it fail the test."""
+    """Return a new visitor's page with its first answer; errors in it fail the test."""
     page = browser.new_context(**how).new_page()
     page.set_default_timeout(PATIENCE)
     faults: list[str] = []

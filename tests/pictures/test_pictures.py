@@ -1,32 +1,50 @@
-"""Every picture at its own size: what is written lies inside the frame, and labels lie apart."""
+"""Pictures through public functions: parts are told, texts are apart, files equal figures, backends are not loaded."""
 
 from __future__ import annotations
 
 import io
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import pytest
+
+pytest.importorskip("matplotlib")
+
+import matplotlib as mpl
+import numpy as np
 from marks import long_but
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from matplotlib.text import Text
+from refusals import refused
 
-from mauvecl.answers.answer import Answer
-from mauvecl.answers.campaigns.visible import visible
-from mauvecl.answers.detection.detect import detect
-from mauvecl.answers.detection.gaussian import gaussian_report
-from mauvecl.answers.detection.maps import detection_map
-from mauvecl.answers.limits.limits import limiting_magnitude
-from mauvecl.answers.signal.exposures import exposure_for
-from mauvecl.answers.signal.simulate import simulate
-from mauvecl.answers.signal.snr import snr
-from mauvecl.device.engine import Engine
-from mauvecl.pictures.style import COLUMN, STYLE, canvas, headline, legend_below, save_or_return
-from mauvecl.study.study import Study
+from mauvecl import (
+    Engine,
+    Frames,
+    Source,
+    Stares,
+    Study,
+    analyse,
+    detect,
+    detection_map,
+    exposure_for,
+    gaussian_report,
+    inject,
+    limiting_magnitude,
+    measure,
+    simulate,
+    snr,
+    visible,
+)
 
+#: Width of one column of a journal, inches.
+COLUMN = 3.5
 FEW = ("run.realisations=2000", "run.fap=0.1")
 ONE = 'star=[{library="G2V", magnitude=7.4}]'
 BARE = 'star=[{library="G2V"}]'
@@ -59,7 +77,7 @@ CASES: dict[str, tuple[Any, tuple[str, ...], bool]] = {
 }
 
 
-def drawn(answer: Answer) -> Iterator[tuple[str, Any, Any]]:
+def drawn(answer: Any) -> Iterator[tuple[str, Any, Any]]:
     """Yield name, figure and renderer of each picture."""
     with mpl.rc_context():
         for name, draw in answer.pictures.items():
@@ -87,6 +105,7 @@ SHORT = ("detect, one statistic", "limit of exposure", "map", "snr", "exposure")
 def test_texts_are_inside_figure_and_do_not_overlap(case: str, engine: Engine) -> None:
     ask, settings, column = CASES[case]
     answer = ask(Study().with_settings(list(settings)), engine)
+    assert answer.pictures
     exposures = {f"{x.exposure_s:g}" for x in answer.inputs}
     for place, (name, figure, renderer) in enumerate(drawn(answer)):
         width, height = figure.bbox.width, figure.bbox.height
@@ -132,21 +151,106 @@ def test_detected_flare_is_visible(engine: Engine) -> None:
     assert line.get_xdata()[-1] < answer.stars[0].detection.quiet.element_wavelength_nm[-1]
 
 
-def test_saved_picture_equals_savefig(tmp_path: Path) -> None:
+def stars(number: int) -> str:
+    each = (f'{{library="G2V", magnitude={7 + k / 10}}}' for k in range(number))
+    return f"star=[{', '.join(each)}]"
+
+
+INJECTED = ("stare.duration_s=1500", "injections.count=10", "injections.sizes=3", "injections.widths=8",
+            "injections.fitted=2", "injections.positions=2", "search.nulls=0")  # fmt: skip
+#: Questions with more stars, flares and half-widths than a picture shows, the note, and the pictures that need none.
+PARTS: dict[str, tuple[Any, tuple[str, ...], str, set[str]]] = {
+    "detect": (detect, (*FEW, stars(7), "flare.amplitudes=[0.5]"), "6 of 7 stars shown", set()),
+    "snr": (snr, (stars(7), "flare.amplitudes=[0.5]"), "6 of 7 stars shown", {"noise-budget"}),
+    "measure": (
+        measure, (ONE, "flare.amplitudes=[0.5, 0.6, 0.7, 0.8, 0.9]", "measure.fits=20"), "4 of 5 flares shown", set(),
+    ),
+    "inject": (
+        lambda study, _: inject(study, Stares()), (ONE, *INJECTED), "6 of 8 half-widths shown",
+        {"completeness", "energies"},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", long_but(PARTS, "detect"))
+def test_pictures_of_a_part_say_so(case: str, engine: Engine) -> None:
+    ask, settings, note, whole = PARTS[case]
+    for name, draw in ask(Study().with_settings(list(settings)), engine).pictures.items():
+        title = draw()._suptitle
+        written = title.get_text().replace("\n", " ") if title else ""
+        assert (note in written) == (name not in whole), (name, written)
+
+
+def test_pictures_without_a_part_say_nothing(engine: Engine) -> None:
+    for draw in detect(Study().with_settings([*FEW, stars(6), "flare.amplitudes=[0.5]"]), engine).pictures.values():
+        assert " shown" not in draw()._suptitle.get_text()
+
+
+def test_saved_picture_equals_savefig(engine: Engine, tmp_path: Path) -> None:
     """Compare all bytes with those of savefig, which draws the picture twice."""
-    plt = canvas()
+    for name, draw in detect(Study().with_settings(list(FEW)), engine).pictures.items():
+        twice = io.BytesIO()
+        draw().savefig(twice, format="png", dpi=160)
+        assert draw(tmp_path / f"{name}.png").read_bytes() == twice.getvalue()
 
-    def made() -> Any:
-        figure, axes = plt.subplots(1, 2, figsize=(5, 2.5))
-        axes[0].loglog([1, 20, 3000], [3, 0.1, 70], label="one")
-        axes[1].plot([0, 1], [1e5, 2e5], label="other")
-        axes[1].set(xlabel="tau", ylabel=r"$10^{-3}$ DN")
-        legend_below(figure, *axes[0].get_legend_handles_labels())
-        headline(figure, "A title that is so long that it takes two lines above both of these panels, as some do")
-        return figure
 
-    twice = io.BytesIO()
-    with plt.rc_context(STYLE):
-        made().savefig(twice, format="png")
-        once = save_or_return(made(), tmp_path / "once.png")
-    assert once.read_bytes() == twice.getvalue()
+def test_pictures_are_drawn_in_the_callers_axes() -> None:
+    star, ax = Source.from_library("G2V"), Figure().subplots()
+    assert list(star.pictures) == ["source"]
+    assert star.pictures["source"](ax=ax) is ax
+    assert len(ax.lines) >= 1
+    with refused("ax"):
+        star.pictures["source"](ax="axes")
+
+
+@pytest.mark.long
+def test_report_has_every_table_remark_and_picture() -> None:
+    """With equal bytes for equal analyses."""
+    time, rng = np.arange(300) * 60.0, np.random.default_rng(1)
+    light = rng.normal(100.0, 1.0, 300) + np.where(time > 9000, 30 * np.exp((9000 - time) / 600), 0.0)
+    answer = analyse(Study(), frames=Frames.of(time, light, np.ones(300), name="<A & B>"))
+    (page,) = (make().decode() for make in answer.documents.values())
+    assert "<A & B>" not in page
+    assert "&lt;A &amp; B&gt;: 300 frames" in page
+    assert all(view.title.split(";")[0] in page.replace("&lt;A &amp; B&gt;", "<A & B>") for view in answer.views)
+    assert page.count("<img") == len(answer.pictures)
+    paper = replace(answer, study=Study(data={"report": "pdf"}))  # type: ignore[arg-type]
+    (name,) = paper.documents
+    assert name == "analyse.pdf"
+    content = paper.documents[name]()
+    assert content.startswith(b"%PDF")
+    assert content == paper.documents[name]()
+
+
+COMMAND = ("-m", "mauvecl", "exposure", "--star", "G2V", "-m", "7.4", "--snr", "10", "--at", "300", "--output", "out")
+LOADED = """
+import sys
+from mauvecl import Source
+star = Source.from_library("G2V")
+assert list(star.pictures) == ["source"] and "matplotlib" not in sys.modules
+assert "mauvecl.answers.answer" not in sys.modules
+figure = star.plot()
+assert figure._repr_png_()[:8] == b"\\x89PNG\\r\\n\\x1a\\n"
+assert "matplotlib" in sys.modules and "matplotlib.pyplot" not in sys.modules
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("backend", "words"),
+    [
+        ("module://no.such.backend", COMMAND),
+        ("nonsense", COMMAND),
+        ("module://no.such.backend", ("-c", LOADED)),
+        ("TkAgg", ("-c", LOADED)),
+    ],
+)
+def test_pictures_load_matplotlib_when_drawn_and_no_backend(
+    backend: str, words: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Notebooks name backends that are not installed, and others need a display."""
+    environment = os.environ | {"MPLBACKEND": backend}
+    done = subprocess.run([sys.executable, *words], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    if words[0] == "-m":
+        assert (tmp_path / "out" / "exposure.png").stat().st_size > 1000

@@ -1,0 +1,768 @@
+"""Studies, commands, programs and tables that the page gives: they are the question, and their numbers are the page's.
+
+Files go the other way, too: what a visitor uploads is read as the command line reads it, or refused in a sentence.
+"""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import io
+import lzma
+import re
+import shlex
+import struct
+import tomllib
+import zipfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import yaml
+from astropy.io import fits
+from astropy.table import Table
+from commands import run
+from golden_inputs import RAW
+from marks import long_but
+from refusals import refused
+from scripts import tool
+
+from mauvecl import Instrument, Study
+from tests.observations.test_calibration import frames_of, star, truth
+from tests.web.visits import Server, Talk, column, link
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from mauvecl import Source
+
+ROOT = Path(__file__).parents[2]
+check_commands = tool("check_commands")
+FILE = "uploaded file"
+DATA = Path(__file__).parents[1] / "data" / "web"
+FIELDS = tomllib.loads((DATA / "fields.toml").read_text(encoding="utf-8"))
+SHOWN = {tab: {*names.split()} for tab, names in tomllib.loads((DATA / "shown.toml").read_text()).items()}
+
+
+def valued(data: Any, key: str) -> Any:
+    """Return a value of a study's data by its dotted key, of the first of several."""
+    for part in key.split("."):
+        data = (data or [{}])[0] if isinstance(data, list) else data
+        data = data.get(part) if isinstance(data, dict) else None
+    return data
+
+
+def study_in(file: str, content: bytes) -> str:
+    """Return the text of a study, which stands in an archive with the visitor's files if there are any."""
+    if file.endswith(".toml"):
+        return content.decode()
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        return archive.read("study.toml").decode()
+
+
+def test_fields_are_shown_where_they_matter(server: Server) -> None:
+    assert {tab: {*seen["reads"]} for tab, seen in server.words()["tabs"].items()} == SHOWN
+
+
+def test_every_field_is_a_key_of_the_study(server: Server) -> None:
+    """In the downloaded study, in the printed command and in the printed program."""
+    words = server.words()
+    uploads = {name for name, one in words["uploads"].items() for name in (name, *one["options"])}
+    assert FIELDS.keys() == words["fields"].keys() - uploads - {"as_observed", "change_band"} | {"star", "own_unknown"}
+
+    async def work(talk: Talk) -> None:
+        for name, row in FIELDS.items():
+            tab = row.get("tab") or next(tab for tab in SHOWN if name in SHOWN[tab])
+            before = row.get("before", {})
+            seen = []
+            for entered in (before, before | {name: row["text"]}):
+                asked = link(**entered)
+                question, printed = next(iter((await talk.exported(asked, tab)).items()))
+                study = study_in(*await talk.file(link=asked, tab="", name=question, ending="study"))
+                given: dict[str, Any] = {}
+                exec(printed["python"].partition("answer =")[0], given)
+                found = (tomllib.loads(study), given["study"].model_dump(mode="json"))
+                seen.append([valued(one, row["key"]) == row["value"] for one in found])
+                seen[-1].append(f"{row['command']} " in f"{printed['command']} ")
+            assert seen == [[False] * 3, [True] * 3], (name, printed)
+
+    server.visited(work)
+
+
+@pytest.mark.long
+def test_hidden_fields_change_nothing_and_others_do(server: Server) -> None:
+    """Hidden fields may even be wrong."""
+    words = server.words()
+
+    async def work(talk: Talk) -> None:
+        for tab, shown in SHOWN.items():
+            wrong = {name: "x" for name in words["fields"] if name not in shown}
+            first, other = [await talk.answer(link(**entered), tab) for entered in ({}, wrong)]
+            assert {**first, "n": 0} == {**other, "n": 0, "known": first["known"]}, tab
+            for name in FIELDS.keys() & shown:
+                before = FIELDS[name].get("before", {})
+                asked = [link(**entered) for entered in (before, before | {name: FIELDS[name]["text"]})]
+                old, new = [await talk.exported(one, tab) for one in asked]
+                if old == new:
+                    old, new = [await talk.answer(one, tab) for one in asked]
+                    # Limits stand in a sentence of their own; the number of draws and their seed are the button's.
+                    headline = words["tabs"][tab]["headline"] and name in ("of", "power", "realisations", "seed")
+                    assert headline or {**old, "n": 0} != {**new, "n": 0}, f"{tab} shows {name}, which changes nothing"
+
+    server.visited(work)
+
+
+# Tables are those of the command line
+
+
+#: For each table of a tab: verb, flags in addition to the study, file; those of frames and standards are below.
+COMMANDS = {
+    ("detection", "detection"): ("detect", "detection"), ("detection", "roc"): ("detect", "roc"),
+    ("spectrum", "observation"): ("simulate -a 0.02", "observation-2"), ("snr", "snr"): ("snr", "snr-element"),
+    ("noise", "noise-budget"): ("snr", "noise-budget"), ("limit", "limit"): ("limit", "limit"),
+    ("limit", "map"): ("map", "map"), ("measure", "measure"): ("measure", "measure"),
+    ("measure", "fits"): ("measure", "fits"), ("change", "change"): ("change", "change"),
+    ("change", "indices"): ("change", "indices"), ("periods", "periods"): ("change", "periods"),
+    ("completeness", "completeness"): ("inject", "completeness"), ("completeness", "limits"): ("inject", "limits"),
+    **{("visibility", name): ("visible", name) for name in ("visible", "months", "days")},
+    **{("plan", name): ("plan", name) for name in ("plan", "stars", "energies", "assumptions")},
+}  # fmt: skip
+PAIRS = b"200 1\n400 3\n700 1\n"
+
+
+def star_file() -> bytes:
+    nm = np.linspace(170.0, 1000.0, 400)
+    return rows_of(nm, 1e-12 * np.exp(-(((nm - 500) / 150) ** 2)))
+
+
+def rows_of(*columns: Any) -> bytes:
+    return "\n".join(" ".join(f"{x:.9e}" for x in row) for row in zip(*columns, strict=True)).encode()
+
+
+def extracted(content: bytes, folder: Path) -> Path:
+    folder.mkdir(exist_ok=True)
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        archive.extractall(folder)
+    return folder
+
+
+def answered(folder: Path, command: str) -> dict[str, Table]:
+    """Run a command, and return the tables that it writes."""
+    words = shlex.split(command.removeprefix("mauvecl "))
+    run(*words, "--no-pictures", "--quiet", "--output", f"out-{len(list(folder.iterdir()))}", folder=folder)
+    newest = max(folder.glob("out-*"), key=lambda path: int(path.name[4:]))
+    return {path.stem: Table.read(path, format="ascii.ecsv") for path in newest.glob("*.ecsv")}
+
+
+def same_numbers(one: Table, other: Table, *names: str) -> None:
+    for name in names:
+        np.testing.assert_allclose(np.asarray(one[name]), np.asarray(other[name]), rtol=1e-9, err_msg=name)
+
+
+@pytest.mark.long
+def test_downloads_equal_the_files_of_the_command_line(server: Server, tmp_path: Path) -> None:
+    """With a study that is taken from the page, of an uploaded star and an uploaded unknown: all bytes."""
+    entered = {"realisations": "10000", "fap": "0.05", "statistic": "chi2", "magnitude": "7", "targets": "eps Eri"}
+    asked = link(**entered, star="uploaded star", own_unknown="uploaded spectrum", visits="5")
+    words = server.words()
+
+    async def work(talk: Talk) -> dict[tuple[str, str], tuple[bytes, bytes, str]]:
+        assert (await talk.upload(star_file()))["entered"] == "uploaded star"
+        assert (await talk.upload(PAIRS, "own_unknown", "stray.txt"))["entered"] == "uploaded spectrum"
+        for kind in words["asks"].keys() - {"analyse", "calibrate"}:
+            assert (await talk.simulate(kind, asked)).startswith("Done"), kind
+        offered = (await talk.answer(asked))["answer"]["files"]
+        tables = {tuple(one.split()) for one in offered if not one.endswith((".pdf", ".html"))}
+        assert tables == COMMANDS.keys()
+        found = {}
+        for (tab, name), (verb, _) in COMMANDS.items():
+            _, table = await talk.file(link=asked, tab=tab, name=name, ending="ecsv")
+            said = await talk.exported(asked, tab)
+            (question,) = (name for name, one in said.items() if one["command"].split()[1] == verb.split()[0])
+            file, study = await talk.file(link=asked, tab="", name=question, ending="study")
+            assert file.endswith(".zip" if "star" in SHOWN[tab] else ".toml")
+            found[tab, name] = table, study, question
+        return found
+
+    done: dict[tuple[str, str], Path] = {}
+    for (tab, name), (table, study, question) in server.visited(work).items():
+        assert b"mauvecl-page" not in table + study, "what an upload is called on the server appears nowhere"
+        command, written = COMMANDS[tab, name]
+        verb, *flags = command.split()
+        folder = tmp_path / f"{question}-{verb}"
+        if (verb, question) not in done:
+            done[verb, question] = folder
+            if study[:2] == b"PK":
+                assert sorted(path.name for path in extracted(study, folder).iterdir()) == ["star.ecsv", "study.toml"]
+            else:
+                folder.mkdir()
+                (folder / "study.toml").write_bytes(study)
+            run(verb, "study.toml", *flags, "--no-pictures", "-q", "-o", "out", folder=folder)
+        assert (folder / "out" / f"{written}.ecsv").read_bytes() == table, name
+    # From another folder the table finds its star again, and no other file of that name.
+    folder = done["detect", "detection"]
+    again = Study.read(folder / "out" / "detection.ecsv")
+    assert again.star[0].file == (folder / "star.ecsv").resolve()
+    (folder / "star.ecsv").write_bytes(star_file())
+    with refused("file", value="star.ecsv"):
+        Study.read(folder / "out" / "detection.ecsv")
+
+
+@pytest.mark.parametrize("unknown", long_but(["nothing", "the usual"], "nothing"))
+def test_one_simulation_gives_both_numbers(server: Server, unknown: str, tmp_path: Path) -> None:
+    """Compare all bits with `detect` with and without the usual unknowns, asked by the printed command and study."""
+    entered = {"star": "M3V", "magnitude": "9", "realisations": "10000", "fap": "0.05"}
+
+    async def work(talk: Talk) -> None:
+        asked = link(**entered, unknown=unknown)
+        await talk.simulate("detection", asked)
+        numbers = (await talk.answer(asked))["answer"]["numbers"]
+        _, roc = await talk.file(link=asked, tab="detection", name="roc", ending="fits")
+        assert roc.startswith(b"SIMPLE")
+        for one in numbers:
+            printed = await talk.exported(link(**entered, unknown=one["unknown"]))
+            table = answered(tmp_path, printed["detection"]["command"])["detection"]
+            (row,) = (row for row in table if row["statistic"] == "matched")
+            assert one["value"] == row["probability"]
+            assert "of 10,000 simulated" in one["interval"]
+
+    server.visited(work)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("tab", [name for name in SHOWN if name not in ("analyse", "calibrate", "measure", "periods")])
+def test_printed_commands_give_the_numbers_of_the_page(tab: str, tmp_path: Path) -> None:
+    """Run the command of a random question for each tab; `tools/check_commands.py` runs twenty.
+
+    This detects a page and a command line that compute something else from the same question; answers with files of the
+    visitor's, fits and periods, which are slow, are compared in other tests.
+    """
+    generator = np.random.default_rng([3, len(tab)])
+    state, closed = check_commands.possible_question(generator, check_commands.TABS[tab], tmp_path, quick=True)
+    assert check_commands.differences(check_commands.TABS[tab], state, closed, tmp_path) == []
+
+
+@pytest.mark.long
+def test_comparison_notices_another_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tab = check_commands.TABS["spectrum"]
+    state, closed = check_commands.possible_question(np.random.default_rng(5), tab, tmp_path)
+    original = check_commands.commands_and_programs
+
+    def reseeded(*how: Any) -> list[dict[str, str]]:
+        return [one | {"command": re.sub(r"--seed \d+", "--seed 99", one["command"])} for one in original(*how)]
+
+    monkeypatch.setattr(check_commands, "commands_and_programs", reseeded)
+    assert check_commands.differences(tab, state, closed, tmp_path)
+
+
+def test_bibtex_cites_what_the_citation_file_cites(server: Server) -> None:
+    _, html = server.fetched()
+    (text,) = re.findall(r"@software.*?@article.*?\n}", html.replace("&#34;", '"'), re.DOTALL)
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert text.count("{") == text.count("}")
+    for entry in (cited, *cited["references"]):
+        assert f"title = {{{entry['title']}}}" in text
+        assert all(one.get("family-names", one.get("name")) in text for one in entry["authors"])
+    assert f"version = {{{cited['version']}}}" in text
+    paper = cited["references"][0]
+    for value in (paper["journal"], str(paper["year"]), paper["url"], str(cited["date-released"])[:4]):
+        assert f"{{{value}}}" in text
+
+
+# Spectra of the visitor's
+
+
+#: Few draws: threshold and probability of both ways are of equal draws.
+FEW = {"realisations": "10000", "fap": "0.05"}
+DIRECT = (
+    "--realisations 10000 --fap 0.05 --temperature 21 --statistic chi2 --statistic chi2_element --statistic matched"
+)
+
+
+async def taken(talk: Talk, asked: str, tab: str, folder: Path) -> str:
+    """Extract the study of a tab's first question, and return its printed command."""
+    question, printed = next(iter((await talk.exported(asked, tab)).items()))
+    _, content = await talk.file(link=asked, tab="", name=question, ending="study")
+    extracted(content, folder)
+    return printed["command"]
+
+
+def test_own_star_and_unknown_are_in_the_study_that_the_command_names(server: Server, tmp_path: Path) -> None:
+    """No flag holds a visitor's file: what observes it is asked by the study, next to which the file lies."""
+
+    async def work(talk: Talk) -> None:
+        await talk.upload(rows_of(np.arange(170, 1001), np.full(831, 1e-12)))
+        await talk.upload(b"# nm DN\n200 1\n450 3.5\n700 1\n", "own_unknown", "stray.txt")
+        asked = link(star="uploaded star", own_unknown="uploaded spectrum")
+        assert "your own star" in (await talk.answer(asked))["answer"]["words"]
+        for tab, shown in SHOWN.items():
+            for one in (await talk.exported(asked, tab)).values() if "star" in shown else ():
+                assert re.fullmatch(r"mauvecl \w+ study\.toml", one["command"])
+                assert "'file': 'star.ecsv'" in one["python"]
+        await taken(talk, asked, "detection", tmp_path)
+
+    server.visited(work)
+    study = Study.read(tmp_path / "study.toml")
+    assert study.star[0].file == tmp_path / "star.ecsv"
+    assert study.nuisances.own["own"].points == ((200.0, 1.0), (450.0, 3.5), (700.0, 1.0))
+
+
+def test_own_flare_answers_as_its_file(server: Server, tmp_path: Path) -> None:
+    """In Angstrom, continued by a blackbody: as the command line reads it itself, and as the study of the page."""
+    nm = np.linspace(300.0, 690.0, 800)
+    content = rows_of(10 * nm, np.exp(-(((nm - 350) / 60) ** 2)))
+    (tmp_path / "own.txt").write_bytes(content)
+    entered = {"flare_file": FILE, "flare_wavelength_unit": "Angstrom", "continue_at_k": "9000"} | FEW
+
+    async def work(talk: Talk) -> tuple[float, float, str]:
+        await talk.upload(content, "flare_file", "own.txt", link(**entered))
+        command = await taken(talk, link(**entered), "detection", tmp_path)
+        chances = [(await talk.chances(one))[0] for one in (link(**entered), link(**entered | {"flare_file": ""}))]
+        return *chances, command
+
+    chance, other, command = server.visited(work)
+    assert command == "mauvecl detect study.toml"
+    direct = f"detect --star G2V --magnitude 8.5 --amplitude 0.02 {DIRECT} --flare-file own.txt "
+    direct += "--flare-wavelength-unit Angstrom --continue-at 9000"
+    one, two = (answered(tmp_path, words)["detection"] for words in (command, direct))
+    same_numbers(one, two, "threshold", "probability")
+    assert one["probability"][list(one["statistic"]).index("matched")] == pytest.approx(chance, abs=0.03)
+    assert abs(chance - other) > 0.01, "the flare is another one than without the file"
+
+
+def test_observed_flare_without_its_star_answers_as_its_files(server: Server, tmp_path: Path) -> None:
+    """As bright as observed, in Angstrom: as the command line subtracts the star, and as the study of the page."""
+    units = {"flare_wavelength_unit": "Angstrom", "flare_flux_unit": "erg s-1 cm-2 Angstrom-1"}
+    entered = {"flare_file": FILE, "flare_quiescent": FILE, "continue_at_k": "9000", "amplitude_percent": "77"}
+    asked = link(**units, **entered, **FEW, as_observed="yes")
+    contents = {}
+    for field, nm in (("flare_file", np.linspace(300.0, 690.0, 800)), ("flare_quiescent", np.linspace(290, 680, 500))):
+        flux = 1e-12 * np.ones(nm.size) + (1e-13 * (350 / nm) ** 2 if field == "flare_file" else 0.0)
+        contents[field] = rows_of(10 * nm, flux)
+        (tmp_path / f"{field}.txt").write_bytes(contents[field])
+
+    async def work(talk: Talk) -> tuple[str, str, list[float]]:
+        for field, content in contents.items():
+            await talk.upload(content, field, f"{field}.txt", asked)
+        words = (await talk.answer(asked))["answer"]["words"]
+        # Without the subtraction the flare is another one, and so it is with an amplitude.
+        observed = units | entered | {"as_observed": "yes"}
+        others = ({}, {"flare_quiescent": ""}, {"as_observed": "no"})
+        chances = [(await talk.chances(link(**observed | one)))[0] for one in others]
+        assert (await talk.exported(asked, "measure"))["measure"]["command"] == "mauvecl measure study.toml"
+        return await taken(talk, asked, "detection", tmp_path), words, chances
+
+    command, words, chances = server.visited(work)
+    amplitude = Study.read(tmp_path / "study.toml").flare.amplitudes[0]
+    (told,) = re.findall(r"a ([\d.]+) % flare", words)
+    assert float(told) == pytest.approx(100 * amplitude, rel=1e-4)
+    direct = f"detect --star G2V --magnitude 8.5 {DIRECT} --flare-file flare_file.txt --as-observed --flare-quiescent "
+    direct += "flare_quiescent.txt --continue-at 9000 --flare-wavelength-unit Angstrom "
+    direct += "--flare-flux-unit 'erg s-1 cm-2 Angstrom-1'"
+    one, two = (answered(tmp_path, words)["detection"] for words in (command, direct))
+    same_numbers(one, two, "amplitude", "threshold", "probability")
+    assert min(abs(chances[0] - other) for other in chances[1:]) > 0.01
+
+
+@pytest.mark.long
+def test_own_added_spectrum_answers_as_its_file(server: Server, tmp_path: Path) -> None:
+    """In Angstrom, for a band: as the command line reads it itself, and as the command that the page prints."""
+    nm = np.linspace(170.0, 1000.0, 800)
+    content = rows_of(10 * nm, np.exp(-(((nm - 300) / 80) ** 2)))
+    (tmp_path / "own.txt").write_bytes(content)
+    entered = {"change_file": FILE, "change_wavelength_unit": "Angstrom", "changes": "Mg II", "magnitude": "7"}
+    asked = link(**entered, change_band="B")
+
+    async def work(talk: Talk) -> tuple[str, Table, Table]:
+        await talk.upload(content, "change_file", "own.txt", asked)
+        tables = []
+        for one in (asked, link(**entered)):
+            await talk.simulate("change", one)
+            _, table = await talk.file(link=one, tab="change", name="change", ending="ecsv")
+            tables.append(Table.read(table.decode(), format="ascii.ecsv"))
+        return await taken(talk, asked, "change", tmp_path), *tables
+
+    command, page, other = server.visited(work)
+    assert list(page["change"]) == ["Mg II", "spectrum"]
+    assert "--change-file added.ecsv --change-band B" in command
+    direct = "change --star G2V --magnitude 7 --temperature 21 --sky 22.1 --visits 20 --change 'Mg II' --change "
+    direct += "spectrum --change-file own.txt --change-wavelength-unit Angstrom --change-band B"
+    for words in (command, "change study.toml", direct):
+        same_numbers(answered(tmp_path, words)["change"], page, "error", "smallest")
+    # Another band is another answer: that of the light in V.
+    assert abs(other["smallest"][1] / page["smallest"][1] - 1) > 0.01
+
+
+def test_neighbours_of_the_page_are_those_of_the_command_line(server: Server, tmp_path: Path) -> None:
+    """A Gaia table whose first row is the star itself dilutes the page's chance as it does that of `detect`."""
+    table = 'designation,ra,dec,phot_g_mean_mag,bp_rp\n"Gaia DR3 1",150.0,60.0,9,2.1\n"Gaia DR3 2",150.0,60.003,8,0.8\n'
+    entered = {"star": "M3V", "magnitude": "9", "amplitude_percent": "2"}
+    near = {"neighbours": table, "neighbours_of": "Gaia DR3 1"}
+
+    async def work(talk: Talk) -> tuple[list[float], str]:
+        asked = [link(**entered | more) for more in ({}, near, near | {"neighbour_share": "0"})]
+        found = [(await talk.chances(one))[0] for one in asked]
+        return found, await taken(talk, link(**entered, **near, **FEW), "detection", tmp_path)
+
+    (alone, blended, none_of_it), command = server.visited(work)
+    assert alone == none_of_it
+    assert blended < alone - 0.004
+    assert "--neighbours neighbours.csv --neighbours-of 'Gaia DR3 1'" in command
+    (one, two) = (answered(tmp_path, words)["detection"] for words in (command, "detect study.toml"))
+    same_numbers(one, two, "threshold", "probability")
+    assert round(Study.read(tmp_path / "study.toml").star[0].near().stars[0].separation_arcsec, 3) == 10.8  # type: ignore[union-attr]
+
+
+# Uploads that cannot be used
+
+
+WIDE = "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: w, datatype: float64}\n# meta:\n#   a0: &a0 [x, x, x, x, x, x, x]\n"
+ALIASES = "".join(f"#   a{i}: &a{i} [{', '.join(8 * [f'*a{i - 1}'])}]\n" for i in range(1, 9))
+BOMBS: dict[str, Callable[[], bytes]] = {
+    "bzip2 of zeros": lambda: bz2.compress(bytes(2**28)),
+    "gzip twice": lambda: gzip.compress(gzip.compress(bytes(2**28))),
+    "xz of zeros": lambda: lzma.compress(bytes(2**27), preset=0),
+    "YAML aliases": lambda: f"{WIDE}{ALIASES}w\n1\n".encode(),
+    "deep YAML": lambda: b"# %ECSV 1.0\n# ---\n# meta: " + b"[" * 200_000 + b"\n",
+    "XML entities": lambda: b'<?xml version="1.0"?><!DOCTYPE l [<!ENTITY a "b">]><VOTABLE>&a;</VOTABLE>',
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("bomb", BOMBS)
+def test_decompression_bombs_are_refused_early(server: Server, bomb: str) -> None:
+    async def work(talk: Talk) -> None:
+        before, memory = server.spent(readers=True), server.memory()
+        reported = await talk.upload(BOMBS[bomb](), name="star.fits")
+        assert ", expected " in reported["lacks"]
+        assert "\n" not in reported["lacks"]
+        # Processor time is the same on a busy machine: 3 s with the start of Python.
+        assert server.spent(readers=True) - before < 10.0
+        assert server.memory() - memory < 100.0
+
+    server.visited(work)
+
+
+#: Uploads that are refused: field, content, words of the sentence.
+UNUSABLE: list[tuple[str, bytes, str]] = [
+    ("star", b"", ""),
+    ("star", b"200 1\n300 2 3\n", ""),
+    ("star", b"SIMPLE  = " * 300, ""),
+    ("star", b"200 1e-12\n300 <script>\n", "is not numeric"),
+    *[("own_unknown", content, "") for content in (
+        b"", b"200 1\n", b"200 1 2\n300 1 2\n", b"300 1\n200 1\n", b"\xff\xfe", b"a b\nc d\n", b"1 1\n2 nan\n",
+        rows_of(np.arange(1.0, 4002.0), np.ones(4001)),
+    )],
+]  # fmt: skip
+
+
+def test_unusable_spectra_leave_no_answer(server: Server) -> None:
+    """Whatever was there before; a message on a file names the fields of this file, and what they advise works."""
+    angstrom = rows_of(np.arange(1700.0, 10_001.0, 10), np.full(831, 1e-12))
+
+    async def work(talk: Talk) -> None:
+        asked = {"star": "uploaded star", "own_unknown": "uploaded spectrum"}
+        for field, content, reported in UNUSABLE:
+            good = star_file() if field == "star" else PAIRS
+            assert (await talk.upload(good, field))["entered"] == asked[field]
+            assert "answer" in await talk.answer(link(**{field: asked[field]}))
+            why = (await talk.upload(content, field, "my ![star](http://x/y.png).txt"))["lacks"]
+            assert reported in why
+            assert "expected" in why
+            faults = await talk.faults(link(**{field: asked[field]}))
+            assert "its file again" in faults[field], content
+            refused = await talk.ask("file", "refused", link=link(**{field: asked[field]}), tab="spectrum",
+                                     name="observation", ending="ecsv")  # fmt: skip
+            assert "expected" in refused["refused"]
+        assert "entered" in await talk.upload(gzip.compress(star_file()), name="a.exe"), "its content shows what it is"
+        for field, option in (
+            ("star", "wavelength_unit"), ("flare_file", "flare_wavelength_unit"),
+            ("flare_quiescent", "flare_wavelength_unit"), ("change_file", "change_wavelength_unit"),
+        ):  # fmt: skip
+            told = await talk.upload(angstrom, field)
+            assert told["remedies"] == [[option, "Angstrom"]], told
+            assert "nit of wavelengths Angstrom" in told["lacks"]
+            assert "entered" in await talk.upload(angstrom, field, link=link(**{option: "Angstrom"}))
+        # One file as the flare and as the star without it: nothing is left, continued by a blackbody or not.
+        nm = np.arange(170.0, 1001.0)
+        units = {"flare_wavelength_unit": "nm", "flare_flux_unit": "erg s-1 cm-2 Angstrom-1"}
+        for continued in ("", "9000"):
+            same = link(flare_file=FILE, flare_quiescent=FILE, continue_at_k=continued, **units)
+            for field in ("flare_file", "flare_quiescent"):
+                await talk.upload(rows_of(nm, 1e-12 * (1 + 0.1 * np.sin(nm))), field, "same.txt", same)
+            for tab in ("detection", "measure"):
+                reported = await talk.answer(same, tab)
+                assert "answer" not in reported
+                assert "is no brighter than uploaded star without the flare" in reported["faults"]["flare_quiescent"]
+
+    server.visited(work)
+
+
+# Frames of the visitor's
+
+
+MAPPING = b'time = "minute"\ntime_unit = "min"\nflux = "rate"\nerror = "sd"\n'
+OWN = {"frames": FILE, "mapping": FILE, "false_alarms": "1", "per": "day"}
+
+
+def light_curve(*, flags: bool = False) -> bytes:
+    """Return a CSV file of 200 frames with a flare of 20 standard deviations, and three flags if they are wanted."""
+    time = np.arange(200) / 6
+    flux = 100 + np.random.default_rng(29).normal(size=200) + 20 * np.exp(-(((time - 15) / 0.8) ** 2))
+    flag = {50: 1, 60: 2, 70: 4}
+    rows = [f"{t},{y},1" + f",{flag.get(k, 0)}" * flags for k, (t, y) in enumerate(zip(time, flux, strict=True))]
+    return "\n".join(["minute,rate,sd" + ",flag" * flags, *rows, ""]).encode()
+
+
+async def given_frames(talk: Talk, frames: bytes, mapping: bytes | None, name: str = "my curve.csv") -> None:
+    assert (await talk.upload(frames, "frames", name))["entered"] == FILE
+    if mapping is not None:
+        assert (await talk.upload(mapping, "mapping", "curve.toml"))["entered"] == FILE
+
+
+@pytest.mark.long
+def test_uploaded_frames_are_analysed_as_on_the_command_line(server: Server, tmp_path: Path) -> None:
+    async def work(talk: Talk) -> tuple[str, dict[str, Table]]:
+        await given_frames(talk, light_curve(), MAPPING)
+        assert (await talk.simulate("analyse", link(**OWN))).startswith("Done")
+        drawn = await talk.answer(link(**OWN), "analyse")
+        assert "1 detected" in drawn["pictures"]["frames"]["text"]
+        assert "A light curve has no spectra." in drawn["pictures"]["dynamic"]["text"]
+        offered = [one.split()[1] for one in drawn["answer"]["files"] if one.startswith("analyse ")]
+        tables = {}
+        for name in offered:
+            ending = "" if name.endswith(".html") else "ecsv"
+            _, content = await talk.file(link=link(**OWN), tab="analyse", name=name, ending=ending)
+            assert b"mauvecl-page" not in content, "nothing names a folder of the server"
+            if ending:
+                tables[name] = Table.read(content.decode(), format="ascii.ecsv")
+            else:
+                assert b"<!doctype html>" in content
+        assert "measured" not in tables
+        told = await talk.ask("file", "refused", link=link(**OWN), tab="analyse", name="measured", ending="ecsv")
+        assert told["refused"]
+        detected = [row for row in drawn["rows"] if "detected" in row]
+        assert len(detected) == 1
+        return await taken(talk, link(**OWN), "analyse", tmp_path), tables
+
+    command, tables = server.visited(work)
+    assert command.startswith("mauvecl analyse my_curve.csv ")
+    assert "--mapping curve.toml" in command
+    assert "--alarms-per day" in command
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["curve.toml", "my_curve.csv", "study.toml"]
+    assert (tmp_path / "my_curve.csv").read_bytes() == light_curve()
+    assert Study.read(tmp_path / "study.toml").data.file == tmp_path / "my_curve.csv"
+    for words in (command, "analyse study.toml"):
+        found = answered(tmp_path, words)
+        for name, table in tables.items():
+            assert found[name].colnames == table.colnames
+            assert len(found[name]) == len(table)
+            for one in table.colnames:
+                assert list(map(str, found[name][one])) == list(map(str, table[one])), (name, one)
+
+
+def test_quality_bits_are_chosen_as_on_the_command_line(server: Server) -> None:
+    """Three frames with the flags 1, 2 and 4; the same file is read again for other bits."""
+
+    async def work(talk: Talk) -> None:
+        await given_frames(talk, light_curve(flags=True), MAPPING + b'quality = "flag"\n')
+        for bits, left_out in (("", 3), ("none", 0), ("all", 3), ("4", 1), ("1,2", 2)):
+            asked = link(**OWN, quality_bits=bits)
+            assert len(column(await talk.answer(asked, "analyse"), "frames", "left out", "x")) == left_out
+            command = (await talk.exported(asked, "analyse"))["analyse"]["command"]
+            assert (f"--quality-bits {bits}" in command) == bool(bits)
+        told = await talk.answer(link(**OWN, quality_bits="NoSuchBit"), "analyse")
+        assert "NoSuchBit" in str(told["faults"]) + str(told.get("refused"))
+
+    server.visited(work)
+
+
+UNREADABLE: list[tuple[bytes, bytes | None, str]] = [
+    (light_curve(), None, "mapping"),
+    (b"minute,rate\n1,2\n", MAPPING, "sd"),
+    (light_curve(), b"time = [", "TOML"),
+    (b"\x89PNG\r\n", None, "text in UTF-8"),
+    (light_curve(), b'time = "minute"\nflux = "/etc/passwd"\n', "rate"),
+    (light_curve(), MAPPING + b'wavelength_file = "/etc/passwd"\n', "passwd"),
+]
+
+
+@pytest.mark.parametrize("number", long_but(range(len(UNREADABLE)), 0))
+def test_unusable_frames_end_in_a_sentence(server: Server, number: int) -> None:
+    frames, mapping, words = UNREADABLE[number]
+
+    async def work(talk: Talk) -> None:
+        await given_frames(talk, frames, mapping)
+        reported = await talk.answer(link(**OWN | {"mapping": FILE if mapping else ""}), "analyse")
+        assert reported["faults"].keys() == {"frames"}, reported
+        assert words in reported["faults"]["frames"]
+        assert "mauvecl-page" not in reported["faults"]["frames"]
+        assert "\n" not in reported["faults"]["frames"]
+
+    server.visited(work)
+
+
+def test_names_of_files_are_plain(server: Server, tmp_path: Path) -> None:
+    async def work(talk: Talk) -> None:
+        for number, name in enumerate(("../../etc/passwd", "C:\\Users\\me\\passwd", "", "..", "a\nb;$(x) ü.csv", "-rf",
+                                       "x" * 300)):  # fmt: skip
+            await given_frames(talk, light_curve(), MAPPING, name)
+            folder = tmp_path / str(number)
+            await taken(talk, link(**OWN), "analyse", folder)
+            (kept,) = {path.name for path in folder.iterdir()} - {"study.toml", "curve.toml"}
+            assert re.fullmatch(r"[A-Za-z0-9_+][A-Za-z0-9._+-]{0,79}", kept)
+            assert (folder / kept).read_bytes() == light_curve()
+        assert "expected" in (await talk.upload(bytes(2**24 + 1), "frames", "large"))["lacks"]
+
+    server.visited(work)
+
+
+# Standards of the visitor's
+
+
+#: The star of the file is half a magnitude fainter in it than it was observed.
+STUDY = """
+[[calibrate.observations]]
+frames = "nights/b3v.fits"
+mapping = "frames.toml"
+spectrum = "b3v.ecsv"
+magnitude = 4.5
+
+[[calibrate.observations]]
+frames = "dark.fits"
+mapping = "frames.toml"
+"""
+STANDARDS = link(observations=FILE)
+
+
+def fits_of(source: Source | None, temperatures: list[float], seed: int) -> bytes:
+    frames = frames_of(truth(), source, temperatures, 20, np.random.default_rng(seed))
+    times = Table({"TIME": frames.time_s, "TEMPERATURE": frames.temperature_c})
+    assert frames.wavelength_nm is not None
+    images = [fits.ImageHDU(frames.flux, name="RAW"), fits.ImageHDU(frames.wavelength_nm, name="WAVELENGTH")]
+    out = io.BytesIO()
+    fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU(times, name="FRAMES"), *images]).writeto(out)
+    return out.getvalue()
+
+
+def standards() -> dict[str, bytes]:
+    """Return the files of a visitor by name."""
+    fainter = star("B3V", 5.0)
+    table = Table({"wavelength": fainter.wavelength_nm, "flux": fainter.flux_flam})
+    table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
+    text = io.StringIO()
+    table.write(text, format="ascii.ecsv")
+    return {
+        "standards.toml": STUDY.encode(), "frames.toml": RAW.encode(), "b3v.ecsv": text.getvalue().encode(),
+        "b3v.fits": fits_of(star("B3V", 4.5), [17.0], 1), "dark.fits": fits_of(None, [15.0, 17.0, 19.0], 2),
+    }  # fmt: skip
+
+
+def zipped(contents: dict[str, bytes], packing: int = zipfile.ZIP_DEFLATED) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", packing) as archive:
+        for name, one in contents.items():
+            archive.writestr(name, one)
+    return out.getvalue()
+
+
+@pytest.mark.long
+def test_uploaded_standards_are_fitted_as_on_the_command_line(server: Server, tmp_path: Path) -> None:
+    contents = standards()
+
+    async def work(talk: Talk) -> tuple[bytes, bytes]:
+        hidden = {"__MACOSX/._standards.toml": b"\x00", ".DS_Store": b"1", "nights/.DS_Store": b"2"}
+        before = await talk.answer("", "calibrate")
+        assert before["pictures"]["transfer"]["text"].startswith("Choose an archive")
+        await talk.upload(zipped(contents | hidden), "observations", "standards.zip")
+        assert (await talk.simulate("calibrate", STANDARDS)).startswith("Done")
+        drawn = await talk.answer(STANDARDS, "calibrate")
+        told = {name: one["text"] for name, one in drawn["pictures"].items()}
+        assert "b3v" in told["residuals"].lower()
+        assert "times the nominal one" in told["throughput"]
+        assert "DN per electron" in told["transfer"]
+        assert drawn["rows"][1][0] == "dark current"
+        printed = (await talk.exported(STANDARDS, "calibrate"))["calibrate"]
+        assert "mauvecl-page" not in printed["command"] + printed["python"]
+        _, table = await talk.file(link=STANDARDS, tab="calibrate", name="calibrate", ending="ecsv")
+        _, study = await talk.file(link=STANDARDS, tab="calibrate", name="calibrate", ending="study")
+        _, instrument = await talk.file(link=STANDARDS, tab="calibrate", name="instrument.zip", ending="")
+        assert "mauvecl-page" not in (extracted(study, tmp_path / "again") / "study.toml").read_text()
+        return table, instrument
+
+    table, instrument = server.visited(work)
+    assert b"mauvecl-page" not in table
+    here = tmp_path / "here"
+    (here / "nights").mkdir(parents=True)
+    for name, content in contents.items():
+        (here / ("nights" if name == "b3v.fits" else "") / name).write_bytes(content)
+    page = Table.read(table.decode(), format="ascii.ecsv")
+    for folder, words in ((here, "calibrate standards.toml"), (tmp_path / "again", "calibrate study.toml")):
+        found = answered(folder, words)["calibrate"]
+        assert found.colnames == page.colnames
+        for name in page.colnames:
+            assert list(map(str, found[name])) == list(map(str, page[name])), name
+    # The archive is an instrument like the shipped ones, and that of the command line.
+    shipped = Instrument.load(extracted(instrument, tmp_path / "instrument") / "instrument.toml")
+    (own,) = here.glob("out-*/**/instrument.toml")
+    nm = np.array([300.0, 500.0])
+    np.testing.assert_allclose(shipped.throughput(nm), Instrument.load(own).throughput(nm), rtol=1e-12)
+
+
+#: Changes of a sound archive's files, and the name that the refusal gives.
+BROKEN: list[tuple[dict[str, bytes | None], str]] = [
+    ({"dark.fits": None}, "dark.fits"),
+    ({"standards.toml": None}, ""),
+    ({"second.toml": STUDY.encode()}, ""),
+    ({"standards.toml": b"[calibrate\n"}, ""),
+    ({"other/frames.toml": b""}, ""),
+    ({"standards.toml": b"[calibrate]\nobservations = 3\n"}, ""),
+    ({"b3v.fits": b"nothing of the kind"}, "b3v.fits"),
+    ({"b3v.ecsv": b"nothing of the kind"}, "numbers"),
+    ({"standards.toml": f"[sky]\nnone = true\n{STUDY}".encode()}, "sky"),
+    ({"standards.toml": STUDY.encode() * 40}, ""),
+    ({"standards.toml": b"a = " + b"[" * 10_000}, ""),
+    ({"standards.toml": STUDY.encode() + b"#" * 2**18}, ""),
+]
+NUMBERS = zipped({"a.csv": b"1" * 999})
+ARCHIVES = {
+    "no archive": b"no archive",
+    "many files": zipped({f"{k}.txt": b"" for k in range(41)}),
+    "large file": zipped({"zeros": bytes(2**26 + 1)}),
+    "parent folder": zipped({"../b3v.fits": b"1"}),
+    "only a parent": zipped({"nights/..": b"1"}),
+    "absolute": zipped({"/etc/b3v.fits": b"1"}),
+    "drive": zipped({"C:\\b3v.fits": b"1"}),
+    "long name": zipped({"a" * 101: b"1"}),
+    "line break": zipped({"a\nb": b"1"}),
+    "cut off": NUMBERS[:-40],
+    "two names": NUMBERS.replace(b"a.csv", b"b.csv", 1),
+    "checksum": zipped({"a.csv": bytes(range(256))}, zipfile.ZIP_STORED).replace(b"\x10\x11", b"\x11\x10"),
+    "unbounded packing": zipped({"a.csv": b"1" * 999}, zipfile.ZIP_LZMA),
+    "too small sizes": zipped({"zeros": bytes(2**25)}).replace(struct.pack("<I", 2**25), struct.pack("<I", 9)),
+}
+
+
+def test_missing_broken_and_unbounded_archives_are_refused(server: Server) -> None:
+    contents = standards()
+
+    async def work(talk: Talk) -> None:
+        for change, value in BROKEN:
+            chosen = {name: one for name, one in (contents | change).items() if one is not None}
+            told = await talk.upload(zipped(chosen), "observations", "standards.zip")
+            if "lacks" not in told:
+                # Frames and spectra are read with the answer.
+                reported = await talk.answer(STANDARDS, "calibrate")
+                assert reported["faults"].keys() == {"observations"}, value
+                told = {"lacks": reported["faults"]["observations"]}
+            assert value in told["lacks"], told
+            assert "expected" in told["lacks"]
+        memory = server.memory()
+        for name, content in ARCHIVES.items():
+            told = await talk.upload(content, "observations", "standards.zip")
+            assert "expected" in told["lacks"], name
+            assert "its file again" in (await talk.faults(STANDARDS, "calibrate"))["observations"]
+        assert server.memory() - memory < 30.0
+
+    server.visited(work)
