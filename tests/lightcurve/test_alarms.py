@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mauvecl.lightcurve.flares.events import Event, coefficients
+from mauvecl import Event, Study
+from mauvecl.lightcurve.flares.events import coefficients
 from mauvecl.lightcurve.search.alarms import LEFT_BEHIND, alarms
 from mauvecl.study.cases import Case
-from mauvecl.study.study import Study
 from mauvecl.study.surveys import StarSurvey, survey_star
 
 #: One false alarm in a star-month at 4.91, by importance sampling, and so 5e-6 in an orbit at 6.

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from mauvecl.lightcurve.flares.events import Event, coefficients
+from mauvecl import Event, Study
+from mauvecl.lightcurve.flares.events import coefficients
 from mauvecl.lightcurve.search.alarms import QUANTITIES, Alarm, alarms
 from mauvecl.study.cases import Case
-from mauvecl.study.study import Study
 from mauvecl.study.surveys import StarSurvey, survey_star
 
 #: One false alarm in a star-month.

@@ -8,12 +8,9 @@ import pytest
 from astropy import constants
 from astropy.modeling.models import BlackBody
 
+from mauvecl import SHAPES, EnergyScale, Event, Source
 from mauvecl.host.stars.bands import band
-from mauvecl.host.stars.source import Source
 from mauvecl.lightcurve.flares import energies
-from mauvecl.lightcurve.flares.energies import EnergyScale
-from mauvecl.lightcurve.flares.events import Event
-from mauvecl.lightcurve.flares.shapes import SHAPES
 
 #: erg/s of Shibayama et al. 2013's formula by other tables of the bands, for flares of 9000 and 10 000 K.
 ELSEWHERE = [

@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 from marks import long_but
 
+from mauvecl import Cooling, EnergyScale, Event, Source, Study
 from mauvecl.host.stars.bands import band
-from mauvecl.host.stars.source import Source
-from mauvecl.lightcurve.flares.energies import EnergyScale
-from mauvecl.lightcurve.flares.events import Cooling, Event, coefficients, temperatures_of
+from mauvecl.lightcurve.flares.events import coefficients, temperatures_of
 from mauvecl.study.cases import Case
 from mauvecl.study.sections import Flare, SkyLight, Star
 from mauvecl.study.stare_expectation import energy_of
 from mauvecl.study.stare_section import EventChoice
-from mauvecl.study.study import Study
 
 STARS = ("A0V", "A7V", "F5V", "G2V", "K1V", "K5V", "M0V", "M3V", "M5V", "Sun")
 BANDS = ("Kepler", "TESS", "V", "B", "Gaia G", "Gaia BP", "GALEX NUV")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from refusals import refused
 
+from mauvecl import SHAPES, Cooling, Event
 from mauvecl.host.stars.blackbody import blackbody
-from mauvecl.lightcurve.flares.events import Cooling, Event, check_contributions, coefficients, temperatures_of
-from mauvecl.lightcurve.flares.shapes import SHAPES
+from mauvecl.lightcurve.flares.events import check_contributions, coefficients, temperatures_of
 
 START = np.arange(400) * 5.0
 

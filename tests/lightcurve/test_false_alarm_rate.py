@@ -7,6 +7,7 @@ import pytest
 from scipy import special
 from searches import DAVENPORT, KNOWN, ONE
 
+from mauvecl import Stare
 from mauvecl.lightcurve.defaults import HALF_WIDTHS_S
 from mauvecl.lightcurve.search.bank import Bank, Baseline
 from mauvecl.lightcurve.search.completeness import default_bank, search_threshold
@@ -14,7 +15,6 @@ from mauvecl.lightcurve.search.counted_rate import CountedRate
 from mauvecl.lightcurve.search.false_alarm_rate import TemplateGrid
 from mauvecl.lightcurve.search.importance_sampling import sample_rate
 from mauvecl.lightcurve.search.search import Search
-from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.schema.physical import DAY_S
 
 

@@ -8,9 +8,9 @@ from refusals import refused
 from scenes import instrument, star
 from scipy.integrate import quad
 
+from mauvecl import Sinusoid, Stare
 from mauvecl.lightcurve.defaults import ORBIT_S
-from mauvecl.lightcurve.stares.curves import Curve, Sinusoid
-from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.lightcurve.stares.curves import Curve
 
 
 def test_frames_skip_gaps():

@@ -11,7 +11,7 @@ import pytest
 from scipy import special
 from searches import DAVENPORT, KNOWN, ONE, consecutive_alarms, spectra, survey
 
-from mauvecl.device.stare_engine import Stares
+from mauvecl import CosmicRays, Processes, Stare, Stares
 from mauvecl.lightcurve.search import injection_sites
 from mauvecl.lightcurve.search.bank import Bank, Baseline
 from mauvecl.lightcurve.search.counted_rate import consecutive_alarm_rate
@@ -20,8 +20,6 @@ from mauvecl.lightcurve.search.importance_sampling import sample_rate
 from mauvecl.lightcurve.search.injection_sites import OVERLAP, sites_of
 from mauvecl.lightcurve.search.injections import Injections
 from mauvecl.lightcurve.search.search import Search
-from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.noise.processes import CosmicRays, Processes
 from mauvecl.results.requests.requests import Shard
 from mauvecl.runs.shards import fingerprint
 

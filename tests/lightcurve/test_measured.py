@@ -12,6 +12,7 @@ import scipy
 from refusals import refused
 
 from mauvecl import (
+    SHAPES,
     Cooling,
     Engine,
     Event,
@@ -26,8 +27,7 @@ from mauvecl import (
     fit,
     fit_cooling,
     measure_along,
-)  # fmt: skip
-from mauvecl.lightcurve.flares.shapes import shape_of
+)
 from mauvecl.lightcurve.stares import cooling_fit
 
 MAUVE = Instrument.load("mauve")
@@ -233,7 +233,7 @@ def noisy_frames(scale: float) -> np.ndarray:
 def test_derivatives_of_joint_fits_agree_with_differences(shape: str) -> None:
     nuisances = Nuisances.of(quiet(), {"dark": np.inf, "light": 0.02})
     stare = Stare.of(300.0, throughput=Sinusoid(0.2, 300.0))
-    data = cooling_fit._data(noisy_frames(1.0), quiet(), model(), nuisances, stare, shape_of(shape), ())
+    data = cooling_fit._data(noisy_frames(1.0), quiet(), model(), nuisances, stare, SHAPES[shape], ())
     theta = np.array([52.3, *np.log([41.0, 1.4, 13_000.0, 0.5, 70.0])])
     whitening, steps = data.whitening(theta), np.diag([4e-4, *[1e-5] * 5])
     moved = [(data.residuals(theta + step, whitening), data.residuals(theta - step, whitening)) for step in steps]
@@ -266,7 +266,7 @@ def test_ends_of_joint_fits_agree_with_a_search(scale: float, monkeypatch: pytes
 
 def test_flare_without_cooling_has_no_newton_step() -> None:
     """Check an end temperature equal to that at the peak, where the cooling time has no effect."""
-    data = cooling_fit._data(noisy_frames(1.0), quiet(), model(), None, Stare.of(300.0), shape_of("davenport2014"), ())
+    data = cooling_fit._data(noisy_frames(1.0), quiet(), model(), None, Stare.of(300.0), SHAPES["davenport2014"], ())
     theta = np.array([52.0, *np.log([40.0, 1.5, 12_000.0, 1.0, 80.0])])
     whitening, limits = data.whitening(theta), (np.full(6, -np.inf), np.full(6, np.inf))
     chi2 = float(np.sum(data.residuals(theta, whitening) ** 2))

@@ -8,15 +8,13 @@ from refusals import refused
 from scipy import special
 from searches import DAVENPORT, KNOWN, ONE, consecutive_alarms, survey
 
-from mauvecl.device.stare_engine import Stares
+from mauvecl import Sinusoid, Stare, Stares
 from mauvecl.lightcurve.defaults import DAYS, per_day
 from mauvecl.lightcurve.search.bank import Bank, Baseline
 from mauvecl.lightcurve.search.counted_rate import CountedRate, consecutive_alarm_rate
 from mauvecl.lightcurve.search.importance_sampling import LADDER, sample_rate
 from mauvecl.lightcurve.search.sampled_rate import draw_shifts
 from mauvecl.lightcurve.search.search import Search
-from mauvecl.lightcurve.stares.curves import Sinusoid
-from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.study.searches import SearchChoice
 
 

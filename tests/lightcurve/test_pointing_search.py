@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mauvecl.device.stare_engine import Stares
+from mauvecl import Stares, Study
 from mauvecl.lightcurve.search.sampled_rate import sampled_rate
 from mauvecl.lightcurve.search.survey import Survey
 from mauvecl.noise.pointing import PointingDrifts
 from mauvecl.study.cases import Case, cases
-from mauvecl.study.study import Study
 from mauvecl.study.surveys import survey_star
 
 #: Heavy drifts: a quarter of the time, all of the light at worst.

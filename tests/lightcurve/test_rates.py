@@ -1,5 +1,7 @@
 """Rates of flares: published relations, AltaiPony's convention, tables, other bands, and recovery."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +9,8 @@ import pytest
 from refusals import refused
 from scipy import stats
 
-from mauvecl.lightcurve.flares.energies import EnergyScale, in_band
+from mauvecl import SHAPES, EnergyScale
+from mauvecl.lightcurve.flares.energies import in_band
 from mauvecl.lightcurve.flares.rates import (
     PowerLaw,
     RateTable,
@@ -17,7 +20,6 @@ from mauvecl.lightcurve.flares.rates import (
     preset,
     sunlike,
 )
-from mauvecl.lightcurve.flares.shapes import shape_of
 from mauvecl.lightcurve.search.completeness import (
     HALF_WIDTHS_S,
     Completeness,
@@ -112,12 +114,12 @@ def test_yield_with_scatter_agrees_with_simulation() -> None:
 
 def test_gain_in_a_long_stretch_equals_the_closed_form() -> None:
     """Compare with sqrt(.72148 t_half / 5 s) far from the ends (TIME.md, section 4); a fitted line costs little."""
-    widths, gain = _gains(shape_of("davenport2014"), 20_000.0, 5.0)
+    widths, gain = _gains(SHAPES["davenport2014"], 20_000.0, 5.0)
     i = int(np.argmin(np.abs(widths - 60.0)))
     middle = gain[i, 6:18]
     assert middle == pytest.approx(np.sqrt(0.72148 * widths[i] / 5.0), rel=0.02)
     # Flares much longer than the stretch are but lines.
-    short = _gains(shape_of("davenport2014"), 600.0, 5.0)[1]
+    short = _gains(SHAPES["davenport2014"], 600.0, 5.0)[1]
     assert short[-1].max() < 0.2 * np.sqrt(0.72148 * HALF_WIDTHS_S[1] / 5.0)
 
 
@@ -127,7 +129,7 @@ def test_closed_form_completeness_agrees_with_white_noise() -> None:
     2000 stretches: three standard deviations are 3.4 % at most; of five energies one misses them once in some 70 tests
     with other seeds; this one is fixed.
     """
-    shape, window, frame, law = shape_of("davenport2014"), 1500.0, 5.0, DurationLaw(scatter_dex=0.0)
+    shape, window, frame, law = SHAPES["davenport2014"], 1500.0, 5.0, DurationLaw(scatter_dex=0.0)
     scale = EnergyScale.shibayama2013(1.0, 5778.0, flare_k=10_000.0)
     signal, alarms = 300.0, 1 / 30
     form = Completeness.of_search(signal, scale, window_s=window, false_alarms_per_day=alarms, law=law)

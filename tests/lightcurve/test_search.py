@@ -7,10 +7,10 @@ import pytest
 from scipy import special
 from searches import DAVENPORT, KNOWN, ONE
 
+from mauvecl import Stare
 from mauvecl.lightcurve.defaults import HALF_WIDTHS_S
 from mauvecl.lightcurve.search.bank import Bank, Baseline
 from mauvecl.lightcurve.search.search import Search
-from mauvecl.lightcurve.stares.stare import Stare
 
 
 def filtered(search, sums, curves):

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from mauvecl.lightcurve.flares.shapes import SHAPES, Fiducial, TableShape, half_width_of_altaipony
+from mauvecl import SHAPES, TableShape
+from mauvecl.lightcurve.flares.shapes import Fiducial, half_width_of_altaipony
 
 #: Where each shape has a kink or a step.
 KINKS = {"davenport2014": [-1.0, 0.0], "tovarmendoza2022": [0.0], "fiducial": [0.0, Fiducial.BOX], "table": [0.0, 1.0]}

@@ -7,8 +7,8 @@ import pytest
 from refusals import refused
 from searches import spectra
 
+from mauvecl import Stare
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates, frame_nuisances
-from mauvecl.lightcurve.stares.stare import Stare
 
 CASES = {
     "known": {},

@@ -12,10 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mauvecl import Instrument, ObservedFlare, Source, Study, analyse, expect
+from mauvecl import SHAPES, Frames, Instrument, ObservedFlare, Source, Study, analyse, expect
 from mauvecl.answers.observations.analyse import AnalyseAnswer
-from mauvecl.lightcurve.flares.shapes import shape_of
-from mauvecl.observations.frames import Frames
 
 DATA = Path(__file__).parents[1] / "data"
 FILES = {912: DATA / "spectra" / "ADLeo_912s.dat", 1497: DATA / "flares" / "ADLeo_1497s.dat"}
@@ -28,7 +26,7 @@ EDGES = np.column_stack([TIME - FRAME_S / 2, TIME + FRAME_S / 2])
 
 
 def course(seconds: int) -> np.ndarray:
-    return shape_of("davenport2014").mean_over(EDGES, PEAKS_S[seconds], HALF_WIDTH_S)
+    return SHAPES["davenport2014"].mean_over(EDGES, PEAKS_S[seconds], HALF_WIDTH_S)
 
 
 @pytest.fixture(scope="module")

@@ -16,11 +16,10 @@ from astropy.table import Table
 from commands import run
 from refusals import refused
 
-from mauvecl import Frames, Instrument, Sky, Source, Study, calibrate, expect, plan, read_frames
+from mauvecl import Expectation, Frames, Instrument, Sky, Source, Study, calibrate, expect, plan, read_frames
 from mauvecl.answers.limits.assumptions import assumptions
 from mauvecl.answers.measurements.expected import expected_measurements
 from mauvecl.answers.observations.calibrate import MODE_BANDS, CalibrateAnswer
-from mauvecl.host.expectation import Expectation
 from mauvecl.host.instrument.curve import Curve
 from mauvecl.host.instrument.throughput_errors import CALIBRATED, ThroughputErrors
 from mauvecl.noise.unknowns import MAX_MODES

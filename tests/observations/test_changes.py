@@ -8,17 +8,14 @@ import numpy as np
 import pytest
 import scipy
 
-from mauvecl import Instrument, Sky, Source, Study, change, expect
+from mauvecl import Engine, Expectation, Instrument, Nuisances, Sky, Source, Study, change, expect
 from mauvecl.answers.observations.change import PERIOD_COLUMNS, PeriodRow
-from mauvecl.device.engine import Engine
-from mauvecl.host.expectation import Expectation
 from mauvecl.observations.changes.indices import INDICES, Change, IndexValue
 from mauvecl.observations.changes.periods import Recovery, recover_periods, visit_times_d
 from mauvecl.observations.changes.smallest import error_of_change, error_of_index, smallest_change
 from mauvecl.observations.line_index import line_index
 from mauvecl.schema.tables import table_of
 from mauvecl.statistics.intervals import Interval
-from mauvecl.statistics.nuisances import Nuisances
 from tests.refusals import refused
 
 AU_MIC = Path(__file__).parents[1] / "data" / "flares" / "aumic_iue"

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from mauvecl.lightcurve.flares.shapes import shape_of
+from mauvecl import SHAPES, Detection, Frames
 from mauvecl.observations.analysis import analyse_frames
 from mauvecl.observations.detection import detect_events
 from mauvecl.observations.event_fits import _ranges, _single
@@ -17,13 +17,13 @@ from mauvecl.observations.event_windows import FittedFlare, Window
 from mauvecl.observations.events import measure_event, measure_events
 from mauvecl.observations.false_alarms import simulated_rates
 from mauvecl.observations.families import Family
-from mauvecl.observations.frames import Frames, Reason
+from mauvecl.observations.frames import Reason
 from mauvecl.observations.level import quiet_variance
 from mauvecl.observations.light_curve import survey_light_curve
 from mauvecl.observations.noise import binned_scatter, likeness
-from mauvecl.observations.search import Detection, SeriesSurvey
+from mauvecl.observations.search import SeriesSurvey
 
-SHAPE = shape_of("davenport2014")
+SHAPE = SHAPES["davenport2014"]
 FRAMES, CADENCE_S, LEVEL, SD = 600, 60.0, 1000.0, 5.0
 TIME = np.arange(FRAMES) * CADENCE_S
 

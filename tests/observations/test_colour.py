@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
+from mauvecl import Frames, Study
 from mauvecl.answers.observations.analyse import AnalyseAnswer
 from mauvecl.observations.analysis import analyse_frames
 from mauvecl.observations.colour import event_colour
-from mauvecl.observations.frames import Frames
-from mauvecl.study.study import Study
 
 PIXELS, FRAMES = 40, 300
 STAR = np.linspace(100.0, 900.0, PIXELS)

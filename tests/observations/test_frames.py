@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from astropy.table import Table
 
-from mauvecl.observations.frames import Frames, Reason
+from mauvecl import Frames
+from mauvecl.observations.frames import Reason
 from mauvecl.observations.reading import frames_of
 
 RNG = np.random.default_rng(29)

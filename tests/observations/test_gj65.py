@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
+from mauvecl import Study, read_frames
 from mauvecl.answers.observations.analyse import AnalyseAnswer
 from mauvecl.observations.analysis import Analysis, analyse_frames
 from mauvecl.observations.frames import Reason
-from mauvecl.observations.reading import read_frames
-from mauvecl.study.study import Study
 
 pytestmark = pytest.mark.long
 

@@ -11,19 +11,17 @@ from astropy.table import Table
 from commands import run
 from numpy.typing import NDArray
 
-from mauvecl import Study, analyse
+from mauvecl import SHAPES, Detection, Frames, Study, analyse
 from mauvecl.cli.session import Session
-from mauvecl.lightcurve.flares.shapes import shape_of
 from mauvecl.observations import event_windows, level
 from mauvecl.observations.detection import detect_events
 from mauvecl.observations.events import measure_event
-from mauvecl.observations.frames import Frames
 from mauvecl.observations.noise import binned_scatter
 from mauvecl.observations.process import Covariance, Process, ProcessTerm
-from mauvecl.observations.search import Detection, SeriesSurvey
+from mauvecl.observations.search import SeriesSurvey
 
 Float = NDArray[np.float64]
-SHAPE = shape_of("davenport2014")
+SHAPE = SHAPES["davenport2014"]
 CADENCE_S, LEVEL, SD = 20.0, 10_000.0, 10.0
 SHORT, LONG = 80_000, 320_000
 SMOOTH = Process((ProcessTerm("smooth", (np.log(2.0), np.log(40_000.0))),), 1.0)

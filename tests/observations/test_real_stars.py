@@ -13,16 +13,14 @@ from scenes import flare
 from scipy import stats
 from scipy.linalg import null_space
 
-from mauvecl import Study
+from mauvecl import SHAPES, Frames, Study, read_frames
 from mauvecl.answers.observations.analyse import AnalyseAnswer
-from mauvecl.lightcurve.flares.shapes import SHAPES
 from mauvecl.lightcurve.search.survey import select_frames
 from mauvecl.observations.analysis import Analysis, analyse_frames
 from mauvecl.observations.events import ObservedEvent
-from mauvecl.observations.frames import Frames, Reason
+from mauvecl.observations.frames import Reason
 from mauvecl.observations.process import Covariance, Process, ProcessTerm, level_fit
 from mauvecl.observations.process_search import ProcessSearch
-from mauvecl.observations.reading import read_frames
 from mauvecl.observations.search import bank_of, stare_of
 
 Float = NDArray[np.float64]

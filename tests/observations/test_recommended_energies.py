@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 from scenes import flare
 from scipy import stats
 
-from mauvecl.lightcurve.flares.shapes import SHAPES, TableShape
+from mauvecl import SHAPES, Frames, TableShape
 from mauvecl.observations.analysis import analyse_frames
 from mauvecl.observations.energies import Energy
-from mauvecl.observations.frames import Frames
 
 Float = NDArray[np.float64]
 DAVENPORT = SHAPES["davenport2014"]

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mauvecl import Frames, Study, analyse
-from mauvecl.lightcurve.flares.shapes import shape_of
+from mauvecl import SHAPES, Frames, Study, analyse
 from mauvecl.observations.analysis import analyse_frames
 from mauvecl.observations.detection import fit_quiet_light
 from mauvecl.observations.level import guess_flares
@@ -84,7 +83,7 @@ def test_losses_are_found_at_their_frames_and_a_flare_is_none() -> None:
     flux = 1 - 0.03 * lost + 0.02 * flare(time, 20.0, 11_000.0, 60.0) + noise * rng.standard_normal(time.size)
     frames = Frames.of(time, flux, np.full(time.size, noise))
     used = np.ones(time.size, np.bool_)
-    survey = SeriesSurvey.of(frames, flux, np.full(time.size, noise**2), used, 1.0, 0.0, shape_of("davenport2014"))
+    survey = SeriesSurvey.of(frames, flux, np.full(time.size, noise**2), used, 1.0, 0.0, SHAPES["davenport2014"])
     found = sudden_losses(survey, *fit_quiet_light(survey, guess_flares(frames.numbers, flux)))
     assert found[lost].mean() > 0.9
     assert found[~lost].mean() < 0.05
