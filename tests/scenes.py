@@ -11,6 +11,7 @@ from mauvecl.host.expectation import Expectation, expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.neighbours import Neighbour, Neighbours
 from mauvecl.host.sky.zodiacal import Sky
+from mauvecl.host.stars.bands import band
 from mauvecl.host.stars.source import Source
 from mauvecl.lightcurve.flares.shapes import SHAPES, Shape
 from mauvecl.lightcurve.stares.frame_components import Components
@@ -67,3 +68,11 @@ def flare(
     """Return the mean of a flare of unit amplitude over each frame."""
     edges = np.column_stack([time_s - frame_s / 2, time_s + frame_s / 2])
     return shape.mean_over(edges, peak_s, half_width_s)
+
+
+def through(name: str, nm: Float, flux: Float) -> float:
+    """Integrate a spectrum through a band, weighted with energy: erg s-1 cm-2."""
+    found = band(name)
+    fine = np.linspace(found.wavelength_nm[0], found.wavelength_nm[-1], 60_001)
+    response = np.interp(fine, found.wavelength_nm, found.throughput / found.throughput.max())
+    return float(np.trapezoid(response * np.interp(fine, nm, flux, left=0, right=0), fine)) * 10
