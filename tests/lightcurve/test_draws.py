@@ -9,10 +9,8 @@ import pytest
 from scenes import NEAR, instrument, star
 from scipy import special
 
-from mauvecl.device.engine import Engine
-from mauvecl.device.stare_engine import Stares
+from mauvecl import Engine, Stare, Stares
 from mauvecl.lightcurve.stares.frame_components import Components
-from mauvecl.lightcurve.stares.stare import Stare
 
 METHODS = ["pixels", "cumulants"]
 

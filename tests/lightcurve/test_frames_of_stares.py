@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from refusals import refused
 from scenes import instrument, star
 from scipy.integrate import quad
 
-from mauvecl.lightcurve.defaults import ORBIT_S
-from mauvecl.lightcurve.stares.curves import Curve, Sinusoid
-from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl import Sinusoid, Stare, Study
+
+
+def points(*values):
+    """Return a curve through some points, as of a study."""
+    return Study.build({"stare": {"variability": {"points": values}}}, "test").stare.variability
 
 
 def test_frames_skip_gaps():
@@ -23,16 +25,7 @@ def test_frames_skip_gaps():
     assert not stare.start_s.flags.writeable
 
 
-def test_star_month_needs_little_memory():
-    stare = Stare.of(30 * 86_400, thermal=1.0, drifts={"temperature": 0.01})
-    assert stare.n_frames == 518_400
-    held = sum(a.nbytes for a in (stare.start_s, stare.star, stare.light, stare.sky, stare.temperature_c))
-    assert held + stare.unknowns[0].curve.nbytes == 6 * 8 * 518_400
-
-
-@pytest.mark.parametrize(
-    "curve", [Sinusoid(0.3, 400.0, 1.0), Curve(points=((20, 1.0), (33, -2.0), (36, 5.0), (90, 0.5)))]
-)
+@pytest.mark.parametrize("curve", [Sinusoid(0.3, 400.0, 1.0), points((20, 1.0), (33, -2.0), (36, 5.0), (90, 0.5))])
 def test_curves_are_averaged_over_frames(curve):
     def at(t):
         if isinstance(curve, Sinusoid):
@@ -46,10 +39,10 @@ def test_curves_are_averaged_over_frames(curve):
 
 def test_known_conditions_and_unknowns_are_separate():
     stare = Stare.of(
-        ORBIT_S,
+        Study().stare.orbit_s,
         thermal=0.5,
         temperature_c=13.0,
-        variability=Curve(points=((0.0, 0.0), (6000.0, 0.06))),
+        variability=points((0.0, 0.0), (6000.0, 0.06)),
         jitters={"light": 0.02, "temperature": 0.01},
         offsets={"sky": 0.1},
         drifts={"light": 0.01},
@@ -71,12 +64,5 @@ def test_known_conditions_and_unknowns_are_separate():
 
 def test_dark_current_follows_the_law_of_the_instrument():
     (quiet,) = star(payload=instrument(part=True))
-    stare = Stare.of(50.0, thermal=Curve(points=((0.0, 1.0), (50.0, 1.0))))
+    stare = Stare.of(50.0, thermal=points((0.0, 1.0), (50.0, 1.0)))
     np.testing.assert_allclose(stare.dark_factor(quiet), np.exp(0.0684))
-
-
-def test_variability_must_stay_positive_within_the_stare_only() -> None:
-    """A factor that falls below zero after the last frame is accepted."""
-    assert Stare.of(100, variability=Sinusoid(2.0)).star.min() > 0
-    with refused("star"):
-        Stare.of(6000, variability=Sinusoid(2.0))

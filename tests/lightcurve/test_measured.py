@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy
-from refusals import refused
 
 from mauvecl import (
     Cooling,
@@ -26,9 +25,7 @@ from mauvecl import (
     fit,
     fit_cooling,
     measure_along,
-)  # fmt: skip
-from mauvecl.lightcurve.flares.shapes import shape_of
-from mauvecl.lightcurve.stares import cooling_fit
+)
 
 MAUVE = Instrument.load("mauve")
 STEADY = Cooling(9000.0, 9000.0, 1.0)
@@ -219,95 +216,6 @@ def test_joint_fit_of_a_steady_flare_leaves_the_cooling_open() -> None:
     place = found.column("cooling time")
     assert np.isinf(found.high[0, 0, place])
     assert found.low[0, 0, 3] < 9000.0 < found.high[0, 0, 3]
-
-
-def noisy_frames(scale: float) -> np.ndarray:
-    """Return frames with the cooling flare times a factor, and normal noise."""
-    rng, x = np.random.default_rng(3), quiet()
-    lit, _ = lit_frames(FALLING, Stare.of(300.0))
-    added = np.array([scale * (one.recorded_dn - x.recorded_dn) for one in lit])
-    return x.recorded_dn + added + np.sqrt(x.variance_dn2) * rng.standard_normal(added.shape)
-
-
-@pytest.mark.parametrize("shape", ["davenport2014", "tovarmendoza2022"])
-def test_derivatives_of_joint_fits_agree_with_differences(shape: str) -> None:
-    nuisances = Nuisances.of(quiet(), {"dark": np.inf, "light": 0.02})
-    stare = Stare.of(300.0, throughput=Sinusoid(0.2, 300.0))
-    data = cooling_fit._data(noisy_frames(1.0), quiet(), model(), nuisances, stare, shape_of(shape), ())
-    theta = np.array([52.3, *np.log([41.0, 1.4, 13_000.0, 0.5, 70.0])])
-    whitening, steps = data.whitening(theta), np.diag([4e-4, *[1e-5] * 5])
-    moved = [(data.residuals(theta + step, whitening), data.residuals(theta - step, whitening)) for step in steps]
-    jacobian = data.jacobian(theta, whitening)
-    for k, (after, before) in enumerate(moved):
-        np.testing.assert_allclose(
-            jacobian[:, k], (after - before) / (2 * steps[k, k]), atol=1e-6 * abs(jacobian).max()
-        )
-    for one in cooling_fit._quantities(data, stare, cooling=True):
-        ends = np.array([[one.value(theta + sign * step, data) for step in steps] for sign in (1, -1)])
-        change = ends if one.place == 0 else np.log(ends)
-        np.testing.assert_allclose(one.slope(theta, data), (change[0] - change[1]) / (2 * np.diag(steps)), atol=1e-6)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("scale", [1.0, 0.1], ids=["bright", "faint"])
-def test_ends_of_joint_fits_agree_with_a_search(scale: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compare Newton's steps with roots of chi-squared minimised at fixed quantities."""
-    frames = noisy_frames(scale)
-    fast = fit_cooling(frames, quiet(), model(), levels=(0.95,), **START)
-    monkeypatch.setattr(cooling_fit, "_newton_end", lambda *_: None)
-    slow = fit_cooling(frames, quiet(), model(), levels=(0.95,), **START)
-    for one, other in ((fast.low, slow.low), (fast.high, slow.high)):
-        finite = np.isfinite(one[0, 0])
-        np.testing.assert_array_equal(finite, np.isfinite(other[0, 0]))
-        assert finite.sum() >= 9
-        change = one[0, 0, finite] - other[0, 0, finite]
-        assert np.abs(change / fast.errors[0, finite]).max() < 0.003
-
-
-def test_flare_without_cooling_has_no_newton_step() -> None:
-    """Check an end temperature equal to that at the peak, where the cooling time has no effect."""
-    data = cooling_fit._data(noisy_frames(1.0), quiet(), model(), None, Stare.of(300.0), shape_of("davenport2014"), ())
-    theta = np.array([52.0, *np.log([40.0, 1.5, 12_000.0, 1.0, 80.0])])
-    whitening, limits = data.whitening(theta), (np.full(6, -np.inf), np.full(6, np.inf))
-    chi2 = float(np.sum(data.residuals(theta, whitening) ** 2))
-    quantity = cooling_fit._quantities(data, Stare.of(300.0), cooling=True)[3]
-    args = (data, whitening, theta, np.arange(6), limits, quantity, 1.0, chi2, chi2 + 1.0)
-    assert cooling_fit._newton_end(*args) is None
-
-
-def test_impossible_joint_fits_raise() -> None:
-    frames = np.tile(quiet().recorded_dn, (60, 1))
-    with_jump = FlareModel.of(star(), MAUVE, quiet(), jump=True)
-    for used, how, key in (
-        (with_jump, START, "model"),
-        (model(), START | {"peak_s": 5000.0}, "peak_s"),
-        (model(), START | {"half_width_s": 0.0}, "half_width_s"),
-        (model(), START | {"levels": (2.0,)}, "levels"),
-    ):
-        with refused(key):
-            fit_cooling(frames, quiet(), used, **how)
-
-
-def test_stares_without_a_flare_have_no_bins(engine: Engine) -> None:
-    """Search 200 frames of noise; one run in 1e9 has a frame beyond 8 standard deviations."""
-    raw = engine.realise(quiet(), count=200, seed=3)
-    with refused("snr_per_bin", value=8.0):
-        measure_along(raw, quiet(), model(), snr_per_bin=8.0)
-
-
-def test_bad_frames_raise() -> None:
-    one = quiet().recorded_dn[None]
-    for frames, how, key in (
-        (one[:, :7], {}, "frames"),
-        (one[0], {}, "frames"),
-        (one, {"snr_per_bin": 0.0}, "snr_per_bin"),
-        (one, {"stare": Stare.of(50.0)}, "frames"),
-        (one * np.nan, {}, "frames"),
-    ):
-        with refused(key):
-            measure_along(frames, quiet(), model(), **how)
-    with refused("n_frames", value=10):
-        measure_along(one, replace(quiet(), n_frames=10), model())
 
 
 def test_skipped_wavelengths_change_no_fit_along_a_stare() -> None:

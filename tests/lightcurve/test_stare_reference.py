@@ -11,16 +11,13 @@ from marks import long_but
 from refusals import refused
 from scenes import NEAR, instrument, star
 
-from mauvecl.device.engine import Engine
-from mauvecl.device.stare_engine import Stares
+from mauvecl import CosmicRays, Engine, Processes, Stare, Stares
 from mauvecl.lightcurve.stares import stare_reference
 from mauvecl.lightcurve.stares.frame_components import Components
-from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.stares.stare_requests import StaresRequest
 from mauvecl.lightcurve.stares.stare_scene import Flares, StareScene
 from mauvecl.lightcurve.stares.sum_cumulants import SumTable
 from mauvecl.noise.pointing import PointingDrifts
-from mauvecl.noise.processes import CosmicRays, Processes
 from mauvecl.results.requests.requests import Shard
 
 SEED = 2**63 + 12345

@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mauvecl import Study, analyse, inject, stare
-from mauvecl.device.stare_engine import Stares
-from mauvecl.observations.reading import read_frames
+from mauvecl import Stares, Study, analyse, inject, read_frames, stare
 
 SECTIONS: dict[str, Any] = {
     "star": [{"library": "M3V", "magnitude": 9.0, "distance_pc": 5.0}],

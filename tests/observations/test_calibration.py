@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,25 +16,21 @@ from astropy.table import Table
 from commands import run
 from refusals import refused
 
-from mauvecl import Frames, Instrument, Sky, Source, Study, calibrate, expect, plan, read_frames
-from mauvecl.answers.limits.assumptions import assumptions
-from mauvecl.answers.measurements.expected import expected_measurements
-from mauvecl.answers.observations.calibrate import MODE_BANDS, CalibrateAnswer
-from mauvecl.host.expectation import Expectation
-from mauvecl.host.instrument.curve import Curve
-from mauvecl.host.instrument.throughput_errors import CALIBRATED, ThroughputErrors
-from mauvecl.noise.unknowns import MAX_MODES
-from mauvecl.observations.calibration.dark import assumed_dark, fit_dark
-from mauvecl.observations.calibration.exposures import CalibrationFrames
-from mauvecl.observations.calibration.photon_transfer import (
-    MeasuredVariance,
-    NoiseModel,
-    fit_photon_transfer,
-    measured_variance,
+from mauvecl import (
+    Expectation,
+    Frames,
+    Instrument,
+    PixelMap,
+    Sky,
+    Source,
+    Study,
+    calibrate,
+    expect,
+    measure,
+    plan,
+    read_frames,
+    what_matters,
 )
-from mauvecl.observations.calibration.throughput import ThroughputModel
-from mauvecl.study.cases import cases
-from mauvecl.study.unknowns import drawn
 
 NOMINAL = Instrument.load("mauve")
 SKY = Sky.of_brightness(22.1)
@@ -43,13 +39,18 @@ STARS = (("B3V", 4.5), ("A0V", 5.0), ("F0V", 4.0), ("G2V", 4.0), ("B0V", 5.0))
 FAR = 4.0
 
 
+def curve(nm: Any, values: Any) -> Any:
+    """Return a quantity of the instrument against wavelength."""
+    return replace(NOMINAL.quantum_efficiency_a_per_w, wavelength_nm=tuple(nm), value=tuple(values))
+
+
 def truth(**changes: Any) -> Instrument:
     """Return an instrument that differs from the nominal one in all that is fitted."""
     nm = np.linspace(195, 705, 103)
     x = (nm - 450) / 250
     factor = np.exp(-0.1 + 0.2 * np.sin(2.3 * x + 1) + 0.1 * x**2 - 0.05 * np.sin(6 * x))
     true = {
-        "throughput_factor": Curve(tuple(nm), tuple(factor)), "dark_scale_dn_per_s": 95.0, "dark_slope_per_c": 0.072,
+        "throughput_factor": curve(nm, factor), "dark_scale_dn_per_s": 95.0, "dark_slope_per_c": 0.072,
         "conversion_uv_per_electron": 22.0, "read_noise_dn": 13.0, "bias_dn": 612.0,
     }  # fmt: skip
     return NOMINAL.with_(**(true | changes))
@@ -93,9 +94,7 @@ def study_of(stars: tuple[tuple[str, float], ...], dark: bool = True) -> Study:
     return Study().with_settings([f"calibrate.observations=[{', '.join(rows)}]"])
 
 
-def answer_of(
-    stars: tuple[tuple[str, float], ...], instrument: Instrument, seed: int, dark: bool = True
-) -> CalibrateAnswer:
+def answer_of(stars: tuple[tuple[str, float], ...], instrument: Instrument, seed: int, dark: bool = True) -> Any:
     rng = np.random.default_rng(seed)
     frames = [frames_of(instrument, star(*one), [16.0 + k], 40, rng) for k, one in enumerate(stars)]
     if dark:
@@ -104,11 +103,11 @@ def answer_of(
 
 
 @pytest.fixture(scope="module")
-def answer() -> CalibrateAnswer:
+def answer() -> Any:
     return answer_of(STARS, truth(), 1)
 
 
-def test_fit_recovers_values(answer: CalibrateAnswer) -> None:
+def test_fit_recovers_values(answer: Any) -> None:
     """Nine values: a false failure once in 1800 seeds."""
     true = truth()
     expected = {
@@ -126,31 +125,12 @@ def test_fit_recovers_values(answer: CalibrateAnswer) -> None:
     assert all(row["p_value"] > 1e-4 for row in answer.fits)
 
 
-def test_fit_recovers_throughput(answer: CalibrateAnswer) -> None:
+def test_fit_recovers_throughput(answer: Any) -> None:
     f = answer.throughput
     true = np.log(truth().throughput(f.wavelength_nm) / NOMINAL.throughput(f.wavelength_nm))
     far = (f.log_factor - true) / f.error
     assert np.abs(far).max() < FAR
     assert 0.005 < np.median(f.error) < 0.02
-
-
-@pytest.mark.parametrize("order", ["paper", "physical"])
-@pytest.mark.parametrize(("width", "tolerance"), [(0.0, 1e-12), (-0.1, 1e-4), (0.1, 1e-4), (0.25, 2e-3)])
-def test_light_through_a_wider_line_is_that_of_such_an_instrument(
-    order: Literal["paper", "physical"], width: float, tolerance: float
-) -> None:
-    """The fit takes the light for quadratic in the width of the line function."""
-    stars, n = [star("G2V", 4.0), star("B3V", 4.5)], NOMINAL.wavelength_nm.size
-    seen = tuple(CalibrationFrames(one.name, np.ones((3, n)), 5.0, np.full(3, 21.0), one) for one in stars)
-    transfer = fit_photon_transfer([MeasuredVariance(np.ones(n), np.ones(n), np.ones(n), 10.0)], NOMINAL)
-    none = np.empty((n, 0))
-    model = ThroughputModel(seen, NOMINAL, assumed_dark(NOMINAL, n), transfer, SKY, order, none, none, 0.0)
-    found = model.light_dn(np.zeros(n), np.array([0.0, 0.0, width, 0.0]))
-    wider = NOMINAL.with_(gaussian_fwhm_nm=NOMINAL.gaussian_fwhm_nm * (1 + width))
-    for light, one in zip(found, stars, strict=True):
-        x = expect(one, wider, exposure=5.0, sky=SKY, order=order)
-        exact = x.gain_dn_per_electron * (x.source_electrons + x.sky_electrons)
-        assert light == pytest.approx(exact, rel=tolerance)
 
 
 @pytest.mark.long
@@ -171,7 +151,7 @@ def test_throughput_with_kinks_is_followed() -> None:
 
     Some tens of independent values lie within 4 standard errors, and nothing is blamed on the stars.
     """
-    true = truth(throughput_factor=None, quantum_efficiency_a_per_w=Curve.flat(0.15))
+    true = truth(throughput_factor=None, quantum_efficiency_a_per_w=curve([450.0], [0.15]))
     f = answer_of(STARS, true, 7).throughput
     off = f.log_factor - np.log(true.throughput(f.wavelength_nm) / NOMINAL.throughput(f.wavelength_nm))
     assert np.abs(off / f.error).max() < FAR
@@ -179,7 +159,7 @@ def test_throughput_with_kinks_is_followed() -> None:
     assert f.p_value > 1e-4
 
 
-def test_written_instrument_is_the_fitted_one(answer: CalibrateAnswer, tmp_path: Path) -> None:
+def test_written_instrument_is_the_fitted_one(answer: Any, tmp_path: Path) -> None:
     answer.write(tmp_path)
     read = Instrument.load(tmp_path / "instrument.toml")
     assert read == answer.instrument
@@ -222,67 +202,6 @@ def test_wrong_spectrum_is_noticed() -> None:
     f = found.throughput
     true = np.log(truth().throughput(f.wavelength_nm) / NOMINAL.throughput(f.wavelength_nm))
     assert np.abs((f.log_factor - true) / f.error).max() < FAR
-
-
-def test_dark_fit_determines_bias_of_pixels_from_exposure_times() -> None:
-    rng = np.random.default_rng(4)
-    bias = np.full(NOMINAL.pixels, 600.0)
-    bias[NOMINAL.read_pixels] += np.linspace(-20, 20, NOMINAL.wavelength_nm.size)
-    from mauvecl.host.instrument.pixel_map import PixelMap
-
-    instrument = truth(pixel_map=PixelMap(bias_dn=bias))
-    parts = [frames_of(instrument, None, [15.0, 19.0], 30, rng, exposure_s) for exposure_s in (1.0, 5.0)]
-    dark = [CalibrationFrames.of(one, NOMINAL, None) for one in parts]
-    found = fit_dark(dark, NOMINAL, NoiseModel.nominal(instrument))
-    far = (found.bias_dn - bias[NOMINAL.read_pixels]) / found.bias_error
-    # 1643 normal values have a mean square of 1 within 4 standard errors.
-    assert abs(np.mean(far**2) - 1) < 4 * np.sqrt(2 / far.size)
-    assert abs(found.slope_per_c - 0.072) < FAR * found.slope_error
-    assert found.p_value > 1e-4
-    assert found.slopes_p_value > 1e-4
-
-
-def test_photon_transfer_ignores_jitter_of_light() -> None:
-    """Gain within 4 standard errors although the light of frames jitters by 5 %, which alone would triple it."""
-    rng = np.random.default_rng(5)
-    light, gain = np.linspace(100.0, 20_000.0, 1600), 0.6
-    jitter = 1 + 0.05 * rng.standard_normal((200, 1))
-    raw = light * jitter + np.sqrt(gain * light + 150.0) * rng.standard_normal((200, 1600))
-    dark = np.zeros(1600)
-    found = fit_photon_transfer([measured_variance(raw, light, dark, np.ones(1600, bool))], NOMINAL)
-    assert abs(found.noise.gain - gain) < FAR * found.gain_error
-    assert found.p_value > 1e-4
-
-
-def test_modes_have_the_covariance() -> None:
-    nm = np.linspace(200, 700, 60)
-    covariance = 0.01 * np.exp(-(((nm[:, None] - nm) / 100) ** 2)) + 0.02
-    errors = ThroughputErrors.of_covariance(nm, covariance, "C: test", lost=0.0)
-    np.testing.assert_allclose(errors.modes.T @ errors.modes, covariance, atol=1e-12)
-    np.testing.assert_allclose(errors.sd(nm), np.sqrt(np.diag(covariance)))
-
-
-@pytest.mark.long
-def test_unknowns_of_a_calibrated_instrument_are_its_modes(answer: CalibrateAnswer, tmp_path: Path) -> None:
-    """The drawn throughputs scatter as the fitted covariance says, with the error of a variance of 256 draws."""
-    answer.write(tmp_path)
-    name = str(tmp_path / "instrument.toml")
-    study = Study().with_settings([f"observation.instrument={name}", "unknowns.draws=256"])
-    draws = drawn(study)
-    assert "light_loss" not in draws.names
-    assert "qe_scale" not in draws.names
-    assert "throughput_1" in draws.names
-    nm = np.array([250.0, 450.0, 650.0])
-    fitted = answer.instrument
-    log = np.log([fitted.with_(**one.observation.changes).throughput(nm) for one in draws.studies])
-    assert fitted.throughput_errors is not None
-    modes = fitted.throughput_errors.at(nm)[:MAX_MODES]
-    assert MODE_BANDS + len(CALIBRATED) == MAX_MODES
-    np.testing.assert_allclose(log.std(axis=0), np.sqrt((modes**2).sum(axis=0)), rtol=4 * np.sqrt(0.5 / 256))
-    np.testing.assert_allclose(np.exp(log.mean(axis=0)), fitted.throughput(nm), rtol=2e-3)
-    named = [one.name for one in assumptions(fitted)]
-    assert "calibration, mode 1" in named
-    assert "light loss" not in named
 
 
 @pytest.mark.parametrize(
@@ -359,17 +278,6 @@ def grey(tmp_path: Path) -> str:
     return str(tmp_path / "grey.toml")
 
 
-def test_measurements_state_the_error_of_the_throughput(grey: str) -> None:
-    """Light alike at all wavelengths moves fluxes by 5 %, and no temperature."""
-    settings = ["star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.5]", f"observation.instrument={grey}"]
-    (case,) = cases(Study().with_settings(settings))
-    (one, *_) = expected_measurements(case, 0.5, case.flares[0])
-    assert one.of_throughput is not None
-    found = dict(zip(one.fitted.names, one.of_throughput / one.perfect.estimates[0], strict=True))
-    assert found["flux 200-700 nm"] == pytest.approx(np.expm1(0.05), rel=0.01)
-    assert found["temperature"] < 1e-3
-
-
 def test_plans_state_the_error_of_the_throughput(grey: str) -> None:
     """E50 follows the S/N, which grows with the light by less than its share and more than its root."""
     settings = ["plan.targets=[{name='eps Eri'}]", "orbit.days=5", "plan.completeness='closed form'"]
@@ -385,7 +293,7 @@ def test_light_through_the_fitted_instrument_covers_the_true_one() -> None:
 
     Fewer than 4 of 6 happen once in 450 times, if 95 % do.
     """
-    true = truth(throughput_factor=Curve.flat(1.0))
+    true = truth(throughput_factor=curve([450.0], [1.0]))
     study = Study().with_settings(["star=[{library='G2V', magnitude=7.4}]", "flare.amplitudes=[0.24]"])
     held = 0
     for seed in range(6):
@@ -403,3 +311,57 @@ def test_light_through_the_fitted_instrument_covers_the_true_one() -> None:
         moved = [signal(fitted.with_(throughput_amplitudes=tuple(np.eye(len(several))[k]))) - middle for k in several]
         held += abs(signal(true) - middle) < 1.96 * np.linalg.norm(moved)
     assert held >= 4
+
+
+def test_dark_frames_of_two_exposure_times_determine_the_bias_of_pixels() -> None:
+    """1643 normal values have a mean square of 1 within 4 standard errors; the noise of the dark current counts."""
+    rng = np.random.default_rng(4)
+    bias = np.full(NOMINAL.pixels, 600.0)
+    bias[NOMINAL.read_pixels] += np.linspace(-20, 20, NOMINAL.wavelength_nm.size)
+    true = truth(pixel_map=PixelMap(bias_dn=bias))
+    frames = [frames_of(true, None, [15.0, 19.0], 30, rng, exposure_s) for exposure_s in (1.0, 5.0)]
+    frames.insert(0, frames_of(true, star("A0V", 5.0), [16.0], 40, rng))
+    study = Study().with_settings(
+        ["calibrate.observations=[{frames='x', library='A0V', magnitude=5.0}, {frames='y'}, {frames='z'}]"]
+    )
+    found = calibrate(study, frames=tuple(frames))
+    table = found.dark_table
+    far = (table["bias"].value - bias[NOMINAL.read_pixels]) / table["bias_error"].value
+    assert abs(np.mean(far**2) - 1) < 4 * np.sqrt(2 / far.size)
+    (slope,) = (one for one in found.values if one.name == "dark slope")
+    assert abs(slope.value - 0.072) < FAR * slope.error
+    assert all(row["p_value"] > 1e-4 for row in found.fits)
+
+
+def test_gain_ignores_jitter_of_light() -> None:
+    """Gain within 4 standard errors although the light of frames jitters by 5 %, which alone would triple it."""
+    rng = np.random.default_rng(5)
+    frames = frames_of(truth(), star("A0V", 4.0), [16.0], 60, rng)
+    dark = frames_of(truth(), None, [13.0, 16.0, 19.0], 30, rng)
+    level = dark.flux[30:60].mean(axis=0)
+    jitter = 1 + 0.05 * rng.standard_normal((60, 1))
+    jittered = replace(frames, flux=np.rint(level + (frames.flux - level) * jitter))
+    found = calibrate(study_of((("A0V", 4.0),)), frames=(jittered, dark))
+    (gain,) = (one for one in found.values if one.name == "gain")
+    assert abs(gain.value - truth().gain_dn_per_electron) < FAR * gain.error
+    assert gain.error < 0.05 * gain.value
+
+
+@pytest.mark.long
+def test_answers_through_a_calibrated_instrument_state_its_modes(answer: Any, tmp_path: Path) -> None:
+    """The error of the light of a star is that of the fitted covariance, and the nominal unknowns are gone."""
+    answer.write(tmp_path)
+    settings = ["star=[{library='G2V', magnitude=7.4}]", "flare.amplitudes=[0.24]", "run.statistics=['matched']"]
+    study = Study().with_settings([*settings, f"observation.instrument={tmp_path / 'instrument.toml'}"])
+    named = set(what_matters(study)["assumption"])
+    assert "calibration, mode 1" in named
+    assert "light loss" not in named
+
+
+def test_measurements_state_the_error_of_the_throughput(grey: str) -> None:
+    """Light alike at all wavelengths moves fluxes by 5 %, and no temperature."""
+    settings = ["star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.5]", f"observation.instrument={grey}"]
+    table = measure(Study().with_settings([*settings, "run.realisations=10"])).table
+    found = {row["quantity"]: row["error_throughput"] / row["perfect"] for row in table}
+    assert found["flux 200-700 nm"] == pytest.approx(np.expm1(0.05), rel=0.01)
+    assert found["temperature"] < 1e-3

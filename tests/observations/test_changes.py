@@ -3,27 +3,33 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import scipy
 
-from mauvecl import Instrument, Sky, Source, Study, change, expect
-from mauvecl.answers.observations.change import PERIOD_COLUMNS, PeriodRow
-from mauvecl.device.engine import Engine
-from mauvecl.host.expectation import Expectation
-from mauvecl.observations.changes.indices import INDICES, Change, IndexValue
-from mauvecl.observations.changes.periods import Recovery, recover_periods, visit_times_d
-from mauvecl.observations.changes.smallest import error_of_change, error_of_index, smallest_change
+from mauvecl import Engine, Expectation, Instrument, Nuisances, Sky, Source, Study, change, expect
+from mauvecl.observations.changes.periods import recover_periods
 from mauvecl.observations.line_index import line_index
-from mauvecl.schema.tables import table_of
-from mauvecl.statistics.intervals import Interval
-from mauvecl.statistics.nuisances import Nuisances
-from tests.refusals import refused
 
 AU_MIC = Path(__file__).parents[1] / "data" / "flares" / "aumic_iue"
 MAUVE = Instrument.load("mauve")
 STAR = Source.from_library("M3V").at_magnitude(9.0)
+#: Windows beside Mg II in which its index takes the continuum.
+CONTINUUM_NM = ((258.0, 270.0), (290.0, 302.0))
+
+
+def asked(*settings: str, star: str = "library='M3V', magnitude=9") -> Any:
+    return change(Study().with_settings([f"star=[{{{star}}}]", *settings]))
+
+
+def written(source: Source, path: Path) -> str:
+    """Return the words of a study for a star's spectrum in a file."""
+    both = zip(source.wavelength_nm.tolist(), source.flux_flam.tolist(), strict=True)
+    rows = [f"{nm!r},{flux!r}" for nm, flux in both]
+    path.write_text("\n".join(["wavelength (nm),flux (erg/(s cm2 Angstrom))", *rows]) + "\n")
+    return f"file='{path}'"
 
 
 @pytest.fixture(scope="module")
@@ -31,45 +37,43 @@ def quiet() -> Expectation:
     return expect(STAR, MAUVE, exposure=50.0, sky=Sky.of_brightness(22.1))
 
 
-def counts(name: str, quiet: Expectation, file: Source | None = None) -> np.ndarray:
-    return Change.named(name, STAR, quiet, MAUVE, "paper", file, "V").counts_dn
-
-
 @pytest.mark.parametrize(("fap", "power"), [(1e-3, 0.9), (1e-6, 0.5), (0.05, 0.95)])
 def test_two_visits_are_the_two_sided_test_of_a_difference(fap: float, power: float) -> None:
-    """The closed form leaves out the far tail, which is below 1e-5 for these."""
-    normal = scipy.stats.norm
+    """The closed form leaves out the far tail, which is below 1e-5 for these; the scatter is that of one degree."""
+    (row,) = asked("change.of=['320-700']", f"run.fap={fap}", f"limit.power={power}", "nuisances.light=0.02").table
+    normal, chi2 = scipy.stats.norm, scipy.stats.chi2
     expected = np.sqrt(2.0) * (normal.isf(fap / 2) + normal.ppf(power))
-    assert smallest_change(1.0, 2, fap, power).one == pytest.approx(expected, rel=1e-4)
+    assert row["smallest"] / row["error"] == pytest.approx(expected, rel=1e-4)
+    scatter = np.sqrt(chi2.isf(fap, 1) / chi2.isf(power, 1) - 1)
+    assert row["smallest_scatter"] / row["error"] == pytest.approx(scatter, rel=1e-4)
 
 
 def test_smallest_changes_have_the_power() -> None:
     """Draws of 30 visits: 20 000 tests each, within 4 binomial standard errors (once in 16 000 times)."""
     visits, fap, power, n = 30, 0.01, 0.8, 20_000
-    found = smallest_change(2.0, visits, fap, power)
+    (row,) = asked("change.of=['320-700']", f"run.fap={fap}", f"limit.power={power}", f"change.visits={visits}").table
     rng = np.random.default_rng(1)
-    noise = 2.0 * rng.standard_normal((n, visits))
+    noise = row["error"] * rng.standard_normal((n, visits))
     one = noise.copy()
-    one[:, 3] += found.one
-    scattered = noise + found.scatter * rng.standard_normal((n, visits))
+    one[:, 3] += row["smallest"]
+    scattered = noise + row["smallest_scatter"] * rng.standard_normal((n, visits))
     cut = scipy.stats.chi2.isf(fap, visits - 1)
     for values, expected in ((noise, fap), (one, power), (scattered, power)):
-        share = np.mean(values.var(axis=1) * visits / 4.0 > cut)
+        share = np.mean(values.var(axis=1) * visits / row["error"] ** 2 > cut)
         assert abs(share - expected) < 4 * np.sqrt(expected * (1 - expected) / n)
 
 
-@pytest.mark.parametrize(
-    ("line", "snr"), [("Mg II k", 0.050), ("Ca II K", 0.071), ("H beta", 0.075), ("H alpha", 0.066)]
-)
-def test_errors_of_lines_are_those_computed_independently(line: str, snr: float, quiet: Expectation) -> None:
+def test_errors_of_lines_are_those_computed_independently() -> None:
     """S/N of 1e-12 erg s-1 cm-2 in 50 s at M3V, V = 9, everything known; numbers of two digits."""
-    assert 1e-12 / error_of_change(counts(line, quiet), quiet, None) == pytest.approx(snr, abs=0.001)
+    snr = {"Mg II k": 0.050, "Ca II K": 0.071, "H beta": 0.075, "H alpha": 0.066}
+    for row in asked(f"change.of={list(snr)}").table:
+        assert 1e-12 / row["error_known"] == pytest.approx(snr[row["change"]], abs=0.001)
 
 
 def test_error_of_change_is_the_scatter_of_fits(quiet: Expectation) -> None:
     """Amplitudes fitted together with drawn unknowns; 4000 exposures give the scatter within 4 x 1.1 %."""
-    n, delta = 4000, counts("320-700", quiet)
-    unknown = Nuisances.of(quiet, {"dark": 0.1, "light": 0.02})
+    n, (row,) = 4000, asked("change.of=['320-700']", "nuisances.dark=0.1", "nuisances.light=0.02").changes
+    delta, unknown = row.change.counts_dn, Nuisances.of(quiet, {"dark": 0.1, "light": 0.02})
     rng = np.random.default_rng(2)
     sd = np.sqrt(quiet.variance_dn2)
     exposures = sd * rng.standard_normal((n, sd.size)) + (unknown.sd * rng.standard_normal((n, 2))) @ unknown.spectra
@@ -77,31 +81,29 @@ def test_error_of_change_is_the_scatter_of_fits(quiet: Expectation) -> None:
     columns = np.vstack([delta, unknown.spectra]) / sd
     information = columns @ columns.T + np.diag([0.0, *unknown.sd**-2.0])
     fitted = (exposures / sd @ columns.T) @ np.linalg.inv(information)
-    assert error_of_change(delta, quiet, unknown) == pytest.approx(fitted[:, 0].std(), rel=4 / np.sqrt(2 * n), abs=0)
+    assert row.error == pytest.approx(fitted[:, 0].std(), rel=4 / np.sqrt(2 * n), abs=0)
+    assert row.error_known == pytest.approx(1 / np.linalg.norm(delta / sd), rel=1e-6)
+    assert row.error > 1.2 * row.error_known
 
 
-def test_change_that_an_unknown_imitates_is_hidden(quiet: Expectation) -> None:
-    unknown = Nuisances.of(quiet, {"light": np.inf})
-    assert error_of_change(quiet.recorded_light_dn, quiet, unknown) == np.inf
-    assert np.isfinite(error_of_change(counts("200-320", quiet), quiet, unknown))
+def test_changes_and_indices_that_an_unknown_imitates_are_hidden() -> None:
+    whole, part = asked("change.of=['150-760', '200-320']", "nuisances.light='free'", "sky={none=true}").table
+    assert whole["error"] > 1e3 * whole["error_known"]
+    assert part["error"] < 10 * part["error_known"]
+    assert np.isinf(asked("change.of=['200-320']", "nuisances.light='free'").index_table["error"]).all()
 
 
-def test_error_of_index_is_the_scatter_of_drawn_exposures(engine: Engine, quiet: Expectation) -> None:
+def test_errors_of_indices_are_those_of_drawn_exposures(engine: Engine, quiet: Expectation) -> None:
     """All four indices of 10 000 drawn exposures: their scatter is known to 0.7 %, and may differ by 2 %."""
     raw = engine.realise(quiet, count=10_000, seed=3) - quiet.recorded_dn
-    for index in INDICES.values():
-        value = IndexValue.of(index, quiet, MAUVE, "paper")
-        assert error_of_index(value.weights, quiet, None) == pytest.approx((raw @ value.weights).std(), rel=0.02, abs=0)
-
-
-def test_unknowns_of_finite_spread_add_to_the_error_of_an_index(quiet: Expectation) -> None:
-    value = IndexValue.of(INDICES["H alpha"], quiet, MAUVE, "paper")
-    unknown = Nuisances.of(quiet, {"light": 0.05})
-    # Light that grows by 5 % makes the index grow by 5 %.
-    expected = np.hypot(error_of_index(value.weights, quiet, None), 0.05 * value.weights @ quiet.recorded_light_dn)
-    assert error_of_index(value.weights, quiet, unknown) == pytest.approx(expected, rel=1e-12, abs=0)
-    free = Nuisances.of(quiet, {"light": np.inf})
-    assert error_of_index(value.weights, quiet, free) == np.inf
+    rows = asked("change.of=['320-700']", "nuisances.light=0.05").indices
+    assert len(rows) == 4
+    for row in rows:
+        weights = row.value.weights
+        assert row.error_known == pytest.approx((raw @ weights).std(), rel=0.02, abs=0)
+        # Light that grows by 5 % makes the index grow by 5 %.
+        expected = np.hypot(row.error_known, 0.05 * weights @ quiet.recorded_light_dn)
+        assert row.error == pytest.approx(expected, rel=1e-6, abs=0)
 
 
 def spread(nm: np.ndarray, flux: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -118,7 +120,7 @@ def _of(source: Source) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("file", ["lp02123.txt", "lp09052.txt", "lp09126.txt"])
-def test_indices_of_au_mic_are_those_of_a_direct_integration(file: str) -> None:
+def test_indices_of_au_mic_are_those_of_a_direct_integration(file: str, tmp_path: Path) -> None:
     table = np.loadtxt(AU_MIC / file, skiprows=19, usecols=(0, 1))
     # A library star of its type continues it; only 258-302 nm and the reach of the line function matter.
     nm, flux, other = table[:, 0] / 10, table[:, 1], Source.from_library("M1V")
@@ -127,17 +129,16 @@ def test_indices_of_au_mic_are_those_of_a_direct_integration(file: str) -> None:
     source = Source.from_arrays(
         np.concatenate([[170.0], nm, other.wavelength_nm[beyond]]), np.concatenate([flux[:1], flux, red]), name="AU Mic"
     )
-    x = expect(source, MAUVE, exposure=50.0, sky=Sky.none())
-    index = INDICES["Mg II"]
-    value = IndexValue.of(index, x, MAUVE, "paper")
-    nm = x.wavelength_nm
+    answer = asked("sky={none=true}", "change.of=['200-320']", star=written(source, tmp_path / "aumic.csv"))
+    (row,) = answer.index_table[answer.index_table["index"] == "Mg II"]
+    nm = MAUVE.wavelength_nm
     # Per nm in place of per Angstrom; the pixel is far narrower than the line function.
     flux = 10 * spread(source.wavelength_nm, source.flux_flam, nm)
-    windows = np.any([(nm >= low) & (nm <= high) for low, high in index.continuum_nm], axis=0)
+    windows = np.any([(nm >= low) & (nm <= high) for low, high in CONTINUUM_NM], axis=0)
     line = np.polyfit(nm[windows], flux[windows], 1)
-    fine = np.linspace(*index.band_nm, 4001)
+    fine = np.linspace(row["band_low"].value, row["band_high"].value, 4001)
     direct = np.trapezoid(np.interp(fine, nm, flux) - np.polyval(line, fine), fine)
-    assert value.value == pytest.approx(direct, rel=0.01, abs=0)
+    assert row["flux"].value == pytest.approx(direct, rel=0.01, abs=0)
     # The index at the resolution of IUE, times the share that is captured, leaves the continuum's curvature.
     sharp = line_index(
         source.wavelength_nm,
@@ -145,25 +146,25 @@ def test_indices_of_au_mic_are_those_of_a_direct_integration(file: str) -> None:
         band_nm=(278.5, 281.5),
         continuum_nm=((275.5, 278.0), (282.0, 284.5)),
     )
-    assert 0.2 < value.value / (value.captured * float(sharp.flux)) < 5
+    assert 0.2 < row["flux"].value / (row["captured"] * float(sharp.flux)) < 5
 
 
-def test_captured_share_is_that_of_a_line_of_flux_one(quiet: Expectation) -> None:
-    value = IndexValue.of(INDICES["H beta"], quiet, MAUVE, "paper")
-    lit = counts("H beta", quiet)
-    assert value.captured == pytest.approx(float(value.weights @ lit), rel=1e-9)
-    # A narrow line spread by the line function, in the band and in the continuum below it.
+def test_captured_share_is_that_of_a_narrow_line() -> None:
+    """A line of flux one spread by the line function, in the band and in the continuum below it."""
+    table = asked("change.of=['H beta']").index_table
+    (row,) = table[table["index"] == "H beta"]
     nm = np.arange(380.0, 590.0, 0.05)
     profile = spread(nm, np.maximum(0, 1 - np.abs(nm - 486.269) / 0.1) / 0.1, nm)
     direct = line_index(nm, profile, band_nm=(478.0, 494.0), continuum_nm=((464.0, 476.0), (496.0, 508.0)))
-    assert value.captured == pytest.approx(float(direct.flux), rel=0.01)
+    assert row["captured"] == pytest.approx(float(direct.flux), rel=0.01)
 
 
-def test_spectrum_from_a_file_is_measured_in_its_band(quiet: Expectation) -> None:
+def test_spectrum_from_a_file_is_measured_in_its_band(tmp_path: Path) -> None:
     hot = Source.from_library("A0V").at_magnitude(3.0)
-    own = counts("spectrum", quiet, hot)
+    written(hot, tmp_path / "hot.csv")
+    (row,) = asked("change.of=['spectrum']", f"change.file='{tmp_path / 'hot.csv'}'", "change.band='V'").changes
     lit = expect(hot.at_magnitude(9.0), MAUVE, exposure=50.0, sky=Sky.none())
-    np.testing.assert_allclose(own, lit.net_source_dn, rtol=1e-9)
+    np.testing.assert_allclose(row.change.counts_dn, lit.net_source_dn, rtol=1e-6)
 
 
 def peaks(time: np.ndarray, values: np.ndarray, frequency: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -200,25 +201,26 @@ def test_recovered_periods_are_those_of_another_periodogram() -> None:
             assert abs(found.recovered[k][j].value - other) < 0.03 + 4 * error, (period, amplitude)
 
 
-def test_visits_lie_in_windows() -> None:
-    from mauvecl.host.orbit.visibility import Windows
-
-    start = np.array([0.0, 5000.0, 9000.0])
-    windows = Windows(start, start + np.array([1000.0, 200.0, 3000.0]), np.zeros(3))
-    days = visit_times_d(windows, 500, 300.0, 1)
-    seconds = days * 86_400
-    inside = [(seconds >= a + 150) & (seconds <= b - 150) for a, b in ((0, 1000), (9000, 12_000))]
-    assert np.all(inside[0] | inside[1])
-    # By length: 700 of 3400 s; 4 standard errors of 500 visits.
-    assert abs(inside[0].mean() - 700 / 3400) < 4 * np.sqrt(0.2059 * 0.7941 / 500)
-    with refused("observation.exposure_s", expected="longest window, 3000 s"):
-        visit_times_d(windows, 5, 4000.0, 1)
+def test_visits_lie_in_the_windows_of_the_target_and_rows_of_periods_are_those_of_their_cells() -> None:
+    """Sinusoids far below the noise are never found, and far above it nearly always."""
+    settings = ["change.periods=true", "change.visits=20", "orbit.targets=['eps Eri']", "orbit.days=30"]
+    asked_for = [*settings, "change.of=['320-700']", "change.trials=20"]
+    answer = asked(*asked_for)
+    table = answer.period_table
+    periods, amplitudes = (list(dict.fromkeys(np.asarray(table[name]))) for name in ("period", "amplitude_errors"))
+    assert len(table) == len(periods) * len(amplitudes)
+    pairs = set(zip(np.asarray(table["period"]), np.asarray(table["amplitude_errors"]), strict=True))
+    assert len(pairs) == len(table)
+    error = answer.table["error"][0]
+    np.testing.assert_allclose(table["amplitude"], error * np.asarray(table["amplitude_errors"]), rtol=1e-6)
+    least, most = (np.asarray(table["amplitude_errors"]) == end for end in (min(amplitudes), max(amplitudes)))
+    assert table["recovered"][least].mean() < 0.2
+    assert table["recovered"][most].mean() > table["recovered"][least].mean() + 0.3
 
 
 def test_answer_holds_every_change_and_magnitude() -> None:
-    settings = ["star=[{library='M3V', magnitude=9}]", "sweep.axes=[{quantity='exposure', values=[50, 600]}]",
-                "nuisances.dark=0.1"]  # fmt: skip
-    answer = change(Study().with_settings(settings))
+    answer = asked("sweep.axes=[{quantity='exposure', values=[50, 600]}]", "nuisances.dark=0.1",
+                   "change.of=['320-700', 'Mg II k', 'colour']")  # fmt: skip
     names = list(dict.fromkeys(answer.table["change"]))
     assert len(answer.table) == 2 * len(names)
     short, long = (answer.table[answer.table["exposure"].value == seconds] for seconds in (50, 600))
@@ -227,46 +229,17 @@ def test_answer_holds_every_change_and_magnitude() -> None:
     assert np.all(answer.table["error"] >= answer.table["error_known"])
 
 
-def test_columns_of_a_change_are_its_errors_and_smallest_sizes(quiet: Expectation) -> None:
-    """Two visits: the difference as of normal values, the scatter by the variance of one degree of freedom."""
-    settings = ["star=[{library='M3V', magnitude=9}]", "change.of=['320-700']", "nuisances.light=0.02"]
-    study = Study().with_settings(settings)
-    assert (study.change.visits, study.observation.exposure_s) == (2, 50.0)
-    (row,) = change(study).table
-    fap, power = study.run.fap, study.limit.power
-    delta = counts("320-700", quiet)
-    errors = [error_of_change(delta, quiet, one) for one in (Nuisances.of(quiet, {"light": 0.02}), None)]
-    assert errors[0] > 1.2 * errors[1]
-    assert [row["error"], row["error_known"]] == pytest.approx(errors, rel=0.01)
-    normal, chi2 = scipy.stats.norm, scipy.stats.chi2
-    one = np.sqrt(2.0) * (normal.isf(fap / 2) + normal.ppf(power))
-    scatter = np.sqrt(chi2.isf(fap, 1) / chi2.isf(power, 1) - 1)
-    assert [row["smallest"], row["smallest_scatter"]] == pytest.approx(
-        row["error"] * np.array([one, scatter]), rel=1e-4
-    )
-
-
-def test_rows_of_periods_are_those_of_their_cells() -> None:
-    """Shares that state their amplitude and period in their digits."""
-    periods, amplitudes = np.array([1.0, 2.0, 3.0]), np.array([0.4, 0.8])
-    cells = [[Interval(a + p / 100, 0.0, 1.0) for p in periods] for a in amplitudes]
-    star = Change("320-700", "", "", np.ones(3))
-    row = PeriodRow("star", {}, star, 5.0, Recovery(periods, 0.5, periods, amplitudes, cells))
-    table = table_of(PERIOD_COLUMNS, [row])
-    np.testing.assert_allclose(table["recovered"], table["amplitude_errors"] + table["period"].value / 100)
-    np.testing.assert_allclose(table["amplitude"], 5.0 * table["amplitude_errors"])
-
-
-FLAT = Source(np.linspace(150.0, 760.0, 611), np.full(611, 1e-12), "flat", "test")
+@pytest.fixture(scope="module")
+def flat(tmp_path_factory: pytest.TempPathFactory) -> str:
+    source = Source(np.linspace(150.0, 760.0, 611), np.full(611, 1e-12), "flat", "test")
+    return written(source, tmp_path_factory.mktemp("flat") / "flat.csv")
 
 
 @pytest.mark.parametrize("limits", [(300.0, 301.0), (310.03, 317.58), (400.0, 500.0)])
-def test_bands_have_the_light_between_their_edges(limits: tuple[float, float], quiet: Expectation) -> None:
+def test_bands_have_the_light_between_their_edges(limits: tuple[float, float], quiet: Expectation, flat: str) -> None:
     """Compare the share of a flat spectrum in each pixel, added up over wavelengths, with the width of the band."""
-    part, whole = (
-        Change.named(f"{low}-{high}", FLAT, quiet, MAUVE, "paper", None, "V").counts_dn
-        for low, high in (limits, (150.0, 760.0))
-    )
+    rows = asked(f"change.of=['{limits[0]}-{limits[1]}', '150-760']", star=flat).changes
+    part, whole = (row.change.counts_dn for row in rows)
     # Each pixel has the band's share of its line function, whose sum over pixels is the band's width.
     share = part / whole * np.gradient(quiet.wavelength_nm)
     assert float(share.sum()) == pytest.approx(limits[1] - limits[0], rel=2e-4)
@@ -275,13 +248,13 @@ def test_bands_have_the_light_between_their_edges(limits: tuple[float, float], q
 
 
 @pytest.mark.parametrize(("name", "edge"), [("balmer jump", 364.6), ("colour", 450.0)])
-def test_changes_below_an_edge_end_there(name: str, edge: float, quiet: Expectation) -> None:
+def test_changes_below_an_edge_end_there(name: str, edge: float, quiet: Expectation, flat: str) -> None:
     """Compare with the same change as a band, and find the edge where a pixel has half of the light."""
-    below, band = counts(name, quiet), counts(f"150-{edge}", quiet)
+    rows = asked(f"change.of=['{name}', '150-{edge}', '150-760']", star=flat).changes
+    below, band, whole = (row.change.counts_dn for row in rows)
     unit = 0.4 * np.log(10.0) if name == "colour" else 1.0
-    np.testing.assert_allclose(below, unit * band, rtol=1e-12, atol=1e-12 * band.max())
-    parts = [Change.named(one, FLAT, quiet, MAUVE, "paper", None, "V").counts_dn for one in (name, "150-760")]
-    share = parts[0] / parts[1] / unit
+    np.testing.assert_allclose(below, unit * band, rtol=1e-9, atol=1e-9 * band.max())
+    share = below / whole / unit
     assert float(np.interp(0.5, share[::-1], quiet.wavelength_nm[::-1])) == pytest.approx(edge, abs=0.01)
 
 

@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scenes import analysed
 from scipy import stats
 
-from mauvecl.lightcurve.flares.shapes import shape_of
-from mauvecl.observations.analysis import analyse_frames
+from mauvecl import SHAPES, Frames
 from mauvecl.observations.detection import detect_events
-from mauvecl.observations.event_fits import _ranges, _single
-from mauvecl.observations.event_windows import FittedFlare, Window
-from mauvecl.observations.events import measure_event, measure_events
+from mauvecl.observations.events import measure_event
 from mauvecl.observations.false_alarms import simulated_rates
-from mauvecl.observations.families import Family
-from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.level import quiet_variance
 from mauvecl.observations.light_curve import survey_light_curve
 from mauvecl.observations.noise import binned_scatter, likeness
-from mauvecl.observations.search import Detection, SeriesSurvey
+from mauvecl.observations.search import SeriesSurvey
 
-SHAPE = shape_of("davenport2014")
+SHAPE = SHAPES["davenport2014"]
 FRAMES, CADENCE_S, LEVEL, SD = 600, 60.0, 1000.0, 5.0
 TIME = np.arange(FRAMES) * CADENCE_S
 
@@ -79,59 +73,6 @@ def test_intervals_of_the_fitted_equivalent_duration_cover(threshold: float) -> 
     assert stats.binom.ppf(0.0005, number, 0.6827) <= inside <= stats.binom.ppf(0.9995, number, 0.6827)
 
 
-@pytest.mark.long
-def test_long_flares_are_fitted_in_bins_with_the_same_result(threshold: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    survey = survey_of(light_curve(np.random.default_rng(298), LEVEL * (1 + 0.05 * flare(15_000, 3000))))
-    found, taken = detect_events(survey, threshold)
-    (best,) = found
-    fits = []
-    for bins in (400, 150):
-        monkeypatch.setattr("mauvecl.observations.event_windows.MAX_INSIDE", bins)
-        fits.append(measure_event(survey, taken, survey.flux_level(~taken), best).energy)
-    whole, binned = fits
-    assert whole.dof > 1.3 * binned.dof
-    # Bins tell shapes apart less well: both fits differ by a part of the standard error.
-    width = whole.high_s[0] - whole.low_s[0]
-    assert binned.fitted_s == pytest.approx(whole.fitted_s, abs=0.3 * width)
-    assert binned.high_s[0] - binned.low_s[0] == pytest.approx(width, rel=0.5)
-
-
-def faint_star() -> tuple[SeriesSurvey, NDArray[np.bool_], Detection]:
-    """Return a star whose level is known to 0.3 % alone, the frames of a flare of an amplitude of 4, and the flare."""
-    flux = 100.0 * (1 + 4.0 * flare(15_000, 300.0)) + np.random.default_rng(299).normal(0.0, SD, FRAMES)
-    frames = Frames.of(TIME, flux, np.full(FRAMES, SD))
-    survey = SeriesSurvey.of(frames, flux, np.full(FRAMES, SD**2), np.ones(FRAMES, np.bool_), 100.0, 0.0, SHAPE)
-    taken = (np.arange(FRAMES) >= 240) & (np.arange(FRAMES) < 340)
-    return survey, taken, Detection(100.0, 300.0, 15_030.0, 0, 80.0, 240, 339)
-
-
-def test_error_of_a_fitted_duration_is_that_of_least_squares() -> None:
-    """Compare the part of the posterior at the best peak and half-width with the fit of amplitude and level there."""
-    survey, taken, one = faint_star()
-    window = Window.of(survey, taken, one)
-    start = FittedFlare(one.peak_s, 4.0, one.half_width_s, 4.0 * one.half_width_s * SHAPE.equivalent_duration)
-    (fit,) = _single(window, replace(Family.of(SHAPE, 1.0), epsilon=(0.0,)), SHAPE, start, _ranges(window))
-    (best,), part = fit.flares, int(np.argmax(fit.mixture.log_weight))
-    peak, half_width = np.array([best.peak_s]), np.array([best.half_width_s])
-    columns = np.column_stack([window.model(SHAPE, peak, half_width)[0] / window.scale, np.ones(window.values.size)])
-    covariance = np.linalg.inv(columns.T / window.noise @ columns)
-    light, level = covariance @ (columns.T / window.noise @ window.values)
-    duration = light / level * best.half_width_s * SHAPE.equivalent_duration
-    along = duration * np.array([1 / light, -1 / level])
-    assert fit.mixture.mean[part] == pytest.approx(duration, rel=1e-6)
-    assert fit.mixture.sd[part] == pytest.approx(np.sqrt(along @ covariance @ along), rel=1e-6)
-
-
-def test_error_of_a_summed_duration_includes_that_of_its_level() -> None:
-    """Both the light above the level and the unit of the duration follow from the mean of the other 500 frames."""
-    survey, taken, one = faint_star()
-    energy = measure_event(survey, taken, survey.flux_level(~taken), one).energy
-    level = survey.flux[~taken].mean() * SD
-    frames = energy.summed_s * energy.level * 100.0 / level / CADENCE_S
-    expected = SD / level * CADENCE_S * np.sqrt(100 + (100 + frames) ** 2 / 500)
-    assert energy.summed_error_s * energy.level * 100.0 / level == pytest.approx(expected, rel=1e-6)
-
-
 def test_noise_at_the_level_is_that_of_its_counts() -> None:
     """Stated errors are those of the counts of each frame, of which a flare has more than the level."""
     rng = np.random.default_rng(300)
@@ -142,43 +83,6 @@ def test_noise_at_the_level_is_that_of_its_counts() -> None:
     variance, slope = quiet_variance(flux, np.sqrt(flux + 25), np.full(FRAMES, level), quiet)
     assert slope == pytest.approx(1.0, rel=1e-9)
     np.testing.assert_allclose(variance, level + 25, rtol=1e-9)
-
-
-def test_a_flare_is_found_at_its_time_and_a_step_is_a_step(threshold: float) -> None:
-    rng = np.random.default_rng(292)
-    survey = survey_of(light_curve(rng, LEVEL * (1 + 0.1 * flare(15_000, 400))))
-    found, taken = detect_events(survey, 5.0)
-    (event,) = (measure_event(survey, taken, survey.flux_level(~taken), one) for one in found)
-    assert event.kind == "flare"
-    assert abs(survey.time_s[event.brightest] - 15_000) < 300
-    stepped = survey_of(light_curve(rng, LEVEL + np.where(TIME > 24_000, 40.0, 0.0)))
-    found, taken = detect_events(stepped, 6.0)
-    assert {one.kind for one in measure_events(stepped, taken, found)} == {"step"}
-
-
-def test_single_frames_and_dips_are_flagged_and_a_flare_of_three_frames_is_not() -> None:
-    rng = np.random.default_rng(293)
-    mean = np.full(FRAMES, LEVEL)
-    mean[100] += 100
-    mean[200] -= 100
-    mean[300:303] += (100, 60, 40)
-    frames = light_curve(rng, mean)
-    reasons = survey_light_curve(frames, SHAPE, 1)[1].reasons
-    assert {int(k): int(reasons[k]) for k in np.flatnonzero(reasons)} == {100: Reason.SPIKE, 200: Reason.BELOW}
-
-
-@pytest.mark.long
-def test_the_level_follows_rotation_and_the_noise_does_not() -> None:
-    rng = np.random.default_rng(294)
-    time = np.arange(8000) * 120.0
-    rotation = LEVEL * (1 + 0.02 * np.sin(2 * np.pi * time / 2.6e5))
-    frames = Frames.of(time, rng.normal(rotation, SD), np.full(time.size, SD / 2))
-    level = survey_light_curve(frames, SHAPE, 1)[1]
-    # Six standard errors of the level, which are those of its departures from the truth.
-    assert np.abs((level.level - rotation) / level.level_error).max() < 6
-    assert np.sqrt(np.mean(((level.level - rotation) / level.level_error) ** 2)) == pytest.approx(1.0, abs=0.5)
-    # The stated errors are half of the true ones; their estimate has a standard error of 1.4 %.
-    assert level.excess == pytest.approx(2.0, rel=0.06)
 
 
 @pytest.mark.long
@@ -210,20 +114,76 @@ def test_correlations_do_not_bridge_gaps() -> None:
         assert likeness(pairs, np.column_stack([first, second]).reshape(-1, 1)).alike == alike
 
 
+def test_a_flare_is_found_at_its_time_and_a_step_is_a_step() -> None:
+    rng = np.random.default_rng(292)
+    (event,) = analysed(light_curve(rng, LEVEL * (1 + 0.1 * flare(15_000, 400)))).events
+    assert event["kind"] == "flare"
+    assert abs(event["tpeak"].to_value("s") - 15_000) < 300
+    stepped = analysed(light_curve(rng, LEVEL + np.where(TIME > 24_000, 40.0, 0.0))).events
+    assert "flare" not in set(stepped["kind"][stepped["verdict"] == "detected"])
+    assert "step" in set(stepped["kind"])
+
+
+def test_single_frames_and_dips_are_flagged_and_a_flare_of_three_frames_is_not() -> None:
+    rng = np.random.default_rng(293)
+    mean = np.full(FRAMES, LEVEL)
+    mean[100] += 100
+    mean[200] -= 100
+    mean[300:303] += (100, 60, 40)
+    reasons = analysed(light_curve(rng, mean)).frames["reason"]
+    assert {k: str(one) for k, one in enumerate(reasons) if one} == {100: "spike", 200: "below"}
+
+
+@pytest.mark.long
+def test_the_level_follows_rotation_and_the_noise_does_not() -> None:
+    rng = np.random.default_rng(294)
+    time = np.arange(6000) * 120.0
+    rotation = LEVEL * (1 + 0.02 * np.sin(2 * np.pi * time / 2.6e5))
+    table = analysed(Frames.of(time, rng.normal(rotation, SD), np.full(time.size, SD / 2))).frames
+    # Six standard errors of the level, which are those of its departures from the truth.
+    off = np.asarray((table["level"] - rotation) / table["level_error"])
+    assert np.abs(off).max() < 6
+    assert np.sqrt(np.mean(off**2)) == pytest.approx(1.0, abs=0.5)
+    # The stated errors are half of the true ones; their estimate has a standard error of 1.4 %.
+    assert float(np.median(table["error"])) == pytest.approx(SD, rel=0.06)
+
+
 @pytest.mark.long
 def test_flares_at_the_limit_are_detected_nine_times_in_ten() -> None:
     """New light curves with flares at the stated limit; fails by chance once in a thousand times."""
     rng = np.random.default_rng(297)
-    analysis = analyse_frames(light_curve(rng))
-    width = float(analysis.completeness.half_widths_s[1])
-    limit = analysis.completeness.limit(1)
+    limits = analysed(light_curve(rng)).limits
+    width, limit = (limits[name][1].to_value("s") for name in ("half_width", "limit"))
     amplitude = limit / width / SHAPE.equivalent_duration
-    seen, number = 0, 100
+    seen, number = 0, 30
     for _ in range(number):
         peak = float(rng.uniform(4000, 32_000))
-        survey = survey_of(light_curve(rng, LEVEL * (1 + amplitude * flare(peak, width))))
-        best = survey.search.largest(survey.sums[None])
-        seen += best.maximum[0] >= analysis.candidates and abs(best.peak_s[0] - peak) < 4 * width + 300
+        events = analysed(light_curve(rng, LEVEL * (1 + amplitude * flare(peak, width)))).events
+        seen += any(abs(events["tpeak"].to_value("s") - peak) < 4 * width + 300)
     # The limit itself comes from forty injections per size: its completeness is known to some 5 %.
     low, high = stats.binom.ppf([0.0005, 0.9995], number, [0.78, 0.97])
     assert low <= seen <= high
+
+
+def test_errors_of_durations_include_that_of_the_level() -> None:
+    """A star whose level is known to 0.3 %: fitted and summed durations by least squares of light and level."""
+    flux = 100.0 * (1 + 4.0 * flare(15_000, 300.0)) + np.random.default_rng(299).normal(0.0, SD, FRAMES)
+    (event,) = analysed(Frames.of(TIME, flux, np.full(FRAMES, SD))).analysis.events
+    energy, inside = event.energy, event.last - event.first + 1
+    level = energy.level
+    frames = energy.summed_s / CADENCE_S
+    quiet = FRAMES - inside
+    expected = SD / 100.0 * CADENCE_S * np.sqrt(inside + (inside + frames) ** 2 / quiet)
+    assert energy.summed_error_s == pytest.approx(expected, rel=0.15), (level, inside)
+    # Peak, half-width, amplitude and level are free.
+    theta = np.array([15_000.0, np.log(300.0), 4.0, 1.0])
+
+    def model(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(x[3] * 100.0 * (1 + x[2] * flare(x[0], float(np.exp(x[1])))))
+
+    steps = np.diag([5.0, 1e-3, 1e-3, 1e-4])
+    columns = np.array([(model(theta + s) - model(theta - s)) / (2 * s.max()) for s in steps])
+    covariance = np.linalg.inv(columns @ columns.T / SD**2)
+    slope = np.array([0.0, 1.0, 1 / 4.0, 0.0])
+    sd = 4.0 * 300.0 * SHAPE.equivalent_duration * np.sqrt(slope @ covariance @ slope)
+    assert (energy.high_s[0] - energy.low_s[0]) / 2 == pytest.approx(sd, rel=0.4)

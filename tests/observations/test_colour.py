@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from scenes import analysed
 from scipy import stats
 
-from mauvecl.answers.observations.analyse import AnalyseAnswer
-from mauvecl.observations.analysis import analyse_frames
+from mauvecl import Frames
 from mauvecl.observations.colour import event_colour
-from mauvecl.observations.frames import Frames
-from mauvecl.study.study import Study
 
 PIXELS, FRAMES = 40, 300
 STAR = np.linspace(100.0, 900.0, PIXELS)
@@ -44,7 +42,7 @@ def test_the_answer_tells_a_flare_from_a_change_of_throughput() -> None:
     error = np.full(mean.shape, 15.0)
     wavelength = np.linspace(200.0, 700.0, PIXELS)
     frames = Frames.of(np.arange(FRAMES) * 60.0, rng.normal(mean, error), error, wavelength_nm=wavelength)
-    events = AnalyseAnswer(Study(), analyse_frames(frames)).events
+    events = analysed(frames).events
     flare, change = (next(row for row in events if row["istart"] <= at <= row["istop"]) for at in (82, 205))
     assert flare["blue_over_red"] > 2
     assert flare["p_no_colour"] < 1e-6

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mauvecl.lightcurve.flares.shapes import SHAPES
+from mauvecl import SHAPES
 from mauvecl.observations.event_fits import Mixture
 from mauvecl.observations.event_windows import Likelihood
 from mauvecl.observations.families import Family, families

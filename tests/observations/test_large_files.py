@@ -12,9 +12,9 @@ import pytest
 from astropy.io import fits
 from layouts import Truth, row_per_frame
 
+from mauvecl import InputError, read_frames
 from mauvecl.observations.mapping import FrameMapping
-from mauvecl.observations.reading import read_frames, reduce_frames
-from mauvecl.schema.errors import InputError
+from mauvecl.observations.reading import reduce_frames
 
 FRAMES, PIXELS = 65_536, 1024
 #: The address space may grow by this while a file of 256 MiB is read.

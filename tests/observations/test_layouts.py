@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from layouts import documented_files
 
-from mauvecl.observations.reading import read_frames
+from mauvecl import read_frames
 
 
 def test_every_example_of_the_page_gives_the_same_frames(tmp_path: Path) -> None:

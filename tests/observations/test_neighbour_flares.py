@@ -9,14 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mauvecl.answers.observations.analyse import analyse
+from mauvecl import Frames, Instrument, Source, Study, analyse, expect
 from mauvecl.answers.observations.neighbour_flares import NeighbourFlare, blended_stars
-from mauvecl.host.expectation import expect
-from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.host.stars.source import Source
-from mauvecl.observations.frames import Frames
 from mauvecl.study.cases import cases
-from mauvecl.study.study import Study
 
 SHARE = 0.8
 

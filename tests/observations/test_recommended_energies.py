@@ -5,13 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scenes import flare
+from scenes import analysed, flare
 from scipy import stats
 
-from mauvecl.lightcurve.flares.shapes import SHAPES, TableShape
-from mauvecl.observations.analysis import analyse_frames
+from mauvecl import SHAPES, Frames, TableShape
 from mauvecl.observations.energies import Energy
-from mauvecl.observations.frames import Frames
 
 Float = NDArray[np.float64]
 DAVENPORT = SHAPES["davenport2014"]
@@ -23,7 +21,7 @@ def measured(
     """Return the energy of the largest event, None if there is none, and the amplitude that a flare of some S/N has."""
     size = np.exp(rng.uniform(*np.log(snr))) / np.sqrt(float(light @ light))
     flux = 1e4 + size * light + rng.standard_normal(time_s.size)
-    analysis = analyse_frames(Frames.of(time_s, flux, np.ones(time_s.size)), per="day")
+    analysis = analysed(Frames.of(time_s, flux, np.ones(time_s.size)), per="day").analysis
     largest = max(analysis.events, key=lambda one: one.value, default=None)
     return None if largest is None else largest.energy, size / 1e4
 

@@ -11,22 +11,21 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from mauvecl import Study, analyse
+from mauvecl import SHAPES, Frames, Study, analyse
 from mauvecl.answers.observations.analyse import frame_model
-from mauvecl.lightcurve.flares.shapes import shape_of
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K
 from mauvecl.observations.analysis import analyse_frames
 from mauvecl.observations.detection import detect_events
 from mauvecl.observations.event_spectrum import drifts, event_spectrum, measure_flare
 from mauvecl.observations.false_alarms import simulated_rates
 from mauvecl.observations.frame_model import FrameModel
-from mauvecl.observations.frames import Frames, Reason
+from mauvecl.observations.frames import Reason
 from mauvecl.observations.search import SeriesSurvey
 from mauvecl.observations.spectra import CleanedSpectra, SpectralSeries, clean_spectra, survey_spectra
 from tests.refusals import refused
 
 Float = NDArray[np.float64]
-SHAPE = shape_of("davenport2014")
+SHAPE = SHAPES["davenport2014"]
 N, FRAME_S = 720, 5.0
 TIME = (np.arange(N) + 0.5) * FRAME_S
 # One false alarm per star-day needs few resampled frames.

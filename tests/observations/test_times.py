@@ -12,13 +12,11 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.time import Time
 
-from mauvecl import Study, analyse
+from mauvecl import Frames, Study, analyse, read_frames
 from mauvecl.host.orbit.orbit import Orbit
 from mauvecl.host.orbit.targets import Target
 from mauvecl.host.orbit.time_grid import TimeGrid
 from mauvecl.observations.barycentre import barycentric
-from mauvecl.observations.frames import Frames
-from mauvecl.observations.reading import read_frames
 
 RNG = np.random.default_rng(29)
 TIME = np.arange(200) * 30.0 + 15.0

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scenes import analysed
 
-from mauvecl import Frames, Study, analyse
-from mauvecl.lightcurve.flares.shapes import shape_of
-from mauvecl.observations.analysis import analyse_frames
+from mauvecl import SHAPES, Frames, Study, analyse
 from mauvecl.observations.detection import fit_quiet_light
 from mauvecl.observations.level import guess_flares
 from mauvecl.observations.losses import sudden_losses
@@ -50,7 +49,7 @@ def test_tail_of_a_bright_flare_without_its_peak_is_an_event(
     time = (np.arange(round(window * half_width_s / frame_s)) + 0.5) * frame_s
     flux = 1 + amplitude * flare(time, frame_s, -after * half_width_s, half_width_s)
     flux += noise * rng.standard_normal(time.size)
-    analysis = analyse_frames(Frames.of(time, flux, np.full(time.size, noise)), per="month")
+    analysis = analysed(Frames.of(time, flux, np.full(time.size, noise)), per="month").analysis
     event = max(analysis.events, key=lambda one: one.value)
     assert event.first == 0
     assert event.cut
@@ -68,9 +67,9 @@ def test_end_of_a_search_at_its_largest_number_of_events_is_stated(monkeypatch: 
     for peak in np.linspace(2e3, 18e3, 4):
         flux += 0.1 * flare(time, 20.0, peak, 60.0)
     frames = Frames.of(time, flux, np.full(time.size, 1e-3))
-    assert not any("ended at" in line for line in analyse_frames(frames).messages)
+    assert not any("ended at" in line for line in analysed(frames).analysis.messages)
     monkeypatch.setattr("mauvecl.observations.detection.MOST_EVENTS", 3)
-    ended = analyse_frames(frames)
+    ended = analysed(frames).analysis
     assert any(f"ended at {len(ended.events)} events" in line for line in ended.messages)
 
 
@@ -84,7 +83,7 @@ def test_losses_are_found_at_their_frames_and_a_flare_is_none() -> None:
     flux = 1 - 0.03 * lost + 0.02 * flare(time, 20.0, 11_000.0, 60.0) + noise * rng.standard_normal(time.size)
     frames = Frames.of(time, flux, np.full(time.size, noise))
     used = np.ones(time.size, np.bool_)
-    survey = SeriesSurvey.of(frames, flux, np.full(time.size, noise**2), used, 1.0, 0.0, shape_of("davenport2014"))
+    survey = SeriesSurvey.of(frames, flux, np.full(time.size, noise**2), used, 1.0, 0.0, SHAPES["davenport2014"])
     found = sudden_losses(survey, *fit_quiet_light(survey, guess_flares(frames.numbers, flux)))
     assert found[lost].mean() > 0.9
     assert found[~lost].mean() < 0.05
