@@ -9,8 +9,7 @@ import pytest
 from refusals import Row, check
 from scenes import instrument, star
 
-from mauvecl.device.engine import Engine
-from mauvecl.host.expectation import Expectation
+from mauvecl import Engine, Expectation
 
 PAYLOAD = instrument(part=True)
 

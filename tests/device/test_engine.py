@@ -17,13 +17,11 @@ from refusals import refused
 from scenes import instrument, star
 from scipy import stats
 
-from mauvecl.device.engine import Engine
+from mauvecl import Comparison, CosmicRays, Engine, Normal, PixelMap, Processes, Uniform
 from mauvecl.device.toy_exposure import toy
 from mauvecl.device.variants import scene_launches
-from mauvecl.host.instrument.pixel_map import PixelMap
 from mauvecl.noise import reference
-from mauvecl.noise.comparison import NOISE_FREE, Comparison
-from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
+from mauvecl.noise.comparison import NOISE_FREE
 from mauvecl.noise.scene import prepare
 from mauvecl.results import numpy_kernels
 from mauvecl.results.counts.tally import Tally

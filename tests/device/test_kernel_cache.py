@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
+from mauvecl import Engine
 from mauvecl.device import kernel_cache
-from mauvecl.device.engine import Engine
 from mauvecl.device.kernel_cache import KernelCache
 from mauvecl.device.program import build
 

@@ -8,14 +8,11 @@ import numpy as np
 import pytest
 from scenes import instrument, star
 
-from mauvecl.device.engine import Engine
-from mauvecl.noise.processes import Normal, Processes, Uniform
+from mauvecl import Engine, Linear, Normal, Nuisances, Processes, Uniform
 from mauvecl.noise.scene import prepare
 from mauvecl.results import numpy_kernels
 from mauvecl.results.requests.channels import plan_channels
 from mauvecl.results.requests.hypotheses import Hypotheses
-from mauvecl.statistics.linear import Linear
-from mauvecl.statistics.nuisances import Nuisances
 
 INDEX = np.arange(2**32 - 24, 2**32 + 16, dtype=np.uint64)
 SEED = 2**63 + 4711

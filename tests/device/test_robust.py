@@ -14,7 +14,9 @@ import pyopencl as cl
 import pytest
 from refusals import refused
 
-from mauvecl.device.engine import DeviceError, Engine, devices
+from mauvecl import Engine
+from mauvecl.device.engine import devices
+from mauvecl.device.errors import DeviceError
 from mauvecl.device.kernel_cache import kernel_cache
 from mauvecl.device.toy_exposure import toy
 

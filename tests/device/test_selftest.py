@@ -10,14 +10,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from mauvecl import Engine, LocalWorkers, Pool, Study
 from mauvecl.answers import files
 from mauvecl.cli.app import app
 from mauvecl.device import program, selftest, selftest_outcome
-from mauvecl.device.engine import Engine
 from mauvecl.device.kernel_cache import KernelCache
 from mauvecl.device.selftest_outcome import Check
-from mauvecl.runs.pool import LocalWorkers, Pool
-from mauvecl.study.study import Study
 
 WEAKER = "same draws to float rounding: no fused multiply-add"
 

@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mauvecl.device.engine import Engine
+from mauvecl import Engine, Processes
 from mauvecl.device.toy_exposure import toy
 from mauvecl.noise import layout, reference
 from mauvecl.noise.additive import NEGLIGIBLE
 from mauvecl.noise.components import components
-from mauvecl.noise.processes import Processes
 from mauvecl.noise.scene import prepare
 from mauvecl.noise.unknowns import ADDITIVE
 

@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 from scenes import instrument, star
 
-from mauvecl.device.engine import Engine
+from mauvecl import CosmicRays, Engine, Expectation, Normal, PixelMap, Processes
 from mauvecl.device.toy_exposure import toy
 from mauvecl.device.variants import scene_launches
-from mauvecl.host.expectation import Expectation
-from mauvecl.host.instrument.pixel_map import PixelMap
 from mauvecl.noise.poisson import SMALLEST_EXPANDED, alias_table
-from mauvecl.noise.processes import CosmicRays, Normal, Processes
 from mauvecl.noise.scene import prepare
 
 #: Sixteen groups of four; pixel i of group g has a mean for the expansion where bit i of g is set, else for a table.

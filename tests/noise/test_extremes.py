@@ -9,12 +9,11 @@ import pytest
 from refusals import refused
 from scenes import instrument, star
 
-from mauvecl.device.engine import Engine
+from mauvecl import CosmicRays, Engine, Expectation, Processes
 from mauvecl.device.tiles import Tile
 from mauvecl.device.variants import scene_launches
-from mauvecl.host.expectation import PER_PIXEL, Expectation
+from mauvecl.host.expectation import PER_PIXEL
 from mauvecl.noise import layout, reference
-from mauvecl.noise.processes import CosmicRays, Processes
 from mauvecl.noise.scene import Scene, prepare
 
 INVERSE = [pow(m, -1, 2**32) for m in (0xD2511F53, 0xCD9E8D57)]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scenes import instrument, star
 
+from mauvecl import Normal, Processes, Uniform
 from mauvecl.noise.factor_distributions import FactorDistributions, changes_of
-from mauvecl.noise.processes import Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
 from mauvecl.statistics.distributions import Gaussian, Mixture, QuadraticForm
 

@@ -10,9 +10,8 @@ import pytest
 from refusals import Row, check
 from scenes import instrument, star
 
+from mauvecl import CosmicRays, Normal, Processes, Stare, Uniform
 from mauvecl.device.toy_exposure import toy
-from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
 
 PAYLOAD = instrument(part=True)

@@ -9,10 +9,10 @@ import pytest
 from scenes import instrument, star
 from scipy import stats
 
-from mauvecl.device.engine import Engine
+from mauvecl import CosmicRays, Engine, Normal, Processes, Uniform
 from mauvecl.noise import layout, random_numbers, reference
 from mauvecl.noise.components import components
-from mauvecl.noise.processes import NONE, CosmicRays, Normal, Processes, Uniform
+from mauvecl.noise.processes import NONE
 from mauvecl.noise.scene import prepare
 
 N = 20_000

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from scenes import instrument, star
 
-from mauvecl.device.engine import Engine
-from mauvecl.host.expectation import Expectation
+from mauvecl import Engine, Expectation, Normal, Processes
 from mauvecl.noise import reference
-from mauvecl.noise.processes import Normal, Processes
 from mauvecl.noise.scene import prepare
 
 N = 4000

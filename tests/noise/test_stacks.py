@@ -11,11 +11,9 @@ from refusals import refused
 from scenes import instrument, star
 from scipy import optimize
 
-from mauvecl.device.engine import Engine
+from mauvecl import Engine, Expectation, Processes, Uniform
 from mauvecl.device.toy_exposure import toy
-from mauvecl.host.expectation import Expectation
 from mauvecl.noise.cumulants import Cumulants, stack_is_exact
-from mauvecl.noise.processes import Processes, Uniform
 from mauvecl.noise.scene import prepare
 
 #: Smallest number of draws of one pixel that distinguish an allowed stack from its frames, by exact convolution.

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl import Processes, Stare
 from mauvecl.noise import layout
-from mauvecl.noise.processes import Processes
 from mauvecl.noise.unknowns import (
     ADDITIVE,
     COURSES,

@@ -19,27 +19,33 @@ from answers import N, same, same_snr, small
 from refusals import refused
 from scenes import instrument, star
 
-from mauvecl.answers.detection.detect import detect
-from mauvecl.answers.detection.maps import detection_map
-from mauvecl.answers.limits.limits import limiting_magnitude
+from mauvecl import (
+    Comparison,
+    Detection,
+    Engine,
+    Expectation,
+    InputError,
+    Linear,
+    LocalWorkers,
+    Pool,
+    Processes,
+    Study,
+    Uniform,
+    detect,
+    detection_map,
+    limiting_magnitude,
+    snr,
+)
 from mauvecl.answers.progress import reported
-from mauvecl.answers.signal.snr import snr
-from mauvecl.device.engine import DeviceError, Engine
-from mauvecl.host.expectation import Expectation
-from mauvecl.noise.comparison import Comparison
+from mauvecl.device.errors import DeviceError
 from mauvecl.noise.drawing import Drawing
-from mauvecl.noise.processes import Processes, Uniform
-from mauvecl.results.detection.detection import Detection
 from mauvecl.results.requests.requests import DetectRequest, Shard, SnrRequest
 from mauvecl.results.shard_sums import Arrays
 from mauvecl.runs import shards
 from mauvecl.runs.checkpoint import Checkpoint, _digest_of
-from mauvecl.runs.pool import LocalWorkers, Pool, Stopped, map_in_order
+from mauvecl.runs.pool import Stopped, map_in_order
 from mauvecl.runs.shards import fingerprint
-from mauvecl.schema.errors import InputError
-from mauvecl.statistics.linear import Linear
 from mauvecl.study.cases import Case
-from mauvecl.study.study import Study
 
 pytestmark = pytest.mark.usefixtures("small_shards")
 

@@ -7,8 +7,8 @@ import sys
 import pytest
 from refusals import refused
 
+from mauvecl import DaskWorkers
 from mauvecl.device.errors import DeviceError
-from mauvecl.runs.cluster import DaskWorkers
 
 #: Value of `cluster`, and what is expected instead.
 CLUSTERS = {

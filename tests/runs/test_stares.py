@@ -14,13 +14,11 @@ from scenes import FIRST_STARE as START
 from scenes import N_STARES as N
 from scenes import flaring_stares as request
 
-from mauvecl.device.engine import Engine
-from mauvecl.device.stare_engine import Stares
+from mauvecl import Engine, LocalWorkers, Pool, Stare, Stares
 from mauvecl.lightcurve.stares.frame_components import Components
-from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.runs import shards
 from mauvecl.runs.checkpoint import Checkpoint
-from mauvecl.runs.pool import LocalWorkers, Pool, Stopped
+from mauvecl.runs.pool import Stopped
 
 pytestmark = pytest.mark.usefixtures("small_shards")
 

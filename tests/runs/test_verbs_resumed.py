@@ -14,13 +14,10 @@ import numpy as np
 import pytest
 from commands import run
 
-from mauvecl import Engine, Study, measure
+from mauvecl import Engine, LocalWorkers, Pool, Stares, Study, measure, plan
 from mauvecl.answers.campaigns import planned_injections
-from mauvecl.answers.campaigns.plan import plan
 from mauvecl.answers.stares import stare as stares_module
-from mauvecl.device.stare_engine import Stares
 from mauvecl.runs.checkpoint import Checkpoint, kept
-from mauvecl.runs.pool import LocalWorkers, Pool
 
 PLAN = [
     "plan.targets=[{name = 'eps Eri'}, {name = 'GJ 205'}]",

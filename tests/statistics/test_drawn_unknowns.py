@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mauvecl import Study
 from mauvecl.noise.factor_distributions import changes_of
 from mauvecl.statistics.distributions import Mixture
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.statistics.statistic import Differences, Statistic
 from mauvecl.study.cases import Case
-from mauvecl.study.study import Study
 
 
 @pytest.mark.parametrize("name", ["matched", "uv_excess"])

@@ -7,10 +7,8 @@ import pytest
 from refusals import Row, check
 from scenes import instrument, star
 
-from mauvecl.host.expectation import Expectation
-from mauvecl.noise.comparison import Comparison
+from mauvecl import Comparison, Expectation, Nuisances
 from mauvecl.statistics.linear import Matched
-from mauvecl.statistics.nuisances import Nuisances
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.statistics.statistic import Setting
 
