@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import python
 
 from mauvecl import Engine, Processes
 from mauvecl.device.toy_exposure import toy
-from mauvecl.noise import layout, reference
+from mauvecl.noise import layout, reference, unknowns
 from mauvecl.noise.scene import prepare
-from mauvecl.noise.unknowns import ADDITIVE
 
 N = 4000
 
 
-@pytest.mark.parametrize("name", ADDITIVE)
+@pytest.mark.parametrize("name", unknowns.ADDITIVE)
 def test_charge_is_a_distribution(name: str) -> None:
     """The distribution sums to one, and its variance is that of the process; longer times add up independently."""
-    process = ADDITIVE[name]()
+    process = unknowns.ADDITIVE[name]()
     short, long = process.charge(50.0), process.charge(100.0)
     assert short.sum() == pytest.approx(1.0, abs=1e-9)
     assert short.size <= process.most_electrons(50.0) + 1
@@ -37,10 +34,10 @@ def test_charge_is_a_distribution(name: str) -> None:
     assert process.variance_dn2(quiet) == pytest.approx(variance * quiet.gain_dn_per_electron**2)
 
 
-@pytest.mark.parametrize("name", ADDITIVE)
+@pytest.mark.parametrize("name", unknowns.ADDITIVE)
 def test_device_draws_what_the_reference_draws(engine: Engine, name: str) -> None:
     quiet = toy(64, 3)
-    processes = Processes(**{name: ADDITIVE[name]()}).with_particles(500.0)
+    processes = Processes(**{name: unknowns.ADDITIVE[name]()}).with_particles(500.0)
     index = np.arange(20, dtype=np.uint64)
     scene = prepare([quiet], processes=processes)
     assert scene.additive == (name,)
@@ -82,7 +79,7 @@ from mauvecl.lightcurve.stares import stare_reference as twin
 from mauvecl.noise import reference
 from mauvecl.noise.scene import prepare
 sections = {"bursts": {"per_s": 0.02}, "cosmic_rays": {"rate_per_cm2_s": 300.0}}
-study = Study.build({"star": [{"library": "G2V"}], "processes": sections}, "t")
+study = Study.build({"star": [{"library": "G2V", "magnitude": 7.4}], "processes": sections}, "t")
 both = study.processes
 quiet, engine, index = toy(64, 3), Engine(), np.arange(NUMBER, dtype=np.uint64)
 bursts = Processes(bursts=both.bursts)
@@ -114,12 +111,9 @@ print(json.dumps({
 
 
 @pytest.mark.long
-def test_another_process_needs_its_class_and_row_only(tmp_path: Path) -> None:
+def test_another_process_needs_its_class_and_row_only() -> None:
     """Section, kernels, reference, stares and decomposition follow a row; the added charge is that of the class."""
-    script = tmp_path / "toy.py"
-    script.write_text(TOY.replace("NUMBER", str(N)), encoding="utf-8")
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr
+    done = python(TOY.replace("NUMBER", str(N)))
     found = json.loads(done.stdout.splitlines()[-1])
     assert found["keys"] == ["cosmic_rays", "bursts"]
     assert found["kept"]
