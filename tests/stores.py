@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mauvecl.device.engine import Engine
-from mauvecl.host.files import atomic
-from mauvecl.study.study import Study
+from mauvecl import Engine, Study
 
 CHUNK, LAST = "star-1/quiescent/c/1/0", "star-1/flare-1/c/4/0"
 
@@ -88,4 +86,4 @@ def full_after(n_bytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
             raise OSError(28, "No space left on device")
         real(handle)
 
-    monkeypatch.setattr(atomic.os, "fsync", fsync)
+    monkeypatch.setattr(os, "fsync", fsync)
