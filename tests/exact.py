@@ -63,3 +63,45 @@ def worst_tail(p: Float, q: Float) -> float:
         here = (one > special.ndtr(-6.0)) & (one < special.ndtr(-5.0))
         found = max(found, float(np.abs(other[here] / one[here] - 1).max(initial=0.0)))
     return found
+
+
+def expansion(
+    gaussian: float, poisson: Sequence[tuple[float, float]], *, fourth_power: bool = True, varying: bool = False
+) -> tuple[float, Float]:
+    """Return the standard deviation of Gaussian and Poisson noise, and its Cornish-Fisher polynomial of a normal.
+
+    Parameters
+    ----------
+    gaussian, poisson
+        As in `counts`.
+    fourth_power : bool
+        Whether the polynomial includes z^4.
+    varying : bool
+        Whether it is that of factors on light and dark: without the fourth power, it lacks all of third order.
+    """
+    sd = float(np.sqrt(gaussian + sum(mean * step**2 for mean, step in poisson)))
+    a, b, c = (sum(mean * (step / sd) ** order for mean, step in poisson) for order in (3, 4, 5))
+    shape = np.array([
+        -a / 6 + c / 40 - a * b / 12 + 17 * a**3 / 324,
+        1 - b / 8 + 5 * a**2 / 36,
+        a / 6 - c / 20 + 5 * a * b / 24 - 53 * a**3 / 324,
+        b / 24 - a**2 / 18,
+        c / 120 - a * b / 24 + a**3 / 27,
+    ])  # fmt: skip
+    if not fourth_power:
+        shape[4] = 0.0
+        if varying:
+            shape[[0, 2]] = -a / 6, a / 6
+    return sd, shape
+
+
+def pearson(found: NDArray[np.int64], probability: Float) -> float:
+    """Return the two-sided p-value of Pearson's statistic, with rare outcomes in one bin."""
+    expected = found.sum() * probability
+    common = expected > 20
+    observed = np.append(found[common], found[~common].sum())
+    wanted = np.append(expected[common], found.sum() - expected[common].sum())
+    if wanted[-1] < 20:
+        observed, wanted = observed[:-1], wanted[:-1]
+    upper = float(special.chdtrc(observed.size - 1, np.sum((observed - wanted) ** 2 / wanted)))
+    return 2 * min(upper, 1 - upper)

@@ -82,7 +82,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("request.flares.part(first - request.start,", "request.flares.part(done,"),
     ),
     "a shard under another's name": (
-        "test_misplaced_shard_is_found",
+        "test_interrupted_run_is_resumed_whatever_happens_to_its_files[misplaced]",
         ('name.encode() + b"\\0" + body', "body"),
     ),
     "foreign chunks unseen": (

@@ -2,34 +2,28 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from answers import same_counts
+from answers import same
 from marks import long_but
+from processes import python
 from refusals import refused
 from scenes import instrument, star
 from scipy import stats
 
-from mauvecl.device.engine import Engine
+from mauvecl import Comparison, CosmicRays, Engine, Linear, Normal, PixelMap, Processes, Uniform
 from mauvecl.device.toy_exposure import toy
-from mauvecl.device.variants import scene_launches
-from mauvecl.host.instrument.pixel_map import PixelMap
 from mauvecl.noise import reference
-from mauvecl.noise.comparison import NOISE_FREE, Comparison
-from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
 from mauvecl.results import numpy_kernels
 from mauvecl.results.counts.tally import Tally
-from mauvecl.results.requests.channels import ChannelPlan, plan_channels
+from mauvecl.results.requests.channels import plan_channels
 from mauvecl.results.requests.requests import DetectRequest
-from mauvecl.results.snr import elements, observers
 from mauvecl.statistics.registry import STATISTICS
 
 RAYS = CosmicRays(rate_per_cm2_s=200.0)
@@ -78,26 +72,28 @@ CASES = {
 }
 
 
-#: Cases whose statistics are tested at width 1: joint and separate draws, stacks and frames, with processes or without.
-#: Raw spectra, which use the same draws, are tested in all cases.
-ONE_BY_ONE = ("stack", "apart, electrons, frames", "priors, electrons, frames", "jitter, one frame, rays")
-#: Cases whose statistics are tested: every recipe, stacks and frames, uneven pixels, every process.
-COMPARED = (
-    "stack",
-    "one frame",
-    "cold",
-    "at the rail",
-    "apart, cold",
-    "apart, electrons, frames",
-    "uneven",
-    "uneven, pairs of two ways",
-    "cosmic rays, frames",
-    "priors",
-    "priors, electrons, frames",
-    "jitter, cold",
-    "jitter, one frame, rays",
-)
-#: Cases of `make test`: a joint draw, and separate draws frame by frame.
+FREE = float("inf")
+#: Further options of the statistics: comparisons with noisy exposures and estimated variances, and marginalised
+#: unknowns; the others are compared with the expectation, in every recipe, stacks and frames, with every process.
+COMPARED: list[tuple[str, dict[str, Any]]] = [
+    *((name, {}) for name in CASES if name not in ("electrons", "cold electrons", "frames", "apart", "noiseless")),
+    ("stack", {"comparison": Comparison(1)}),
+    ("stack", {"comparison": Comparison(0, True)}),
+    ("stack", {"comparison": Comparison(3)}),
+    *(
+        (name, {"comparison": Comparison(2, True)})
+        for name in ("at the rail", "apart, electrons, frames", "uneven", "priors")
+    ),
+    *((name, {"nuisances": {"dark": 0.1, "light": 0.02, "tilt": FREE}}) for name in ("stack", "one frame")),
+]
+#: Of these, tested with one realisation per work-item, too: joint and separate draws, stacks and frames, processes.
+ONE_BY_ONE = [
+    *((name, {}) for name in ("stack", "apart, electrons, frames", "priors, electrons, frames")),
+    ("jitter, one frame, rays", {}),
+    ("apart, electrons, frames", {"comparison": Comparison(2, True)}),
+    COMPARED[-2],
+]
+#: Cases of raw spectra in `make test`: a joint draw, and separate draws frame by frame.
 SHORT = ("stack", "apart, electrons, frames")
 
 
@@ -128,6 +124,14 @@ INDEX = np.arange(START, START + 40, dtype=np.uint64)
 SEED = 2**63 + 12345
 
 
+@cache
+def _reference_raw(name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Compute raw counts and each realisation's number of clipped samples with the reference, once for both widths."""
+    (quiet, *_), how = case(name)
+    scene = prepare([quiet], **how)
+    return reference.realise(scene, INDEX, SEED), reference.clipped(scene, INDEX, SEED).sum(axis=(1, 2))
+
+
 @pytest.mark.parametrize("name", long_but(CASES, *SHORT))
 def test_raw_spectra_equal_reference(any_width: Engine, name: str) -> None:
     (quiet, *_), how = case(name)
@@ -147,111 +151,60 @@ def test_raw_sums_above_float32_integers_are_exact(engine: Engine) -> None:
     np.testing.assert_array_equal(raw, reference.realise(scene, np.arange(40, dtype=np.uint64), SEED))
 
 
-@cache
-def _twin(name: str, comparison: Comparison) -> tuple[ChannelPlan, np.ndarray]:
-    """Compute every channel of a detection with the reference, once for both widths."""
+@pytest.mark.parametrize(("name", "more"), [
+    pytest.param(*row, marks=() if row == ("stack", COMPARED[-2][1]) else pytest.mark.long) for row in COMPARED
+])  # fmt: skip
+def test_statistics_equal_reference(engine: Engine, name: str, more: dict[str, Any]) -> None:
+    check_statistics(engine, name, **more)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "more"), ONE_BY_ONE)
+def test_statistics_equal_reference_at_width_one(one_by_one: Engine, name: str, more: dict[str, Any]) -> None:
+    check_statistics(one_by_one, name, **more)
+
+
+def check_statistics(engine: Engine, name: str, **more: Any) -> None:
+    """Compare all statistics with the NumPy reference, and without comparison and unknowns also their histograms."""
     (quiet, *flares), how = case(name)
-    asked = DetectRequest.of(
-        quiet, tuple(flares), INDEX.size, SEED, tuple(STATISTICS), START, comparison=comparison, **how
-    ).hypotheses
+    names: tuple[Any, ...] = tuple(STATISTICS)
+    if "nuisances" in more:
+        # Of those that can be marginalised, `uv_excess` would be degenerate with a flat dark and the star's light.
+        own = Linear("own", np.linspace(0.0, 1.0, quiet.wavelength_nm.size))
+        names = (*(one for one in names if STATISTICS[one].marginal and one != "uv_excess"), own)
+    kind = {"statistics": names, "start": START, "seed": SEED, **how, **more}
+    asked = DetectRequest.of(quiet, tuple(flares), INDEX.size, **kind).hypotheses
     plan = plan_channels(asked, range(len(flares)), first=True)
-    smoothed = numpy_kernels.Smoothed.of(asked, plan)
-    values = numpy_kernels.statistics(asked.scene, INDEX, SEED, plan, smoothed=smoothed)
-    values.setflags(write=False)
-    return plan, values
-
-
-@cache
-def _reference_raw(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Compute raw counts and each realisation's number of clipped samples with the reference."""
-    (quiet, *_), how = case(name)
-    scene = prepare([quiet], **how)
-    return reference.realise(scene, INDEX, SEED), reference.clipped(scene, INDEX, SEED).sum(axis=(1, 2))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", long_but(COMPARED, *SHORT))
-def test_statistics_equal_reference(engine: Engine, name: str) -> None:
-    check_statistics(engine, name)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", ONE_BY_ONE)
-def test_statistics_equal_reference_at_width_one(name: str, one_by_one: Engine) -> None:
-    check_statistics(one_by_one, name)
-
-
-def check_statistics(engine: Engine, name: str) -> None:
-    """Compare the statistics of the fast kernel, and all statistics with their histograms."""
-    (quiet, *flares), how = case(name)
-    kind = {"start": START, "seed": SEED, **how}
-    found = engine.detect(quiet, flares, realisations=INDEX.size, statistics=tuple(STATISTICS), **kind)
-    plan, values = _twin(name, NOISE_FREE)
+    smoothed = numpy_kernels.Smoothed.of(asked, plan) if len(plan.scales) else None
+    paired = "chi2_pair" in names
+    sums = numpy_kernels.statistics(asked.scene, INDEX, SEED, plan, pair=paired, smoothed=smoothed)
+    expected = numpy_kernels.marginalise(sums, plan.subtractions)
+    values = engine.statistic_values(quiet, flares, count=INDEX.size, **kind)
+    np.testing.assert_array_equal(values, expected)
+    if "nuisances" in more:
+        assert (values[0] < sums[0]).all(), "the subtraction changes the statistics"
+    if more == {"comparison": Comparison(1)}:
+        # Against one exposure, chi2 and chi2_pair differ only in the order of summation.
+        np.testing.assert_allclose(values[0], values[2], rtol=1e-5)
+    if more:
+        return
     fast = ("chi2", "chi2_element", "matched", "uv_excess")
-    alone = engine.statistic_values(quiet, flares, count=INDEX.size, statistics=fast, **kind)
+    alone = engine.statistic_values(quiet, flares, count=INDEX.size, **kind | {"statistics": fast})
     same = [row for row in range(len(alone)) if row % 3 != 2 or row >= 9]
     np.testing.assert_array_equal(alone[same], values[: len(alone)][same])
+    found = engine.detect(quiet, flares, realisations=INDEX.size, **kind)
     tally = Tally(plan.grids)
-    histogram, sums, outside = numpy_kernels.tally(values, tally.packed)
-    tally.add(histogram, sums, INDEX.size)
+    histogram, totals, outside = numpy_kernels.tally(values, tally.packed)
+    tally.add(histogram, totals, INDEX.size)
     for i, (statistic, role, flare) in enumerate(plan.keys):
         if role == "flare_on_null_grid":
             continue
         ours = found.distribution(statistic, None if role == "null" else flare, template=flare)
         assert tally.add_far(i, values[plan.grids[i].channel]) == outside[i]
-        expected = tally.distribution(i)
-        np.testing.assert_array_equal(ours.counts, expected.counts)
-        assert (ours.first, ours.second) == (expected.first, expected.second)
-        assert ours.far.equals(expected.far)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("name", "comparison"),
-    long_but(
-        [
-            ("stack", Comparison(1)),
-            ("stack", Comparison(0, True)),
-            ("stack", Comparison(3)),
-            *((name, Comparison(2, True)) for name in ("at the rail", "apart, electrons, frames", "uneven", "priors")),
-        ],
-        ("stack", Comparison(1)),
-    ),
-)
-def test_comparisons_equal_reference(engine: Engine, name: str, comparison: Comparison) -> None:
-    """Compare statistics with noisy quiescent exposures, one or several, and with estimated variances."""
-    check_comparison(engine, name, comparison)
-
-
-@pytest.mark.long
-def test_comparisons_equal_reference_at_width_one(one_by_one: Engine) -> None:
-    check_comparison(one_by_one, "apart, electrons, frames", Comparison(2, True))
-
-
-def check_comparison(engine: Engine, name: str, comparison: Comparison) -> None:
-    (quiet, *flares), how = case(name)
-    kind = {"statistics": tuple(STATISTICS), "start": START, "seed": SEED, "comparison": comparison, **how}
-    values = engine.statistic_values(quiet, flares, count=INDEX.size, **kind)
-    np.testing.assert_array_equal(values, _twin(name, comparison)[1])
-    if comparison == Comparison(1):
-        # Against one exposure, chi2 and chi2_pair differ only in the order of summation.
-        np.testing.assert_allclose(values[0], values[2], rtol=1e-5)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "name", long_but(["stack", "at the rail", "apart, electrons, frames", "priors", "cosmic rays"], "stack")
-)
-def test_snr_equals_reference(any_width: Engine, name: str) -> None:
-    (quiet, *_), how = case(name)
-    scene = prepare([quiet], **how)
-    found = any_width.snr(quiet, realisations=INDEX.size, start=START, seed=SEED, **how)
-    expected = numpy_kernels.histograms(scene, observers(quiet, scene), elements(quiet), INDEX, SEED)
-    same_counts(found.counts, expected)
-    assert all(
-        each.sum() + found.counts.far[kind].counts.sum() == INDEX.size * len(each)
-        for kind, each in (("pixel", found.counts.pixel), ("element", found.counts.element))
-    )
+        wanted = tally.distribution(i)
+        np.testing.assert_array_equal(ours.counts, wanted.counts)
+        assert (ours.first, ours.second) == (wanted.first, wanted.second)
+        assert ours.far.equals(wanted.far)
 
 
 def test_saturating_star_is_drawn_frame_by_frame(engine: Engine) -> None:
@@ -294,31 +247,17 @@ def test_frames_and_stacks_agree(engine: Engine) -> None:
 
 
 @pytest.mark.long
-def test_pixels_and_realisations_are_uncorrelated(engine: Engine) -> None:
-    """Neighbours in pixel, realisation and seed: |z| < 5 for sums of 3e7 products."""
-    (quiet,) = star()
-    raw = engine.realise(quiet, count=20_000, seed=9)
-    z = (raw - quiet.n_frames * quiet.mean_raw_dn) / np.sqrt(quiet.variance_dn2)
-    other = engine.realise(quiet, count=20_000, seed=10)
-    y = (other - quiet.n_frames * quiet.mean_raw_dn) / np.sqrt(quiet.variance_dn2)
-    for a, b in ((z[:, 1:], z[:, :-1]), (z[:, 2:], z[:, :-2]), (z[1:], z[:-1]), (z[16:], z[:-16]), (z, y)):
-        products = a * b
-        assert abs(products.sum()) < 5 * np.sqrt(products.size)
-
-
-@pytest.mark.long
-def test_frames_are_uncorrelated(engine: Engine) -> None:
-    """Single frames 0, 1 and 2**32 - 1 of the same realisations: |z| < 5 for sums of 3e7 products."""
+def test_neighbours_are_uncorrelated(engine: Engine) -> None:
+    """Neighbours in pixel, realisation, seed and frame: |z| < 5 for sums of 3e7 products."""
     (x,) = star(exposure=5.0)
-    z = []
-    for frame in (0, 1, 2**32 - 1):
-        scene, out = prepare([x], first_frame=frame), np.empty((20_000, x.wavelength_nm.size), np.int32)
-        with scene_launches(engine.open_device, scene, 9) as run:
-            engine._tiles.for_each(
-                0, 20_000, 4 * scene.n_pixel, lambda t, n, run=run, out=out: run.realise(t, out[n : n + t.wanted])
-            )
-        z.append((out - x.mean_raw_dn) / np.sqrt(x.variance_dn2))
-    for a, b in ((z[0], z[1]), (z[0], z[2]), (z[1], z[2])):
+
+    def drawn(seed: int, frame: int = 0) -> np.ndarray:
+        raw = engine.realise(x, count=20_000, seed=seed, first_frame=frame)
+        return (raw - x.mean_raw_dn) / np.sqrt(x.variance_dn2)
+
+    z, y, second, last = drawn(9), drawn(10), drawn(9, 1), drawn(9, 2**32 - 1)
+    within = [(z[:, 1:], z[:, :-1]), (z[:, 2:], z[:, :-2]), (z[1:], z[:-1]), (z[16:], z[:-16])]
+    for a, b in (*within, (z, y), (z, second), (z, last), (second, last)):
         products = a * b
         assert abs(products.sum()) < 5 * np.sqrt(products.size)
 
@@ -340,17 +279,14 @@ def test_tile_size_does_not_affect_results(engine: Engine, tile: int) -> None:
     (quiet, *flares), _ = case("stack")
     whole = engine.detect(quiet, flares, realisations=3001, start=77, seed=6, statistics=tuple(STATISTICS))
     parts = Engine(tile=tile).detect(quiet, flares, realisations=3001, start=77, seed=6, statistics=tuple(STATISTICS))
-    for key, distribution in whole._distributions.items():
-        np.testing.assert_array_equal(distribution.counts, parts._distributions[key].counts)
-        assert distribution.far.equals(parts._distributions[key].far)
-        assert (distribution.mean, distribution.std) == (parts._distributions[key].mean, parts._distributions[key].std)
+    same(parts, whole)
 
 
 THREADS = """
 import hashlib, sys
 sys.path.insert(0, {tests!r})
 from scenes import instrument, star
-from mauvecl.device.engine import Engine
+from mauvecl import Engine
 quiet, *flares = star(amplitudes=(0.081, 0.24), payload=instrument(part=True))
 found = Engine().detect(quiet, flares, realisations=20_000, seed=3)
 table = found.table(fap=1e-2)
@@ -361,18 +297,9 @@ print(hashlib.sha256(repr([tuple(row) for row in table]).encode()).hexdigest())
 @pytest.mark.long
 def test_number_of_threads_does_not_affect_results() -> None:
     """Compare all digits of a table from one thread and from two."""
-    code = THREADS.format(tests=os.path.dirname(os.path.dirname(__file__)))
-    digests = {
-        subprocess.run(
-            [sys.executable, "-c", code],
-            env=os.environ | {"POCL_MAX_PTHREAD_COUNT": threads},
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-        for threads in ("1", "2")
-    }
-    assert len(digests) == 1
+    code = THREADS.format(tests=str(Path(__file__).parents[1]))
+    one, two = (python(code, POCL_MAX_PTHREAD_COUNT=threads).stdout for threads in ("1", "2"))
+    assert one == two
 
 
 def test_flares_in_batches_equal_single_flares(engine: Engine) -> None:
@@ -434,12 +361,13 @@ def test_progress_is_reported_and_may_stop(engine: Engine) -> None:
     assert (seen[0], seen[-1]) == ((0, 5000), (5000, 5000))
     assert len(seen) == 6
 
+    calls = iter([KeyboardInterrupt])
+
     def stop(done: int, total: int) -> None:
-        raise KeyboardInterrupt
+        for error in calls:
+            raise error
 
     stopping = Engine(tile=1024, progress=stop)
     with pytest.raises(KeyboardInterrupt):
         stopping.realise(quiet, count=5000, seed=1)
-    # The engine works on.
-    stopping._tiles._progress = None
-    assert stopping.realise(quiet, count=3, seed=1).shape[0] == 3
+    assert stopping.realise(quiet, count=3, seed=1).shape[0] == 3, "the engine works on"

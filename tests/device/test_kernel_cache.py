@@ -14,16 +14,15 @@ import time
 from pathlib import Path
 
 import pytest
+from processes import printed, python
 
-from mauvecl.device import kernel_cache
-from mauvecl.device.engine import Engine
-from mauvecl.device.kernel_cache import KernelCache
-from mauvecl.device.program import build
+from mauvecl import Engine
+from mauvecl.device import kernel_cache, program
 
 #: Script that runs two kernels on the toy scene and prints whether they came from the store.
 RUN = """
 import hashlib, sys
-from mauvecl.device import kernel_cache
+from mauvecl.device import kernel_cache, program
 from mauvecl.device.toy_exposure import toy
 def digest(engine):
     x = toy(frames=1)
@@ -44,15 +43,9 @@ except DeviceError as error:
 
 def run(cache: Path | str, before: str = "") -> dict[str, str]:
     """Run a separate process, which PoCL may abort, and return what it prints."""
-    child = subprocess.run(
-        [sys.executable, "-c", RUN.format(before=before)],
-        env=os.environ | {"MAUVECL_CACHE_DIR": str(cache)},
-        capture_output=True,
-        text=True,
-    )
-    assert child.returncode == 0, child.stderr
-    assert child.stderr == ""
-    return dict(line.split(" ", 1) for line in child.stdout.splitlines())
+    done = python(RUN.format(before=before), cache=cache)
+    assert done.stderr == ""
+    return printed(done.stdout)
 
 
 @pytest.fixture(scope="module")
@@ -105,14 +98,14 @@ def store_of(cache: Path) -> Path:
 def test_damaged_program_is_not_restored(filled: tuple[Path, str], tmp_path: Path, kind: str, ending: str) -> None:
     """Keep damaged files of every kind out of the folder that PoCL reads."""
     shutil.copytree(store_of(filled[0]), tmp_path / "store")
-    cache = KernelCache(tmp_path, tmp_path / "work")
+    cache = kernel_cache.KernelCache(tmp_path, tmp_path / "work")
     programs = [path for path in cache.store.iterdir() if path.is_dir()]
     assert len(programs) >= 2
-    for program in programs:
-        damaged = [path for path in files_of(program) if path.suffix == ending]
+    for stored in programs:
+        damaged = [path for path in files_of(stored) if path.suffix == ending]
         assert damaged
         DAMAGE[kind](damaged[-1])
-        assert not cache.restore(program.name)
+        assert not cache.restore(stored.name)
         assert files_of(cache.work) == []
 
 
@@ -138,7 +131,7 @@ def test_damaged_store_is_rebuilt(filled: tuple[Path, str], tmp_path: Path, kind
 
 def test_concurrent_processes_share_programs(tmp_path: Path) -> None:
     """Store a program at the next build, not only at the end of the process."""
-    one = KernelCache(tmp_path, tmp_path / "work-1")
+    one = kernel_cache.KernelCache(tmp_path, tmp_path / "work-1")
     for number in range(2):
         with one.building(f"key{number}"):
             (one.work / "AA" / f"program{number}").mkdir(parents=True)
@@ -146,7 +139,7 @@ def test_concurrent_processes_share_programs(tmp_path: Path) -> None:
         if number == 0:
             # The first launch completes the program.
             (one.work / "AA" / "program0" / "kernel.so").write_bytes(bytes(100))
-    other = KernelCache(tmp_path, tmp_path / "work-2")
+    other = kernel_cache.KernelCache(tmp_path, tmp_path / "work-2")
     assert other.restore("key0")
     assert [path.name for path in files_of(other.work)] == ["kernel.so", "program.bc"]
 
@@ -156,7 +149,7 @@ MANIFESTS = ("", "[]", "3", '{"files": {}}', '{"files": 1}', '{"folder": "x"}', 
 
 @pytest.mark.parametrize("text", MANIFESTS)
 def test_invalid_manifest_is_rejected(tmp_path: Path, text: str) -> None:
-    cache = KernelCache(tmp_path, tmp_path / "work")
+    cache = kernel_cache.KernelCache(tmp_path, tmp_path / "work")
     entry = cache.store / "key"
     entry.mkdir(parents=True)
     (entry / "a").write_text("contents")
@@ -202,7 +195,7 @@ def test_unusable_cache_folder_is_replaced(filled: tuple[Path, str]) -> None:
 @pytest.mark.long
 def test_folder_of_killed_process_is_removed(filled: tuple[Path, str], tmp_path: Path) -> None:
     shutil.copytree(filled[0], tmp_path, dirs_exist_ok=True)
-    code = "import time; from mauvecl.device.engine import Engine; Engine(); print('up', flush=True); time.sleep(60)"
+    code = "import time; from mauvecl import Engine; Engine(); print('up', flush=True); time.sleep(60)"
     child = subprocess.Popen(
         [sys.executable, "-c", code],
         env=os.environ | {"MAUVECL_CACHE_DIR": str(tmp_path)},
@@ -219,7 +212,7 @@ def test_folder_of_killed_process_is_removed(filled: tuple[Path, str], tmp_path:
     assert not left[0].exists()
 
 
-HOLDS = "from mauvecl.device.kernel_cache import kernel_cache; print(kernel_cache().work, flush=True); input()"
+HOLDS = "from mauvecl.device import kernel_cache; print(kernel_cache.kernel_cache().work, flush=True); input()"
 SWEEPS = "import sys, pathlib; from mauvecl.device import kernel_cache; kernel_cache._sweep(pathlib.Path(sys.argv[1]))"
 #: Commands that run another one with its own process numbers and host name, as on another machine.
 ELSEWHERE = {
@@ -291,7 +284,7 @@ def test_store_is_limited_in_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     """Remove the least recently used programs."""
     monkeypatch.setattr(kernel_cache, "MAX_STORED", 25_000)
     for number in range(4):
-        cache = KernelCache(tmp_path, tmp_path / f"work{number}")
+        cache = kernel_cache.KernelCache(tmp_path, tmp_path / f"work{number}")
         with cache.building(f"key{number}"):
             folder = cache.work / "AA" / f"program{number}"
             folder.mkdir(parents=True)
@@ -310,9 +303,9 @@ def test_store_is_limited_in_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_installations_do_not_share_programs(monkeypatch: pytest.MonkeyPatch, engine: Engine) -> None:
     """Use different keys, since PoCL compiles a program of another installation again at every start."""
     keys: list[str] = []
-    restore = KernelCache.restore
-    monkeypatch.setattr(KernelCache, "restore", lambda cache, key: keys.append(key) or restore(cache, key))
+    restore = kernel_cache.KernelCache.restore
+    monkeypatch.setattr(kernel_cache.KernelCache, "restore", lambda cache, key: keys.append(key) or restore(cache, key))
     for place in ("one", "other", "one"):
         monkeypatch.setattr(sys, "prefix", place)
-        build(engine.open_device.context, "kernel void f(global int *a) { a[0] = 1; }")
+        program.build(engine.open_device.context, "kernel void f(global int *a) { a[0] = 1; }")
     assert keys[0] == keys[2] != keys[1]

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import ctypes
 import importlib.util
-import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pyopencl as cl
 import pytest
+from processes import python
 
+from mauvecl import Engine
 from mauvecl.device import processor, program
 from mauvecl.device.errors import DeviceError
 
@@ -114,14 +114,8 @@ def test_every_offered_level_builds_and_draws(name: str, level: str, with_librar
     if not processor.flags().issuperset(needed):
         pytest.skip("this processor lacks instructions of the level")
     vendors = with_library(name)
-    run = subprocess.run(
-        [sys.executable, "-c", BUILD, level],
-        env=os.environ | {"MAUVECL_CACHE_DIR": str(tmp_path), "OCL_ICD_VENDORS": str(vendors)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert run.stdout.splitlines() == ["None", str({f"{vendors.parent}/pyopencl/.libs/libpocl.so"})]
+    done = python(BUILD, level, cache=tmp_path, OCL_ICD_VENDORS=str(vendors))
+    assert done.stdout.splitlines() == ["None", str({f"{vendors.parent}/pyopencl/.libs/libpocl.so"})]
 
 
 class Record:
@@ -187,25 +181,15 @@ def test_compiler_prints_nothing(tmp_path: Path) -> None:
         "source = '#warning one\\nkernel void f(global int *a) { int unused; a[0] = 1; }'\n"
         "program.build(cl.Context([handle]), source)"
     )
-    run = subprocess.run(
-        [sys.executable, "-c", code],
-        env=os.environ | {"MAUVECL_CACHE_DIR": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert run.stderr == ""
+    assert python(code, cache=tmp_path).stderr == ""
 
 
-def test_error_names_processor_unknown_to_compiler(monkeypatch: Any) -> None:
-    cl = program.load_opencl()
-    handle, _ = program.choose_device(None)
-
+def test_error_names_processor_unknown_to_compiler(engine: Engine, monkeypatch: Any) -> None:
     def refuse(*_: Any) -> Any:
         raise cl.RuntimeError("error: unknown target CPU 'generic'")
 
     monkeypatch.setattr(cl, "Program", refuse)
     with pytest.raises(DeviceError) as caught:
-        program.build(cl.Context([handle]), "__kernel void nothing() {}")
+        program.build(engine.open_device.context, "__kernel void nothing() {}")
     assert caught.value.kind == "processor"
     assert "\n" not in str(caught.value)

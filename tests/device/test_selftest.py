@@ -8,16 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
+from commands import run
 
-from mauvecl.answers import files
-from mauvecl.cli.app import app
-from mauvecl.device import program, selftest, selftest_outcome
-from mauvecl.device.engine import Engine
-from mauvecl.device.kernel_cache import KernelCache
-from mauvecl.device.selftest_outcome import Check
-from mauvecl.runs.pool import LocalWorkers, Pool
-from mauvecl.study.study import Study
+from mauvecl import Engine
+from mauvecl.device import kernel_cache, program, selftest
 
 WEAKER = "same draws to float rounding: no fused multiply-add"
 
@@ -52,7 +46,7 @@ def another_key_schedule(source: str) -> str:
 @pytest.mark.long
 def test_self_test_passes(engine: Engine) -> None:
     """Pass on a correct device; limits of p = 1e-6 and 5 standard errors fail for one in 1e5 seeds."""
-    reported: list[Check] = []
+    reported: list[selftest.Check] = []
     checks = selftest.run(engine, reported.append)
     assert reported == checks
     assert len(checks) > 20
@@ -99,47 +93,42 @@ def test_wrong_kernel_fails_both_promises(monkeypatch: pytest.MonkeyPatch) -> No
     assert not any(check.passed for check in selftest.check_against_reference(wrong))
 
 
-def test_device_without_strict_arithmetic_has_weaker_promise(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["stack", "apart, tables", "frames at the rail", "cosmic rays", "priors, frames"])
+def test_one_realisation_per_work_item_gives_the_same_bits(one_by_one: Engine, name: str) -> None:
+    assert selftest.digests(one_by_one, name) == selftest.reference_digests(name)
+
+
+@pytest.fixture(scope="module")
+def one_by_one() -> Engine:
+    return Engine(width=1)
+
+
+def test_device_without_strict_arithmetic_has_weaker_promise(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert "same bits" in run("devices", "--no-rate", folder=tmp_path).stdout.replace("\n", " ")
     monkeypatch.setattr(program, "weaknesses", lambda device: ["fused multiply-add"])
-    assert program.devices()[0].promise == WEAKER
-    assert Engine().device.promise == WEAKER
+    (first, *_) = json.loads(run("devices", "--json", folder=tmp_path).stdout)
+    assert first["promise"] == Engine().device.promise == WEAKER
+    assert first["rate"] > 1e7
 
 
-def test_selftest_command_reports_and_records_outcome(
-    tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_selftest_command_reports_and_records_outcome(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Check table, file, exit codes 0 and 1 (failed check), and the outcome in later run records."""
     # A separate store keeps these invented outcomes out of the user's.
-    monkeypatch.setattr(selftest_outcome, "kernel_cache", lambda: KernelCache(tmp_path, tmp_path))
-    checks = [Check("one thing", True, "as it should be")]
+    store = kernel_cache.KernelCache(tmp_path, tmp_path)
+    monkeypatch.setattr("mauvecl.device.selftest_outcome.kernel_cache", lambda: store)
+    checks = [selftest.Check("one thing", True, "as it should be")]
     monkeypatch.setattr(selftest, "run", lambda engine: checks)
-    good = CliRunner().invoke(app, ["selftest", "--quiet", "--output", str(tmp_path)])
-    assert good.exit_code == 0
-    assert "PASS" in good.output
-    assert "All 1 checks passed" in good.output
+    good = run("selftest", "--quiet", "--output", tmp_path, folder=tmp_path).stdout
+    assert "PASS" in good
+    assert "All 1 checks passed" in good
     kept = json.loads((tmp_path / "selftest.json").read_text())
     assert kept["passed"] is True
     assert kept["checks"][0]["name"] == "one thing"
-    assert selftest_outcome.read_outcome(engine.device) == kept
-    pool = Pool(LocalWorkers([None], make=lambda device, progress: engine))
-    record = files.write_record(
-        "detect", Study().model_dump(mode="json"), [], tmp_path, pool=pool, seconds=0.0, messages=[]
-    )
-    assert json.loads(record.read_text())["selftest"] == [kept]
-    checks.append(Check("another", False, "wrong"))
-    bad = CliRunner().invoke(app, ["selftest", "--quiet"])
-    assert bad.exit_code == 1
-    assert "FAIL" in bad.output
-    assert "1 of 2 checks FAILED" in bad.output
-    as_json = CliRunner().invoke(app, ["selftest", "--quiet", "--json"])
-    assert as_json.exit_code == 1
-    assert json.loads(as_json.output)["passed"] is False
-
-
-def test_devices_command_lists_promise_and_rate() -> None:
-    run = CliRunner().invoke(app, ["devices", "--json"])
-    (first, *_) = json.loads(run.output)
-    assert first["promise"] == program.SAME_BITS
-    assert first["rate"] > 1e7
-    table = CliRunner().invoke(app, ["devices", "--no-rate"])
-    assert "same bits" in table.output.replace("\n", " ")
+    run("detect", "-n", "1000", "--fap", "0.1", "--no-pictures", "--output", tmp_path / "out", folder=tmp_path)
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["selftest"] == [kept]
+    checks.append(selftest.Check("another", False, "wrong"))
+    bad = run("selftest", "--quiet", folder=tmp_path, code=1).stdout
+    assert "FAIL" in bad
+    assert "1 of 2 checks FAILED" in bad
+    assert json.loads(run("selftest", "--quiet", "--json", folder=tmp_path, code=1).stdout)["passed"] is False

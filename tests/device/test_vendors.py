@@ -9,18 +9,18 @@ import sys
 import tomllib
 from pathlib import Path
 
+import pyopencl as cl
 import pytest
+from commands import run
 from packaging.requirements import Requirement
-from typer.testing import CliRunner
 
-from mauvecl.cli import app
-from mauvecl.device import program, vendors
+from mauvecl.device import vendors
 
 CODE = """
 import os, sys
 sys.path.insert(0, {place!r})
-from mauvecl.device.engine import devices
-print([device.platform for device in devices()], os.environ.get("OCL_ICD_VENDORS"))
+from mauvecl import Engine
+print([Engine().device.platform], os.environ.get("OCL_ICD_VENDORS"))
 """
 
 
@@ -82,13 +82,8 @@ def test_nothing_changes_without_the_wheel(wheel: Path) -> None:
 @pytest.mark.long
 def test_pocl_is_found_despite_broken_driver(wheel: Path) -> None:
     environment = {name: text for name, text in os.environ.items() if name not in vendors.FOLDER_VARIABLES}
-    run = subprocess.run(
-        [sys.executable, "-c", CODE.format(place=str(wheel / "site"))],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    code = CODE.format(place=str(wheel / "site"))
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert "'Portable Computing Language'" in run.stdout
     assert run.stdout.rstrip().endswith("None")
     assert run.stderr == ""
@@ -105,14 +100,13 @@ def test_pocl_is_found_despite_broken_driver(wheel: Path) -> None:
     ],
 )
 def test_devices_command_names_sources_of_drivers(
-    system: str, machine: str, words: list[str], monkeypatch: pytest.MonkeyPatch
+    system: str, machine: str, words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Name no wheel on platforms without one."""
     monkeypatch.setattr(platform, "system", lambda: system)
     monkeypatch.setattr(platform, "machine", lambda: machine)
-    monkeypatch.setattr(program.load_opencl(), "get_platforms", list)
-    result = CliRunner().invoke(app.app, ["devices"])
-    said = str(result.exception)
+    monkeypatch.setattr(cl, "get_platforms", list)
+    said = run("devices", folder=tmp_path, code=2).stderr.strip()
     for word in words:
         assert word in said
     assert ("[pocl]" in said or "[intel]" in said) == (machine == "x86_64")

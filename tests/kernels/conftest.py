@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mauvecl.device.engine import Engine
+from mauvecl import Engine
 from mauvecl.device.probes import Probes
 
 
@@ -13,3 +13,9 @@ def probes(request: pytest.FixtureRequest, engine: Engine) -> Probes:
     """Return probes of PoCL's fast forms, of the plain vectors for other compilers, and of a GPU's scalars."""
     width = 1 if request.param == "scalar" else 16
     return Probes(device=engine.open_device, width=width, vector_forms=request.param == "vector forms")
+
+
+@pytest.fixture(scope="session")
+def probes_fast(engine: Engine) -> Probes:
+    """Return probes in the device's own form."""
+    return Probes(device=engine.open_device)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from scipy import special, stats
 
-from mauvecl.device.engine import Engine
 from mauvecl.device.probes import Probes
 from mauvecl.noise import random_numbers, reference
 
@@ -104,15 +105,8 @@ def test_thousand_million_draws(probes_fast: Probes) -> None:
             assert min(p) > 1e-6
 
 
-@pytest.fixture(scope="module")
-def probes_fast(engine: Engine) -> Probes:
-    return Probes(device=engine.open_device)
-
-
 def test_fused_multiply_add_rounds_once() -> None:
     """Compare the reference's float32 fma with exact rational arithmetic."""
-    from fractions import Fraction
-
     generator = np.random.default_rng(8)
     a, b, c = generator.standard_normal((3, 2000)).astype(np.float32)
     # Sums next to a tie of float32, where rounding twice goes wrong.

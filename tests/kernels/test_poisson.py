@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import exact
 import numpy as np
 import pytest
 from scipy import stats
 
-from mauvecl.device import selftest
-from mauvecl.device.engine import Engine
 from mauvecl.device.probes import Probes
 from mauvecl.device.toy_exposure import toy
 from mauvecl.noise import random_numbers, reference
-from mauvecl.noise.poisson import SMALLEST_EXPANDED, alias_table, table_set
+from mauvecl.noise.poisson import alias_table
 from mauvecl.noise.scene import prepare
 
+#: From this mean on, counts are drawn by an expansion.
+SMALLEST_EXPANDED = 1000.0
 MEANS = [0.0, 0.5, 5.0, 64.0, 2225.0, 22250.0, 222500.0]
 
 
@@ -48,7 +51,7 @@ def test_extreme_words_and_column_edges(probes: Probes, mean: float) -> None:
 
 def pearson(counts: np.ndarray, low: int, mean: float) -> float:
     """Return the two-sided p-value of Pearson's statistic with scipy's probabilities of low, low + 1, ..."""
-    return selftest.pearson(counts, stats.poisson.pmf(low + np.arange(counts.size), mean))
+    return exact.pearson(counts, stats.poisson.pmf(low + np.arange(counts.size), mean))
 
 
 #: Draws of each mean by expansion, and by table.
@@ -100,38 +103,22 @@ def test_pearson_of_the_expansion(drawn: dict[tuple[str, float], np.ndarray], me
     assert pearson(counts, round(mean) - int(10 * np.sqrt(mean)), mean) > 1e-6
 
 
-def draws_to_tell(mean: float, offset: float, slope: float, cubic: float) -> float:
-    """Return the number of draws after which Pearson's test detects the expansion at five sigma."""
-    half = int(9 * np.sqrt(mean))
-    n = np.arange(-half, half + 1) + round(mean)
-    z = np.linspace(-8.9, 8.9, 400_001)
-    drawn = round(mean) + offset + z * (slope + z * (1 / 6 + z * cubic))
-    at = np.interp(np.append(n, n[-1] + 1) - 0.5, drawn, z)
-    q = np.where(at[1:] < 0, np.diff(stats.norm.cdf(at)), -np.diff(stats.norm.sf(at)))
-    p = stats.poisson.pmf(n, mean)
-    common = p > 1e-14
-    return float(5 * np.sqrt(2 * common.sum()) / np.sum((p - q)[common] ** 2 / p[common]))
-
-
 @pytest.mark.parametrize("mean", [SMALLEST_EXPANDED, 2225.0, 22250.0, 1e6])
 def test_expansion_cannot_be_distinguished_from_exact_draws(mean: float) -> None:
     """Check the device's expansion; without its last term, 2e10 draws of a mean of 1000 would show it."""
-    scene = prepare([toy(4, 1, dark=mean)], recipe="apart")
-    (source,) = scene.dark_counts[:1]
+    (source,) = prepare([toy(4, 1, dark=mean)], recipe="apart").dark_counts[:1]
     assert source["bits"] == 0
-    given = (float(source["offset"]), float(source["slope"]), float(source["cubic"]))
-    assert draws_to_tell(mean, *given) > 1e13
+    half, slope = int(9 * np.sqrt(mean)), float(source["slope"])
+    low, size = round(mean) - half, 2 * half
+
+    def needed(cubic: float) -> float:
+        shape = np.array([float(source["offset"]), slope, 1 / 6, cubic]) / slope
+        q = exact.of_polynomial(shape, slope, round(mean), low, size)
+        return exact.draws_to_tell(stats.poisson.pmf(low + np.arange(size), mean), q)
+
+    assert needed(float(source["cubic"])) > 1e13
     if mean < 1e5:  # beyond, what is left is the coefficients' own float32
-        assert draws_to_tell(mean, *given[:2], 0.0) < 1e-2 * draws_to_tell(mean, *given)
-
-
-@pytest.mark.parametrize("mean", [SMALLEST_EXPANDED, 2225.0, 22250.0])
-def test_rounded_normal_fails(mean: float) -> None:
-    """Check that the test above fails for a rounded normal and without the last term."""
-    half = int(10 * np.sqrt(mean))
-    n = np.arange(-half, half)
-    rounded = np.diff(stats.norm.cdf(np.append(n, half) - 0.5, 0.0, np.sqrt(mean)))
-    assert pearson(np.rint(1e8 * rounded).astype(np.int64), round(mean) - half, mean) < 1e-6
+        assert needed(0.0) < 1e-2 * needed(float(source["cubic"]))
 
 
 def test_expansion_equals_the_reference(probes: Probes) -> None:
@@ -144,36 +131,11 @@ def test_expansion_equals_the_reference(probes: Probes) -> None:
     np.testing.assert_array_equal(probes.expansion(w[0], w[1], mean), twin)
 
 
-@pytest.fixture(scope="session")
-def probes_fast(engine: Engine) -> Probes:
-    return Probes(device=engine.open_device)
-
-
-def test_moments_of_the_table() -> None:
-    """Compare mean, variance, skewness and kurtosis from the exact word counts."""
-    for mean in (5.0, 2225.0, 22250.0):
-        table = alias_table(mean)
-        p = table.words_per_column() / 2**32
-        x = table.low + np.arange(p.size) - mean
-        moments = [np.sum(p * x**k) for k in (1, 2, 3, 4)]
-        # 2**-32 a column over some ten standard deviations.
-        sigma = np.sqrt(mean)
-        assert abs(moments[0]) < 1e-7 * sigma
-        np.testing.assert_allclose(moments[1:], [mean, mean, mean + 3 * mean**2], rtol=0, atol=1e-5 * sigma**4)
-        np.testing.assert_allclose(moments[1], mean, rtol=1e-6)
-
-
 def test_equal_means_share_a_table() -> None:
-    there = [alias_table(7.0)]
-    found, starts = table_set([5.0, 64.0, 5.0], there)
-    assert found[0] is found[2] is there[1]
-    assert found[1] is there[2]
-    assert len(there) == 3
-    size = [t.entries.size for t in there]
-    assert starts == [size[0], size[0] + size[1], size[0]]
-
-
-@pytest.mark.parametrize("mean", [-1.0, np.nan, np.inf, 1e9])
-def test_impossible_means_raise(mean: float) -> None:
-    with pytest.raises(ValueError, match="Poisson mean"):
-        alias_table(mean)
+    alike, other = (
+        prepare([replace(toy(4, 1, read=0.7, light=0.0), dark_dn=np.array(means))], recipe="apart")
+        for means in ([5.0, 5.0, 5.0, 5.0], [5.0, 64.0, 5.0, 64.0])
+    )
+    assert alike.tables.size == alias_table(5.0).entries.size
+    assert other.tables.size == alike.tables.size + alias_table(64.0).entries.size
+    assert other.dark_counts["table"][:4].tolist() == [0, alike.tables.size] * 2

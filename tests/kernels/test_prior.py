@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
+from mauvecl import Normal, Processes, Uniform
 from mauvecl.device.probes import Probes
-from mauvecl.noise import reference
-from mauvecl.noise.factor_tables import Factors
-from mauvecl.noise.prior_tables import nodes
-from mauvecl.noise.priors import Normal, Prior, Uniform
-from mauvecl.noise.processes import Processes
+from mauvecl.device.toy_exposure import toy
+from mauvecl.noise import layout, reference
+from mauvecl.noise.scene import prepare
 
+Prior = Normal | Uniform
 CONDITIONS = {"temperature_c": 21.0, "dark_slope_per_c": 0.0684, "light_loss": 0.34, "pointing_loss": 0.02}
 #: What each prior's value makes of the light or the dark.
 FACTOR: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -49,21 +50,21 @@ PRIORS = [
 
 
 @cache
-def factors(name: str, prior: Prior) -> Factors:
-    """Return the table of one prior, made once for all tests."""
-    return Factors.of(Processes(**{name: prior}), CONDITIONS)
+def factors(name: str, prior: Prior) -> tuple[np.ndarray, float]:
+    """Return the table of one prior, made once for all tests, and the factor at its median."""
+    scene = prepare([replace(toy(), conditions=CONDITIONS)], processes=Processes(**{name: prior}))
+    return scene.priors[0], float(np.prod(scene.medians))
 
 
 def drawn(probes: Probes, name: str, prior: Prior, tail: np.ndarray, upper: bool) -> np.ndarray:
     """Return the device's factors at probabilities from an end of the table."""
-    found = factors(name, prior)
+    table, centre = factors(name, prior)
     scaled = np.append(tail, np.full(-tail.size % 16, 0.5)) * 2**32
     word = np.minimum(np.floor(scaled), 2**31 - 1).astype(np.uint32)
     finer = np.minimum((scaled - word) * 2**23, 2**23 - 1).astype(np.uint32)
     # Bits above the finer ones belong to someone else.
     finer |= np.uint32(0xA5800000)
-    less_one = probes.prior(~word if upper else word, finer, found.tables[0]).astype(np.float64)[: tail.size]
-    centre = found.light * found.dark
+    less_one = probes.prior(~word if upper else word, finer, table).astype(np.float64)[: tail.size]
     return centre * (1 + less_one)
 
 
@@ -100,7 +101,9 @@ def moments(x: np.ndarray, weight: np.ndarray) -> tuple[float, float, float, flo
 def test_drawn_factors_have_the_moments_of_the_prior(probes: Probes, name: str, prior: Prior) -> None:
     """Integrate every cell of the table, without draws."""
     t, w = np.polynomial.legendre.leggauss(3)
-    edges = np.append(0.0, nodes()[:-1])
+    cells = np.arange(layout.PRIOR_NODES - 1)
+    octave, part = np.divmod(cells, 2**layout.PRIOR_BITS)
+    edges = np.append(0.0, np.ldexp(1.0 + part / 2**layout.PRIOR_BITS, octave - layout.PRIOR_FINEST))
     half = np.diff(edges)[:, None] / 2
     tail, weight = (edges[:-1, None] + half * (1 + t)).ravel(), (half * w).ravel()
     values = np.concatenate([drawn(probes, name, prior, tail, upper) for upper in (False, True)])
@@ -118,10 +121,10 @@ CHANCES = [1e-9, 1e-7, 1e-5, 1e-3, 0.1]
 @pytest.mark.parametrize(("name", "prior"), PRIORS)
 def test_drawn_factors_have_the_tails_of_the_prior(probes: Probes, name: str, prior: Prior) -> None:
     """Compare the probability beyond the device's value with its word, to 0.1 % and the resolution of float32."""
-    found = factors(name, prior)
+    table, centre = factors(name, prior)
     for upper in (False, True):
         for chance, value in zip(CHANCES, drawn(probes, name, prior, np.array(CHANCES), upper), strict=True):
-            ulp = 2.0**-23 * float(np.abs(found.tables[0]).max()) * found.light * found.dark + 1e-15 * value
+            ulp = 2.0**-23 * float(np.abs(table).max()) * centre + 1e-15 * value
             beyond = [outside(prior, invert(name, v), upper) for v in (value - ulp, value, value + ulp)]
             assert min(beyond) * (1 - 1e-3) <= chance <= max(beyond) * (1 + 1e-3), chance
 
@@ -161,7 +164,7 @@ def outside(prior: Prior, value: float, upper: bool) -> float:
 
 def test_reference_has_the_same_bits(probes: Probes) -> None:
     """Compare at the ends of words, octaves and cells, and at random words."""
-    table = Factors.of(Processes(qe_scale=Normal(1.0, 0.01, 0.5, 1.5)), CONDITIONS).tables[0]
+    table, _ = factors(*PRIORS[0])
     ends = np.concatenate([[2**k - 1, 2**k, 2**k + 1] for k in range(1, 32)]).astype(np.uint32)
     word, finer = (grid.ravel() for grid in np.meshgrid(np.concatenate([[0], ends, ~ends, [2**32 - 1]]), ends))
     word, finer = word.astype(np.uint32), finer.astype(np.uint32)

@@ -10,9 +10,7 @@ from marks import long_but
 from scenes import instrument, star
 from scipy import stats
 
-from mauvecl.device.engine import Engine
-from mauvecl.host.expectation import Expectation
-from mauvecl.noise.processes import CosmicRays, Processes
+from mauvecl import CosmicRays, Engine, Expectation, Processes
 from mauvecl.noise.scene import prepare
 
 N = 2000

@@ -1,4 +1,4 @@
-"""Distributions of factors as nodes, compared with the priors' moments and with drawn mixtures."""
+"""Distributions of factors as nodes, compared with the priors' moments."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from scenes import instrument, star
 
+from mauvecl import Normal, Processes, Uniform
 from mauvecl.noise.factor_distributions import FactorDistributions, changes_of
-from mauvecl.noise.processes import Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
-from mauvecl.statistics.distributions import Gaussian, Mixture, QuadraticForm
 
 
 def drawn(**priors: Normal | Uniform) -> tuple[FactorDistributions, float]:
@@ -20,11 +19,6 @@ def drawn(**priors: Normal | Uniform) -> tuple[FactorDistributions, float]:
     found = FactorDistributions.of(prepare([quiet], processes=Processes(**priors)))
     assert found is not None
     return found, quiet.conditions["dark_slope_per_c"]
-
-
-def test_no_processes_give_no_distributions() -> None:
-    quiet, *_ = star(payload=instrument(part=True))
-    assert FactorDistributions.of(prepare([quiet])) is None
 
 
 def test_moments_equal_those_of_priors() -> None:
@@ -87,20 +81,3 @@ def test_changes_are_slopes_of_recorded_moments(magnitude: float) -> None:
     assert (quiet.variance_dn2 - variances[0] - variances[2] >= 0).all()
     assert (means >= 0).all()
     assert (quiet.cut_share.max() > 0.1) == (magnitude < 0)
-
-
-def test_mixture_follows_simulation() -> None:
-    """Compare moments, tails and quantiles with draws from the components: 4.5 standard errors of 4e5 draws."""
-    rng, n = np.random.default_rng(20_261_122), 400_000
-    weight, shift = np.array([0.5, 2.0, 1.0]), np.array([0.3, 1.0, 0.0])
-    found = Mixture((Gaussian(-1.0, 0.5), QuadraticForm(weight, shift)), np.array([0.3, 0.7]))
-    squares = ((rng.normal(size=(n, 3)) + shift) ** 2) @ weight
-    x = np.where(rng.random(n) < 0.3, rng.normal(-1.0, 0.5, n), squares)
-    assert abs(x.mean() - found.mean) < 4.5 * found.std / np.sqrt(n)
-    away = x - found.mean
-    assert abs(np.mean(away**2) - found.std**2) < 4.5 * np.std(away**2) / np.sqrt(n)
-    assert abs(np.mean(away**3) - found.third) < 4.5 * np.std(away**3) / np.sqrt(n)
-    for p in (0.9, 0.5, 0.01, 1e-6):
-        cut = found.isf(p)
-        assert found.sf(cut) == pytest.approx(p, rel=1e-6)
-        assert abs(np.mean(x > cut) - p) < 4.5 * np.sqrt(p * (1 - p) / n) + 1e-5

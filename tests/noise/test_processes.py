@@ -9,13 +9,12 @@ import pytest
 from scenes import instrument, star
 from scipy import stats
 
-from mauvecl.device.engine import Engine
+from mauvecl import CosmicRays, Engine, Normal, Processes, Study, Uniform, simulate
 from mauvecl.noise import layout, random_numbers, reference
-from mauvecl.noise.components import components
-from mauvecl.noise.processes import NONE, CosmicRays, Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
 
 N = 20_000
+NONE = Processes()
 
 
 def total_light(engine: Engine, processes: Processes, *, exposure: float = 5.0, mode: str = "auto") -> np.ndarray:
@@ -145,10 +144,14 @@ def test_process_does_not_change_draws_of_others(engine: Engine) -> None:
 @pytest.mark.parametrize("name", ["mauve", "mauve-electrons"])
 def test_components_have_correct_sum_and_moments(engine: Engine, name: str, recipe: str) -> None:
     """Check that components add up to the engine's count and have their own moments."""
-    (x,) = star(payload=instrument(name), exposure=50.0)
-    processes = Processes(cosmic_rays=CosmicRays()) if recipe == "joint" else NONE
-    table = components(x, realisation=7, seed=5, recipe=recipe, processes=processes)
-    raw = engine.realise(x, start=7, count=1, seed=5, recipe=recipe, processes=processes)[0]
+    rays = recipe == "joint"
+    sections = {"observation": {"instrument": name, "recipe": recipe}, "run": {"seed": 5}}
+    sections |= {"processes": {"cosmic_rays": {}}} if rays else {}
+    study = Study.build({"star": [{"library": "G2V", "magnitude": 7.4}]} | sections, "test")
+    ((_, x, table),) = simulate(study, realisation=7).observations
+    raw = engine.realise(x, start=7, count=1, seed=5, recipe=recipe, processes=study.processes)[0]
+    assert ("cosmic_rays" in table.colnames) == rays
+    assert not rays or "cosmic rays" in table["cosmic_rays"].info.description
     np.testing.assert_array_equal(table["raw"].value, raw)
     names = [c for c in table.colnames if c not in ("wavelength", "raw", "net")]
     np.testing.assert_allclose(sum(table[c].value for c in names), raw, rtol=0, atol=1e-6)

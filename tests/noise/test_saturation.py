@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from scenes import instrument, star
 
-from mauvecl.device.engine import Engine
-from mauvecl.host.expectation import Expectation
+from mauvecl import Engine, Expectation, Normal, Processes
 from mauvecl.noise import reference
-from mauvecl.noise.processes import Normal, Processes
 from mauvecl.noise.scene import prepare
 
 N = 4000
@@ -125,12 +123,9 @@ def test_flare_that_saturates_every_pixel_gives_nan(engine: Engine) -> None:
 
 def test_saturated_pixels_and_exposures_are_reported() -> None:
     """Report the number of pixels and the fraction of exposures, even if no mean is saturated."""
-    from mauvecl.host.expectation import _saturation
-
-    quiet, flare = bright(1)
-    (often,) = _saturation(flare)
-    assert often.startswith("SATURATED: 8 of 197 pixels at ")
+    payload = instrument(part=True, output_min_nm=290.0, output_max_nm=350.0)
+    often, rarely, never = (star(magnitude=m, payload=payload)[0].messages[0] for m in (-1.0, -0.25, 3.0))
+    assert often.startswith("SATURATED: 170 of 197 pixels at 298.4-349.8 nm")
     assert "at least one in 100 % of exposures" in often
-    (rarely,) = _saturation(quiet)
-    assert rarely.startswith("SATURATED at times: pixels of ")
-    assert _saturation(replace(quiet, source_electrons=0.9 * quiet.source_electrons)) == ()
+    assert rarely.startswith("SATURATED at times: pixels of G2V ")
+    assert not never.startswith("SATURATED")

@@ -4,71 +4,58 @@ from __future__ import annotations
 
 import pytest
 
-from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.noise import layout
-from mauvecl.noise.processes import Processes
-from mauvecl.noise.unknowns import (
-    ADDITIVE,
-    COURSES,
-    DOCUMENTED_NUISANCES,
-    INSTRUMENT_VALUES,
-    NUISANCES,
-    PROCESSES,
-    STARE_CHANGES,
-    STARE_PROCESSES,
-    default_processes,
-    default_spreads,
-)
-from mauvecl.study.nuisances import NuisanceChoice
-from mauvecl.study.sections import Unknowns
-from mauvecl.study.stare_section import StareQuestion
+from mauvecl import Processes, Stare, Study
+from mauvecl.noise import layout, unknowns
 
 ROWS = [
-    *PROCESSES.values(),
-    *NUISANCES.values(),
-    *INSTRUMENT_VALUES.values(),
-    *(row for rows in STARE_CHANGES.values() for row in rows.values()),
+    *unknowns.PROCESSES.values(),
+    *unknowns.NUISANCES.values(),
+    *unknowns.INSTRUMENT_VALUES.values(),
+    *(row for rows in unknowns.STARE_CHANGES.values() for row in rows.values()),
 ]
 
 
 def test_keys_of_studies_are_the_registry() -> None:
     """Compare names and order of the processes' fields and of the keys of each section with the registry."""
-    assert list(Processes.model_fields) == [*ADDITIVE, *PROCESSES]
-    assert list(NuisanceChoice.model_fields) == ["usual", *NUISANCES, "own"]
-    assert list(Unknowns.model_fields) == ["draws", *INSTRUMENT_VALUES, "known"]
-    assert {*COURSES, *STARE_PROCESSES} <= StareQuestion.model_fields.keys()
+    sections = Study().model_dump()
+    assert list(Processes.model_fields) == [*unknowns.ADDITIVE, *unknowns.PROCESSES]
+    assert list(sections["nuisances"]) == ["usual", *unknowns.NUISANCES, "own"]
+    assert list(sections["unknowns"]) == ["draws", *unknowns.INSTRUMENT_VALUES, "known"]
+    assert {*unknowns.COURSES, *unknowns.STARE_PROCESSES} <= sections["stare"].keys()
 
 
 def test_every_default_prior_has_a_source_or_documentation() -> None:
     for row in ROWS:
-        if row.prior is not None and row.name not in INSTRUMENT_VALUES and row.treatment == "drawn":
+        if row.prior is not None and row.name not in unknowns.INSTRUMENT_VALUES and row.treatment == "drawn":
             assert row.source, row.name
-    for row in DOCUMENTED_NUISANCES:
+    for row in unknowns.DOCUMENTED_NUISANCES:
         assert row.marginalised
         assert row.scatter > 0
-        assert PROCESSES[row.process].of == row.of
+        assert unknowns.PROCESSES[row.process].of == row.of
 
 
 def test_streams_of_processes_are_those_of_the_rows() -> None:
-    assert all(layout.STREAMS[name] == row.stream for name, row in (*ADDITIVE.items(), *PROCESSES.items()))
+    rows = [*unknowns.ADDITIVE.items(), *unknowns.PROCESSES.items()]
+    rows += [(f"stare_{name}", process) for name, process in unknowns.STARE_PROCESSES.items()]
+    assert all(layout.STREAMS[name] == row.stream for name, row in rows)
 
 
 def test_default_values_of_documented_set() -> None:
     """The documented values, written out: the views must not change them."""
-    priors = {name: vars(prior) for name, prior in default_processes(21.0).items()}
+    priors = {name: vars(prior) for name, prior in unknowns.default_processes(21.0).items()}
     assert priors == {
         "jitter": {"low": 0.0, "high": 0.05},
         "detector_temperature": {"mean": 21.0, "sd": 0.5, "low": 18.5, "high": 23.5},
         "sky_level": {"mean": 1.0, "sd": 0.1, "low": 0.5, "high": 1.5},
     }
-    assert default_spreads() == {
+    assert unknowns.default_spreads() == {
         "jitters": {"light": 0.05 / 12**0.5},
         "offsets": {"sky": 0.1},
         "drifts": {"star": 0.01},
         "cycles": {"temperature": 0.5},
     }
-    dumped = Unknowns().model_dump()
-    assert {name: dumped[name] for name in INSTRUMENT_VALUES} == {
+    dumped = Study().model_dump()["unknowns"]
+    assert {name: dumped[name] for name in unknowns.INSTRUMENT_VALUES} == {
         "temperature_c": {"uniform": (13.0, 21.0)},
         "light_loss": {"normal": (0.34, 0.10), "between": (0.04, 0.64)},
         "pointing_loss": {"uniform": (0.0, 0.05)},
@@ -78,7 +65,7 @@ def test_default_values_of_documented_set() -> None:
     }
 
 
-@pytest.mark.parametrize("row", [row for rows in STARE_CHANGES.values() for row in rows.values()], ids=str)
+@pytest.mark.parametrize("row", [row for rows in unknowns.STARE_CHANGES.values() for row in rows.values()], ids=str)
 def test_stares_take_every_change_of_the_registry(row: object) -> None:
     stare = Stare.of(6000.0, **{row.course: {row.name: 0.01}})  # type: ignore[attr-defined]
     assert any(stare.jitters.values()) or stare.unknowns

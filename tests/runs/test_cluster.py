@@ -25,16 +25,13 @@ from answers import N, same, same_snr, small
 from scenes import flaring_stares, instrument, star
 from typer.testing import CliRunner
 
-from mauvecl import Study, measure
+from mauvecl import DaskWorkers, Engine, Expectation, Pool, Stares, Study, bulk, measure
 from mauvecl.cli.app import app
-from mauvecl.device.engine import DeviceError, Engine
-from mauvecl.device.stare_engine import Stares
-from mauvecl.host.expectation import Expectation
+from mauvecl.device.errors import DeviceError
 from mauvecl.results.requests.requests import RealiseRequest, Shard
-from mauvecl.runs.cluster import DaskWorkers, _Attempt
-from mauvecl.runs.pool import Pool, Stopped, map_in_order
+from mauvecl.runs.cluster import _Attempt
+from mauvecl.runs.pool import Stopped, map_in_order
 from mauvecl.runs.shards import Task
-from mauvecl.store import bulk
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("small_shards")]
 

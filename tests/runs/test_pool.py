@@ -1,13 +1,15 @@
-"""Shards of a request add up to the engine's answer, whoever counts them, in any order."""
+"""Shards of a request add up to the answer of the engine, in any order and whatever was interrupted."""
 
 from __future__ import annotations
 
+import hashlib
+import itertools
 import json
 import pickle
 import random
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -16,30 +18,33 @@ from typing import Any
 import numpy as np
 import pytest
 from answers import N, same, same_snr, small
+from commands import run
 from refusals import refused
 from scenes import instrument, star
+from stores import full_after
 
-from mauvecl.answers.detection.detect import detect
-from mauvecl.answers.detection.maps import detection_map
-from mauvecl.answers.limits.limits import limiting_magnitude
-from mauvecl.answers.progress import reported
-from mauvecl.answers.signal.snr import snr
-from mauvecl.device.engine import DeviceError, Engine
-from mauvecl.host.expectation import Expectation
-from mauvecl.noise.comparison import Comparison
-from mauvecl.noise.drawing import Drawing
-from mauvecl.noise.processes import Processes, Uniform
-from mauvecl.results.detection.detection import Detection
-from mauvecl.results.requests.requests import DetectRequest, Shard, SnrRequest
-from mauvecl.results.shard_sums import Arrays
+from mauvecl import (
+    Comparison,
+    Detection,
+    Engine,
+    Expectation,
+    InputError,
+    Linear,
+    LocalWorkers,
+    Pool,
+    Processes,
+    Study,
+    Uniform,
+    detect,
+    detection_map,
+    limiting_magnitude,
+    snr,
+)
+from mauvecl.device.errors import DeviceError
+from mauvecl.results.requests.requests import DetectRequest
 from mauvecl.runs import shards
-from mauvecl.runs.checkpoint import Checkpoint, _digest_of
-from mauvecl.runs.pool import LocalWorkers, Pool, Stopped, map_in_order
-from mauvecl.runs.shards import fingerprint
-from mauvecl.schema.errors import InputError
-from mauvecl.statistics.linear import Linear
-from mauvecl.study.cases import Case
-from mauvecl.study.study import Study
+from mauvecl.runs.checkpoint import Checkpoint
+from mauvecl.runs.pool import Stopped, map_in_order
 
 pytestmark = pytest.mark.usefixtures("small_shards")
 
@@ -56,11 +61,11 @@ class Shuffled(LocalWorkers):
     def count(self) -> int:
         return 4
 
-    def submit(self, task: shards.Task) -> Future[Arrays]:
+    def submit(self, task: shards.Task) -> Future[Any]:
         sent = pickle.loads(pickle.dumps(task.request))
         wait = self._random.uniform(0.0, 0.05)
 
-        def work() -> Arrays:
+        def work() -> Any:
             time.sleep(wait)
             with self._alone:
                 found = self.first.count(sent, task.shard)
@@ -108,24 +113,17 @@ def test_shards_of_every_kind_of_request_join(engine: Engine) -> None:
 def test_devices_of_different_form_give_one_answer(scene: list[Expectation], engine: Engine) -> None:
     """Share the work between engines with 16 realisations and with 1 per work-item."""
     quiet, *flares = scene
-    widths = iter((16, 1))
+    widths, counted = iter((16, 1)), set()
 
-    def make(device: str | None, progress: Any) -> Engine:
-        return Engine(device, progress=progress, width=next(widths))
+    class Noted(Engine):
+        def count(self, *given: Any, **more: Any) -> Any:
+            counted.add(id(self))
+            return super().count(*given, **more)
 
-    workers = LocalWorkers([None, "0"], make=make)
-    counted: list[Engine] = []
-    real = Engine.count
-
-    def noted(self: Engine, *given: Any, **more: Any) -> Arrays:
-        counted.append(self)
-        return real(self, *given, **more)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Engine, "count", noted)
-        found = Pool(workers).detect(quiet, flares, realisations=N, seed=2)
+    workers = LocalWorkers([None, "0"], make=lambda device, progress: Noted(device, width=next(widths)))
+    found = Pool(workers).detect(quiet, flares, realisations=N, seed=2)
     workers.close()
-    assert len(set(map(id, counted))) == 2, "both worked"
+    assert len(counted) == 2, "both worked"
     same(found, engine.detect(quiet, flares, realisations=N, seed=2))
 
 
@@ -136,7 +134,7 @@ class Failing:
         self._engine, self._fails, self._calls = engine, fails, calls
         self.open_device, self.device, self.device_name = engine.open_device, engine.device, engine.device_name
 
-    def count(self, request: Any, shard: Shard, **more: Any) -> Arrays:
+    def count(self, request: Any, shard: Any, **more: Any) -> Any:
         self._calls.append(len(self._calls))
         if self._calls[-1] in self._fails:
             # Half of the shard is counted already when it fails.
@@ -166,7 +164,7 @@ def test_closed_workers_end_every_wait(engine: Engine, scene: list[Expectation])
     begun, free = threading.Event(), threading.Event()
 
     class Held(Failing):
-        def count(self, request: Any, shard: Shard, **more: Any) -> Arrays:
+        def count(self, request: Any, shard: Any, **more: Any) -> Any:
             begun.set()
             assert free.wait(60)
             return engine.count(request, shard, **more)
@@ -185,34 +183,13 @@ def test_closed_workers_end_every_wait(engine: Engine, scene: list[Expectation])
     asking.start()
     assert begun.wait(60)
     closing.start()
-    while not workers._stopping:
-        time.sleep(0.01)
+    time.sleep(0.2)
     free.set()
     asking.join(60)
     closing.join(60)
     assert not asking.is_alive()
     assert not closing.is_alive()
     assert len(ends) == 1
-
-
-def test_progress_that_raises_closes_its_items() -> None:
-    """Check that work ahead of a verb's progress is stopped before its workers are closed."""
-    ended: list[str] = []
-
-    def items() -> Iterator[int]:
-        try:
-            yield from range(3)
-        finally:
-            ended.append("items")
-
-    def progress(done: int, total: int) -> None:
-        raise Stopped
-
-    try:
-        list(reported(items(), 3, progress))
-    except Stopped:
-        ended.append("verb")
-    assert ended == ["items", "verb"]
 
 
 def test_device_that_always_fails_raises(engine: Engine, scene: list[Expectation]) -> None:
@@ -253,25 +230,33 @@ def test_pool_gives_the_table_of_the_engine(
 def test_fingerprints_distinguish_requests(scene: list[Expectation]) -> None:
     """Check that the name of a shard changes with everything that changes an answer, and with nothing else."""
     quiet, *flares = scene
-    base = DetectRequest(quiet, tuple(flares), N, 5, ("chi2", "matched"))
+    own = [Linear("own", level * np.ones(quiet.wavelength_nm.size)) for level in (1.0, 2.0)]
     brighter = replace(flares[1], source_electrons=np.nextafter(flares[1].source_electrons, np.inf))
+
+    def asked(flares: Sequence[Expectation] = flares, seed: int = 5, **how: Any) -> DetectRequest:
+        return DetectRequest.of(quiet, tuple(flares), N, seed, **{"statistics": ("chi2", "matched")} | how)
+
+    base = asked()
     others = [
-        replace(base, seed=6),
-        replace(base, statistics=("chi2",)),
-        replace(base, statistics=("chi2", Linear("own", np.ones(quiet.wavelength_nm.size)))),
-        replace(base, statistics=("chi2", Linear("own", np.full(quiet.wavelength_nm.size, 2.0)))),
-        replace(base, flares=tuple(flares[::-1])),
-        replace(base, flares=(flares[0], brighter)),
-        replace(base, comparison=Comparison.of("exposure")),
-        replace(base, drawing=Drawing(processes=Processes(jitter=Uniform(0.0, 0.01)))),
-        replace(base, drawing=Drawing(mode="frames")),
-        SnrRequest(quiet, N, 5),
+        asked(seed=6),
+        asked(statistics=("chi2",)),
+        *(asked(statistics=("chi2", one)) for one in own),
+        asked(flares[::-1]),
+        asked([flares[0], brighter]),
+        asked(comparison=Comparison.of("exposure")),
+        asked(processes=Processes(jitter=Uniform(0.0, 0.01))),
+        asked(mode="frames"),
+        *(asked(nuisances={"dark": sd}) for sd in (0.1, 0.2)),
     ]
-    names = [fingerprint(one) for one in (base, *others)]
+    names = [shards.fingerprint(one) for one in (base, *others)]
     assert len(set(names)) == len(names)
+    assert shards.fingerprint(replace(others[-1])) == names[-1]
     reported = replace(quiet, provenance={"from": "elsewhere"}, messages=())
     for same_one in (replace(base, realisations=7), replace(base, quiet=reported), pickle.loads(pickle.dumps(base))):
-        assert fingerprint(same_one) == names[0]
+        assert shards.fingerprint(same_one) == names[0]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shards, "FORM", 1)
+        assert shards.fingerprint(base) != names[0], "shards of an older form are not read"
 
 
 def test_shards_do_not_depend_on_the_number_of_realisations(scene: list[Expectation]) -> None:
@@ -301,167 +286,146 @@ def interrupting(after: int) -> Callable[[int, int], None]:
     return progress
 
 
-def at_work(
-    folder: Path, engine: Engine, progress: Any = None, study: Study | None = None, **how: Any
-) -> tuple[Detection, Pool, Checkpoint]:
-    study = study or small()
-    quiet, *flares = Case(study).expectations
-    with Checkpoint(folder, "detect", study, patience_s=0.0, **how) as checkpoint:
+def at_work(folder: Path, engine: Engine, progress: Any = None, study: Study | None = None, **how: Any) -> Any:
+    """Ask for a detection whose shards are kept; return it, the pool and the checkpoint."""
+    quiet, *flares = SCENE
+    with Checkpoint(folder, "detect", study or small(), patience_s=0.0, **how) as checkpoint:
         pool = Pool(LocalWorkers([None], make=lambda d, progress: engine), checkpoint=checkpoint, progress=progress)
         return pool.detect(quiet, flares, realisations=N, seed=5), pool, checkpoint
 
 
-def test_interrupted_run_is_resumed(tmp_path: Path, engine: Engine) -> None:
+#: Of all runs below.
+SCENE = star(amplitudes=(0.05, 0.24), payload=instrument(part=True))
+
+
+@pytest.fixture(scope="module")
+def whole(engine: Engine) -> Detection:
+    """Return the answer of a run that nothing interrupts."""
+    return engine.detect(SCENE[0], SCENE[1:], realisations=N, seed=5)
+
+
+@pytest.fixture
+def begun(tmp_path: Path, engine: Engine) -> Path:
+    """Return the folder of a run that was interrupted after 20 000 realisations."""
     with pytest.raises(KeyboardInterrupt):
         at_work(tmp_path, engine, interrupting(20_000))
-    found, pool, checkpoint = at_work(tmp_path, engine, resume=True)
-    assert 16_000 < pool.standing.resumed < N
-    quiet, *flares = Case(small()).expectations
-    same(found, engine.detect(quiet, flares, realisations=N, seed=5))
+    return tmp_path
+
+
+def shards_in(folder: Path) -> list[Path]:
+    return sorted((folder / "checkpoint").glob("*.npz"))
+
+
+def flip(path: Path, place: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[place] ^= 4
+    path.write_bytes(data)
+
+
+def change(folder: Path, text: str) -> None:
+    (folder / "checkpoint" / "manifest.json").write_text(text)
+
+
+def manifest_of(folder: Path) -> str:
+    return (folder / "checkpoint" / "manifest.json").read_text()
+
+
+#: What happens to the files of an interrupted run, and whether a shard, or the manifest, is then found to be damaged.
+DAMAGES: dict[str, tuple[Callable[[Path], object], bool, bool]] = {
+    "none": (lambda folder: None, False, False),
+    "flipped digest": (lambda folder: flip(shards_in(folder)[0], 0), True, False),
+    "flipped header": (lambda folder: flip(shards_in(folder)[0], 20), True, False),
+    "flipped end": (lambda folder: flip(shards_in(folder)[0], -1), True, False),
+    "misplaced": (lambda folder: shards_in(folder)[0].write_bytes(shards_in(folder)[1].read_bytes()), True, False),
+    "flipped manifest": (lambda folder: change(folder, manifest_of(folder).replace("7.4", "7.5")), False, True),
+    "empty manifest": (lambda folder: change(folder, ""), False, True),
+    "no manifest": (lambda folder: (folder / "checkpoint" / "manifest.json").unlink(), False, True),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_interrupted_run_is_resumed_whatever_happens_to_its_files(
+    begun: Path, engine: Engine, whole: Detection, damage: str
+) -> None:
+    text = manifest_of(begun)
+    work, shard, manifest = DAMAGES[damage]
+    work(begun)
+    reported: list[tuple[int, int]] = []
+    found, pool, checkpoint = at_work(begun, engine, lambda *standing: reported.append(standing), resume=True)
+    same(found, whole)
+    assert checkpoint.damaged == int(shard)
+    assert [("damaged or missing" in said) for said in checkpoint.messages if "manifest" in said] == [True] * manifest
+    assert 16_000 - 4096 * shard < pool.standing.resumed < N
+    assert manifest_of(begun) == text
+    # Progress includes what was resumed.
+    assert (reported[0], reported[-1]) == ((0, N), (N, N))
+    assert [done for done, _ in reported] == sorted(done for done, _ in reported)
+    assert (pool.standing.shards, pool.standing.of, pool.standing.retries) == (8, 8, 0)
     checkpoint.forget()
-    assert list(tmp_path.iterdir()) == []
+    assert list(begun.iterdir()) == []
 
 
-def test_unfinished_run_is_not_overwritten(tmp_path: Path, engine: Engine) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        at_work(tmp_path, engine, interrupting(10_000))
+def test_unfinished_run_is_not_overwritten(begun: Path, engine: Engine) -> None:
     with refused("resume", "`resume=True`", "`restart=True`"):
-        at_work(tmp_path, engine)
+        at_work(begun, engine)
     other = small().with_settings(["run.seed=4", "flare.amplitudes=[0.1]"])
     with refused("restart", "flare.amplitudes.0", "flare.amplitudes.1"):
-        at_work(tmp_path, engine, study=other, resume=True)
-    _, pool, _ = at_work(tmp_path, engine, restart=True)
+        at_work(begun, engine, study=other, resume=True)
+    with Checkpoint(begun, "detect", small(), resume=True), refused("lock"):
+        at_work(begun, engine)
+    _, pool, _ = at_work(begun, engine, restart=True)
     assert pool.standing.resumed == 0
 
 
-def test_counts_of_another_form_raise(tmp_path: Path, engine: Engine) -> None:
-    """Refuse shards of an older version, also if their manifest is lost."""
-    with pytest.raises(KeyboardInterrupt):
-        at_work(tmp_path, engine, interrupting(10_000))
-    path = tmp_path / "checkpoint" / "manifest.json"
-    manifest = json.loads(path.read_text())
+def test_counts_of_another_form_raise(begun: Path, engine: Engine) -> None:
+    """Refuse shards of an older version."""
+    manifest = json.loads(manifest_of(begun))
     old = {key: value for key, value in manifest.items() if key not in ("form", "digest")}
-    path.write_text(json.dumps(old | {"digest": _digest_of(old)}))
+    change(begun, json.dumps(old | {"digest": hashlib.sha256(json.dumps(old, sort_keys=True).encode()).hexdigest()}))
     with refused("restart", "1", "2", "`restart=True`"):
-        at_work(tmp_path, engine, resume=True)
-    quiet, *flares = Case(small()).expectations
-    request = DetectRequest(quiet, tuple(flares), N, 5)
-    ours = fingerprint(request)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shards, "FORM", 1)
-        assert fingerprint(request) != ours
-
-
-def test_second_run_in_a_folder_raises(tmp_path: Path, engine: Engine) -> None:
-    with (
-        Checkpoint(tmp_path, "detect", small()),
-        refused("lock"),
-    ):
-        at_work(tmp_path, engine)
-
-
-@pytest.mark.parametrize("place", [0, 20, -1])
-def test_flipped_byte_in_a_shard_is_found(tmp_path: Path, engine: Engine, place: int) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        at_work(tmp_path, engine, interrupting(20_000))
-    first, *_ = sorted((tmp_path / "checkpoint").glob("*.npz"))
-    data = bytearray(first.read_bytes())
-    data[place] ^= 4
-    first.write_bytes(data)
-    found, pool, checkpoint = at_work(tmp_path, engine, resume=True)
-    assert checkpoint.damaged == 1
-    assert pool.standing.resumed >= 8192
-    quiet, *flares = Case(small()).expectations
-    same(found, engine.detect(quiet, flares, realisations=N, seed=5))
-
-
-def test_misplaced_shard_is_found(tmp_path: Path, engine: Engine) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        at_work(tmp_path, engine, interrupting(20_000))
-    first, second, *_ = sorted((tmp_path / "checkpoint").glob("*.npz"))
-    first.write_bytes(second.read_bytes())
-    found, _, checkpoint = at_work(tmp_path, engine, resume=True)
-    assert checkpoint.damaged == 1
-    quiet, *flares = Case(small()).expectations
-    same(found, engine.detect(quiet, flares, realisations=N, seed=5))
-
-
-@pytest.mark.parametrize("spoil", ["flip", "empty", "gone"])
-def test_damaged_manifest_is_replaced(tmp_path: Path, engine: Engine, spoil: str) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        at_work(tmp_path, engine, interrupting(20_000))
-    manifest = tmp_path / "checkpoint" / "manifest.json"
-    text = manifest.read_text()
-    manifest.unlink() if spoil == "gone" else manifest.write_text(text.replace("7.4", "7.5") if spoil == "flip" else "")
-    found, pool, checkpoint = at_work(tmp_path, engine, resume=True)
-    assert "was damaged or missing and is written anew" in checkpoint.messages[0]
-    assert pool.standing.resumed > 16_000
-    assert manifest.read_text() == text
-    quiet, *flares = Case(small()).expectations
-    same(found, engine.detect(quiet, flares, realisations=N, seed=5))
+        at_work(begun, engine, resume=True)
 
 
 def test_short_runs_leave_no_files(tmp_path: Path, engine: Engine) -> None:
-    study = small()
-    quiet, *flares = Case(study).expectations
-    with Checkpoint(tmp_path, "detect", study) as checkpoint:
+    with Checkpoint(tmp_path, "detect", small()) as checkpoint:
         pool = Pool(LocalWorkers([None], make=lambda d, progress: engine), checkpoint=checkpoint)
-        pool.detect(quiet, flares, realisations=N, seed=5)
+        pool.detect(SCENE[0], SCENE[1:], realisations=N, seed=5)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_jumps_of_the_clock_have_no_effect(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the wall time jump and run backwards; shards and progress are unaffected."""
-    from mauvecl.cli.console import Meter
-
-    leaps = iter(np.resize([1e9, -1e9, 0.0, 5e9], 100_000))
-    real = time.time
+def test_jumps_of_the_clock_have_no_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the wall time jump and run backwards while a command reports its progress."""
+    leaps, real = itertools.cycle([1e9, -1e9, 0.0, 5e9]), time.time
+    words = ("detect", "-n", "30000", "--fap", "0.1", "--statistic", "chi2", "--no-pictures", "--keep-after", "0")
+    run(*words, "--output", "usual", folder=tmp_path)
     monkeypatch.setattr(time, "time", lambda: real() + next(leaps))
-    with pytest.raises(KeyboardInterrupt):
-        at_work(tmp_path, engine, interrupting(20_000))
-    with Meter(quiet=True) as meter:
-        found, pool, _ = at_work(tmp_path, engine, meter, resume=True)
-    assert pool.standing.resumed > 16_000
-    quiet, *flares = Case(small()).expectations
-    same(found, engine.detect(quiet, flares, realisations=N, seed=5))
+    run(*words, "--output", "jumps", folder=tmp_path)
+    usual, jumps = ((tmp_path / name / "detection.ecsv").read_bytes() for name in ("usual", "jumps"))
+    assert usual == jumps
 
 
-def test_full_disk_raises_and_is_resumed(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
-    from stores import full_after
-
+def test_full_disk_raises_and_is_resumed(
+    tmp_path: Path, engine: Engine, whole: Detection, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with monkeypatch.context() as patch:
         full_after(400_000, patch)
         with refused("file"):
             at_work(tmp_path, engine)
-    kept = len(list((tmp_path / "checkpoint").glob("*.npz")))
+    kept = len(shards_in(tmp_path))
     assert kept >= 1
     found, pool, _ = at_work(tmp_path, engine, resume=True)
     assert pool.standing.resumed == kept * 4096
-    quiet, *flares = Case(small()).expectations
-    same(found, engine.detect(quiet, flares, realisations=N, seed=5))
+    same(found, whole)
 
 
 def test_background_work_begins_once_after_the_devices() -> None:
-    quiet, *flares = Case(small()).expectations
     begun: list[int] = []
     pool = Pool(LocalWorkers(), meanwhile=lambda: begun.append(pool.standing.of))
     assert begun == []
     for _ in range(2):
-        pool.detect(quiet, flares, realisations=N, seed=5)
+        pool.detect(SCENE[0], SCENE[1:], realisations=N, seed=5)
     (of,) = begun
     assert of > 0
-
-
-def test_progress_includes_resumed_shards(tmp_path: Path, engine: Engine) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        at_work(tmp_path, engine, interrupting(20_000))
-    reported: list[tuple[int, int]] = []
-    _, pool, _ = at_work(tmp_path, engine, lambda done, total: reported.append((done, total)), resume=True)
-    assert reported[0] == (0, N)
-    assert reported[-1] == (N, N)
-    assert [done for done, _ in reported] == sorted(done for done, _ in reported)
-    s = pool.standing
-    assert (s.shards, s.of, s.retries) == (8, 8, 0)
 
 
 def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> None:
@@ -481,6 +445,21 @@ def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> Non
 
     with refused("number", "2"):
         list(map_in_order(pool, bad, range(6)))
-    quiet, *flares = Case(small()).expectations
     with pytest.raises(Stopped):
-        pool.detect(quiet, flares, realisations=N, seed=5)
+        pool.detect(SCENE[0], SCENE[1:], realisations=N, seed=5)
+
+
+def test_progress_that_raises_stops_the_work_ahead_of_it(engine: Engine) -> None:
+    """Check that work ahead of a verb's progress is stopped before its workers are closed."""
+    pool = Pool(Shuffled(engine, 1))
+
+    def progress(done: int, total: int) -> None:
+        raise ArithmeticError
+
+    try:
+        detection_map(small(map=AXES), pool, progress)
+    except ArithmeticError:
+        with pytest.raises(Stopped):
+            pool.detect(SCENE[0], SCENE[1:], realisations=N, seed=5)
+    else:
+        pytest.fail("the progress was not asked")

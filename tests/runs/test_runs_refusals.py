@@ -7,20 +7,8 @@ import sys
 import pytest
 from refusals import refused
 
+from mauvecl import DaskWorkers
 from mauvecl.device.errors import DeviceError
-from mauvecl.runs.cluster import DaskWorkers
-
-#: Value of `cluster`, and what is expected instead.
-CLUSTERS = {
-    "local:0": "local:N with N from 1",
-    "nowhere.json": "local:N, an address such as tcp://host:8786, or a scheduler file",
-}
-
-
-@pytest.mark.parametrize("where", CLUSTERS)
-def test_invalid_cluster_raises(where: str) -> None:
-    with refused("cluster", expected=CLUSTERS[where]):
-        DaskWorkers(where)
 
 
 @pytest.mark.parametrize("package", ["distributed", "cryptography"])

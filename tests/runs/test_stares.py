@@ -14,13 +14,10 @@ from scenes import FIRST_STARE as START
 from scenes import N_STARES as N
 from scenes import flaring_stares as request
 
-from mauvecl.device.engine import Engine
-from mauvecl.device.stare_engine import Stares
-from mauvecl.lightcurve.stares.frame_components import Components
-from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl import Engine, LocalWorkers, Pool, Stare, Stares
 from mauvecl.runs import shards
 from mauvecl.runs.checkpoint import Checkpoint
-from mauvecl.runs.pool import LocalWorkers, Pool, Stopped
+from mauvecl.runs.pool import Stopped
 
 pytestmark = pytest.mark.usefixtures("small_shards")
 
@@ -108,14 +105,13 @@ def test_run_of_stares_is_resumed(engine: Engine, tmp_path: Path) -> None:
 
 def test_fingerprints_distinguish_requests_of_stares() -> None:
     base = request()
-    quiet = base.components.quiet
     warmer = Stare.of(30.0, jitters={"light": 0.01}, offsets={"temperature": 0.1}, temperature_c=np.nextafter(21.0, 22))
     others = [
         replace(base, seed=6),
         replace(base, method="pixels"),
         replace(base, stare=warmer),
         replace(base, stare=Stare.of(30.0, jitters={"light": 0.01}, offsets={"star": 0.1}, temperature_c=21.0)),
-        replace(base, components=Components(quiet, base.components.flare_electrons, 2 * base.components.weights)),
+        replace(base, components=replace(base.components, weights=2 * base.components.weights)),
         replace(base, flare=np.nextafter(base.flare, 9)),
         replace(base, amplitudes=base.amplitudes[:1]),
         replace(base, reduction=Largest()),

@@ -8,13 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mauvecl.host.expectation import Expectation, expect
-from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.host.sky.zodiacal import Sky
-from mauvecl.host.stars.source import Source
+from mauvecl import Expectation, Instrument, Linear, Nuisances, Sky, Source, expect
 from mauvecl.statistics.distributions import QuadraticForm
-from mauvecl.statistics.linear import Linear, Matched
-from mauvecl.statistics.nuisances import Nuisances
+from mauvecl.statistics.linear import Matched
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.statistics.statistic import Setting
 

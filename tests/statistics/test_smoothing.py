@@ -8,9 +8,7 @@ from scenes import instrument, star
 from scipy import stats
 from scipy.ndimage import gaussian_filter1d
 
-from mauvecl import Instrument, Sky, Source, expect
-from mauvecl.host.expectation import Expectation
-from mauvecl.noise.comparison import Comparison
+from mauvecl import Comparison, Expectation, Instrument, Sky, Source, expect
 from mauvecl.statistics.distributions import QuadraticForm
 from mauvecl.statistics.smoothing import SMOOTHING_NM, Smoothing
 

@@ -22,15 +22,14 @@ from refusals import refused
 from stores import CHUNK, LAST, Painter, flip, forked, full_after, killed, study, tree
 from typer.testing import CliRunner
 
+from mauvecl import Engine, Study, bulk
 from mauvecl.cli.app import app
-from mauvecl.device.engine import Engine
 from mauvecl.host.files import atomic
 from mauvecl.runs.locks import locked
-from mauvecl.store import bulk, layout, stored_scenes
+from mauvecl.store import layout, stored_scenes
 from mauvecl.store.export import Selection, _study, export
 from mauvecl.store.layout import Store
 from mauvecl.study.cases import Case, cases
-from mauvecl.study.study import Study
 
 
 def written(path: Path, asked: Study, engine: Any) -> Path:

@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 from stores import study
 
-from mauvecl import read_frames
-from mauvecl.device.engine import Engine
+from mauvecl import Engine, Study, bulk, read_frames
 from mauvecl.observations.reading import reduce_frames
-from mauvecl.store import bulk
 from mauvecl.store.export import Selection, export
 from mauvecl.store.layout import Store
 from mauvecl.study.cases import Case
-from mauvecl.study.study import Study
 
 #: Stacks of two frames, and single frames of which the second is stored.
 STACKED: dict[str, Any] = {"observation": {"exposure_s": 10.0}}

@@ -17,9 +17,9 @@ from refusals import refused
 from stores import CHUNK, Painter, flip, forked, killed, study, tree
 from typer.testing import CliRunner
 
+from mauvecl import bulk
 from mauvecl.cli.app import app
 from mauvecl.runs.locks import locked
-from mauvecl.store import bulk
 from mauvecl.store.description import signed
 from mauvecl.store.export import Selection
 from mauvecl.store.layout import Store

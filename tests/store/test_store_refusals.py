@@ -9,8 +9,7 @@ import pytest
 from refusals import refused
 from stores import Painter, study
 
-from mauvecl import read_frames
-from mauvecl.store import bulk
+from mauvecl import bulk, read_frames
 from mauvecl.store.export import Selection, export
 from mauvecl.store.layout import Store
 

@@ -1,0 +1,32 @@
+"""Python in a separate process, with another environment."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+
+def python(
+    code: str, *words: str | Path, typed: str | None = None, cache: Path | str | None = None, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    """Run code, as an argument or typed, which must end without an error; its kernels may have a cache of its own."""
+    more = environment | ({} if cache is None else {"MAUVECL_CACHE_DIR": str(cache)})
+    done = subprocess.run(
+        [sys.executable, *(["-c", code] if typed is None else []), *map(str, words)],
+        input=typed,
+        env=os.environ | more,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    return done
+
+
+def printed(text: str) -> dict[str, str]:
+    """Return the lines that a process has printed, by their first words."""
+    return dict(line.split(" ", 1) for line in text.splitlines())
