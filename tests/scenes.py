@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from mauvecl import SHAPES, Expectation, Frames, Instrument, Sky, Source, Stare, Study, analyse, expect
 from mauvecl.host.neighbours import Neighbour, Neighbours
 from mauvecl.host.stars.bands import band
-from mauvecl.lightcurve.flares.shapes import Shape
 from mauvecl.lightcurve.stares.frame_components import Components
 from mauvecl.lightcurve.stares.stare_requests import StaresRequest
 
