@@ -299,15 +299,15 @@ MUTATIONS: dict[str, Mutation] = {
         ),
     ),
     "durations without the error of their level": (
-        "test_error_of_a_fitted_duration_is_that_of_least_squares",
+        "test_errors_of_durations_include_that_of_the_level",
         ("grid.information + left + mean**2 * likelihood.level_variance) / level", "grid.information + left) / level"),
     ),
     "brighter flares on a higher level": (
-        "test_error_of_a_fitted_duration_is_that_of_least_squares",
+        "test_errors_of_durations_include_that_of_the_level",
         ("along = per_amplitude + mean * in_level", "along = per_amplitude - mean * in_level"),
     ),
     "light summed above a known level": (
-        "test_error_of_a_summed_duration_includes_that_of_its_level",
+        "test_errors_of_durations_include_that_of_the_level",
         ("variance += _level_variance(process, time, noise, quiet, near)", "pass"),
     ),
     "a slow decay on top of the fast one": (
@@ -431,14 +431,14 @@ MUTATIONS: dict[str, Mutation] = {
     ),
     # Calibration, changes of throughput and colour.
     "steps of two frames that scatter like one": (
-        "test_photon_transfer_ignores_jitter_of_light",
+        "test_gain_ignores_jitter_of_light",
         (
             "np.mean(white**2, axis=0) / kept * scale**2 / 2, light",
             "np.mean(white**2, axis=0) / kept * scale**2, light",
         ),
     ),
     "a dark current without noise": (
-        "test_dark_fit_determines_bias_of_pixels_from_exposure_times",
+        "test_dark_frames_of_two_exposure_times_determine_the_bias_of_pixels",
         (
             "noise.read_variance * hat @ hat.T + noise.dark_factor * level[",
             "noise.read_variance * hat @ hat.T + 0.0 * level[",
@@ -449,7 +449,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("curve += error**2 * _linear_basis(nm) @ _linear_basis(nm).T", "pass"),
     ),
     "a wider line that is narrower": (
-        "test_light_through_a_wider_line_is_that_of_such_an_instrument[0.1-0.0001-paper]",
+        "test_fit_recovers_another_width_and_wavelength_scale",
         ("slope, bend = (wide - narrow) / (2 * step)", "slope, bend = (narrow - wide) / (2 * step)"),
     ),
     "the light of a second for that of a frame": (
@@ -473,7 +473,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("information -= float(np.sum((unknown.rows(variance", "information += float(np.sum((unknown.rows(variance"),
     ),
     "errors of changes with everything known": (
-        "test_columns_of_a_change_are_its_errors_and_smallest_sizes",
+        "test_error_of_change_is_the_scatter_of_fits",
         (
             "error_of_change(one.counts_dn, quiet, unknown), error_of_change",
             "error_of_change(one.counts_dn, quiet, None), error_of_change",
@@ -484,7 +484,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("error * np.sqrt(centre * visits / dof)", "error * np.sqrt(centre)"),
     ),
     "scatter in the column of differences": (
-        "test_columns_of_a_change_are_its_errors_and_smallest_sizes",
+        "test_two_visits_are_the_two_sided_test_of_a_difference[0.001-0.9]",
         ('Column("smallest", "smallest.one"', 'Column("smallest", "smallest.scatter"'),
     ),
     "periods of other cells": (
@@ -499,7 +499,7 @@ MUTATIONS: dict[str, Mutation] = {
         ("np.divide(10.0, per_flam", "np.divide(1.0, per_flam"),
     ),
     "indices of known light": (
-        "test_unknowns_of_finite_spread_add_to_the_error_of_an_index",
+        "test_errors_of_indices_are_those_of_drawn_exposures",
         ("variance += float(np.sum((moved[~free] * unknown.sd[~free]) ** 2))", "pass"),
     ),
     "coverage of upper ends alone": (

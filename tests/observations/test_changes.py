@@ -201,7 +201,7 @@ def test_recovered_periods_are_those_of_another_periodogram() -> None:
             assert abs(found.recovered[k][j].value - other) < 0.03 + 4 * error, (period, amplitude)
 
 
-def test_visits_lie_in_the_windows_of_the_target_and_rows_of_periods_are_those_of_their_cells() -> None:
+def test_rows_of_periods_are_those_of_their_cells() -> None:
     """Sinusoids far below the noise are never found, and far above it nearly always."""
     settings = ["change.periods=true", "change.visits=20", "orbit.targets=['eps Eri']", "orbit.days=30"]
     asked_for = [*settings, "change.of=['320-700']", "change.trials=20"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -9,15 +11,12 @@ from scenes import analysed, flare
 from scipy import stats
 
 from mauvecl import SHAPES, Frames, TableShape
-from mauvecl.observations.energies import Energy
 
 Float = NDArray[np.float64]
 DAVENPORT = SHAPES["davenport2014"]
 
 
-def measured(
-    rng: np.random.Generator, time_s: Float, light: Float, snr: tuple[float, float]
-) -> tuple[Energy | None, float]:
+def measured(rng: np.random.Generator, time_s: Float, light: Float, snr: tuple[float, float]) -> tuple[Any, float]:
     """Return the energy of the largest event, None if there is none, and the amplitude that a flare of some S/N has."""
     size = np.exp(rng.uniform(*np.log(snr))) / np.sqrt(float(light @ light))
     flux = 1e4 + size * light + rng.standard_normal(time_s.size)

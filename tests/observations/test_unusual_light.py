@@ -7,11 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scenes import analysed
 
-from mauvecl import SHAPES, Frames, Study, analyse
-from mauvecl.observations.detection import fit_quiet_light
-from mauvecl.observations.level import guess_flares
-from mauvecl.observations.losses import sudden_losses
-from mauvecl.observations.search import SeriesSurvey
+from mauvecl import Frames, Study, analyse
 
 Float = NDArray[np.float64]
 #: Equivalent duration of a flare of unit amplitude and half-width in the shape of `flare`.
@@ -82,9 +78,8 @@ def test_losses_are_found_at_their_frames_and_a_flare_is_none() -> None:
         lost[first : first + 40] = True
     flux = 1 - 0.03 * lost + 0.02 * flare(time, 20.0, 11_000.0, 60.0) + noise * rng.standard_normal(time.size)
     frames = Frames.of(time, flux, np.full(time.size, noise))
-    used = np.ones(time.size, np.bool_)
-    survey = SeriesSurvey.of(frames, flux, np.full(time.size, noise**2), used, 1.0, 0.0, SHAPES["davenport2014"])
-    found = sudden_losses(survey, *fit_quiet_light(survey, guess_flares(frames.numbers, flux)))
+    reasons = analysed(frames).frames["reason"]
+    found = np.array(["loss" in str(one) for one in reasons])
     assert found[lost].mean() > 0.9
     assert found[~lost].mean() < 0.05
     assert not found[550:560].any()
