@@ -104,11 +104,11 @@ def test_many_terms_of_two_kinds_have_the_tail_of_their_convolution(spread: floa
     form = QuadraticForm(np.repeat([a, b], n), np.full(2 * n, 0.3))
     one, other = stats.ncx2(n, push, scale=a), stats.ncx2(n, push, scale=b)
     nodes, weights = np.polynomial.legendre.leggauss(400)
-    low, high = one.isf(1 - 1e-13), one.isf(1e-13)
+    low, high = other.isf(1 - 1e-13), other.isf(1e-13)
     x, w = low + (high - low) * (nodes + 1) / 2, (high - low) / 2 * weights
     for sigmas in (-3.0, -1.0, 0.5, 3.0, 5.0):
         value = form.mean + sigmas * form.std
-        exact = w @ (one.pdf(x) * other.sf(value - x))
+        exact = w @ (other.pdf(x) * one.sf(value - x))
         assert form.sf(value) == pytest.approx(exact, rel=1e-6, abs=1e-12)
 
 

@@ -318,7 +318,7 @@ def test_fits_file_contains_any_study(tmp_path: Path) -> None:
     name = f'{"long/" * 30}ein "Stern" \\ λ Vir 🌟.txt'
     (tmp_path / name).parent.mkdir(parents=True)
     (tmp_path / name).write_text("".join(f"{nm} 1e-12\n" for nm in range(150, 1200, 5)))
-    sections = tomllib.loads(study(2).toml()) | {"star": [{"file": name, "magnitude": 5.0}]}
+    sections = tomllib.loads(study(2).toml()) | {"star": [{"file": str(tmp_path / name), "magnitude": 5.0}]}
     asked = Study.build(sections, "test")
     (tmp_path / "study.toml").write_text(asked.toml())
     run("realise", "study.toml", "--output", "f.fits", folder=tmp_path)
