@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mauvecl import Engine, Study
+from mauvecl import Engine, Expectation, Study, simulate
 
 CHUNK, LAST = "star-1/quiescent/c/1/0", "star-1/flare-1/c/4/0"
 
@@ -27,6 +29,22 @@ def study(realisations: int = 300, **sections: Any) -> Study:
     for name, values in sections.items():
         data[name] = {**data.get(name, {}), **values}  # type: ignore[dict-item]
     return Study.build(data, "test")
+
+
+def expectations(asked: Study) -> list[Expectation]:
+    """Return the expectations of a study's quiescent star and its flare."""
+    return simulate(asked, flaring=True).inputs
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Lock a folder as another process that writes to it."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
 
 
 def tree(path: Path) -> dict[str, bytes]:

@@ -182,7 +182,8 @@ def _image(selection: Selection, scene: StoredScene, table: str) -> ImageHDU:
     hdu = fits.ImageHDU(selection.rows(scene), name=scene.path.upper().replace("/", "_"))
     header = hdu.header
     header["BUNIT"] = "adu"
-    header["OBJECT"] = scene.star
+    # FITS is restricted to ASCII, and files of spectra may have any name.
+    header["OBJECT"] = scene.star.encode("ascii", "backslashreplace").decode()
     header["AMPLITUD"] = (scene.amplitude, "flare amplitude, 0 without a flare")
     header["EXPTIME"] = (x.frame_s if scene.frames is not None else x.exposure_s, "[s] of one row")
     header["TELAPSE"] = (x.exposure_s, "[s] of one realisation")

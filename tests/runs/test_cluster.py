@@ -11,8 +11,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
@@ -22,16 +22,12 @@ import numpy as np
 import psutil
 import pytest
 from answers import N, same, same_snr, small
+from commands import run
 from scenes import flaring_stares, instrument, star
-from typer.testing import CliRunner
 
 from mauvecl import DaskWorkers, Engine, Expectation, Pool, Stares, Study, bulk, measure
-from mauvecl.cli.app import app
 from mauvecl.device.errors import DeviceError
-from mauvecl.results.requests.requests import RealiseRequest, Shard
-from mauvecl.runs.cluster import _Attempt
 from mauvecl.runs.pool import Stopped, map_in_order
-from mauvecl.runs.shards import Task
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("small_shards")]
 
@@ -44,7 +40,9 @@ def workers() -> Iterator[DaskWorkers]:
     found.close()
 
 
-def test_two_processes_give_the_answer_of_one(workers: DaskWorkers, engine: Engine, scene: list[Expectation]) -> None:
+def test_two_processes_give_the_answers_of_one(
+    workers: DaskWorkers, engine: Engine, scene: list[Expectation], tmp_path: Path
+) -> None:
     quiet, *flares = scene
     pool = Pool(workers)
     assert workers.count == 2
@@ -52,27 +50,35 @@ def test_two_processes_give_the_answer_of_one(workers: DaskWorkers, engine: Engi
     same_snr(pool.snr(quiet, realisations=N, seed=5), engine.snr(quiet, realisations=N, seed=5))
     assert pool.standing.shards == 16
     assert [device.name for device in pool.devices] == [engine.device.name] * 2
+    stares = flaring_stares()
+    np.testing.assert_array_equal(
+        Pool(workers).stares(stares)["values"], Stares(engine.open_device).reduced(stares)["values"]
+    )
+    bulk.realise(small().with_settings(["run.realisations=500"]), tmp_path / "s.zarr", Pool(workers))
+    assert bulk.verify(tmp_path / "s.zarr", engine, redraw=True) == []
+    study = Study().with_settings(["star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.5]", "measure.fits=40"])
+    assert measure(study, Pool(workers)) == measure(study, engine)
 
 
-def test_two_processes_give_the_stares_of_one(workers: DaskWorkers, engine: Engine) -> None:
-    asked = flaring_stares()
-    found = Pool(workers).stares(asked)
-    np.testing.assert_array_equal(found["values"], Stares(engine.open_device).reduced(asked)["values"])
+def kill_after(pool: Pool, shards: int, kill: Callable[[], object]) -> threading.Thread:
+    """Kill a process after a number of shards."""
+
+    def work() -> None:
+        while pool.standing.shards < shards:
+            time.sleep(0.005)
+        kill()
+
+    killer = threading.Thread(target=work)
+    killer.start()
+    return killer
 
 
 def test_killed_worker_is_replaced(workers: DaskWorkers, engine: Engine, scene: list[Expectation]) -> None:
     """Kill a counting process: another one counts its shard, and the answer has the same bits."""
     quiet, *flares = scene
-    n, pids = 150_000, list(workers._client.run(os.getpid).values())
+    n, pids = 400_000, list(workers._client.run(os.getpid).values())
     pool = Pool(workers)
-
-    def kill() -> None:
-        while pool.standing.shards < 10:
-            time.sleep(0.005)
-        os.kill(pids[0], signal.SIGKILL)
-
-    killer = threading.Thread(target=kill)
-    killer.start()
+    killer = kill_after(pool, 10, lambda: os.kill(pids[0], signal.SIGKILL))
     found = pool.detect(quiet, flares, realisations=n, seed=6)
     killer.join()
     same(found, engine.detect(quiet, flares, realisations=n, seed=6))
@@ -92,7 +98,6 @@ def greeted(port: int, context: ssl.SSLContext | None) -> bool:
 
 def test_strangers_cannot_connect(workers: DaskWorkers) -> None:
     """Check that no port answers without this run's certificate, since other users of the machine see them."""
-    import psutil
     from distributed import Security
 
     workers._client.wait_for_workers(2, timeout=60)
@@ -115,25 +120,12 @@ def test_strangers_cannot_connect(workers: DaskWorkers) -> None:
         assert b"PRIVATE" not in Path(f"/proc/{pid}/cmdline").read_bytes()
 
 
-def test_two_processes_give_the_spectra_of_one(workers: DaskWorkers, tmp_path: Path, engine: Engine) -> None:
-    study = small().with_settings(["run.realisations=500"])
-    bulk.realise(study, tmp_path / "s.zarr", Pool(workers))
-    assert bulk.verify(tmp_path / "s.zarr", engine, redraw=True) == []
-
-
-def test_two_processes_measure_the_flares_of_one(workers: DaskWorkers, engine: Engine) -> None:
-    study = Study().with_settings(["star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.5]", "measure.fits=40"])
-    assert measure(study, Pool(workers)) == measure(study, engine)
-
-
 def test_error_on_a_worker_raises(workers: DaskWorkers) -> None:
     """Check that errors which another try would not mend are raised at once."""
     before = workers.retries
-
     (bright,) = star(magnitude=-0.7, payload=instrument(part=True))
-    impossible = RealiseRequest.of(bright, 10, seed=1, mode="stacked")
     with pytest.raises(DeviceError) as error:
-        workers.submit(Task(impossible, "key", Shard(0, 0, 10))).result()
+        Pool(workers).realise(bright, start=0, count=10, seed=1, mode="stacked")
     assert error.value.kind == "failed"
     assert "realisations 0 to 9: mode = 'stacked'" in str(error.value)
     assert workers.retries == before
@@ -197,24 +189,10 @@ def test_interrupted_cluster_ends_its_workers(stop: signal.Signals, tmp_path: Pa
     Ctrl-C in a terminal reaches the whole process group: workers are not of it, or what they build is cut off aloud.
     """
     script = "import mauvecl.runs.shards as s; s.SHARD_WORK = 2**27; from mauvecl.cli.app import main; main()"
-    words = [
-        "detect",
-        "--star",
-        "G2V",
-        "--star",
-        "K3V",
-        "-m",
-        "7.4,3.7",
-        "--statistic",
-        "chi2",
-        "-n",
-        "80000",
-        "--no-pictures",
-        "--fap",
-        "0.01",
-    ]
+    flags = "--statistic chi2 -n 80000 --no-pictures --fap 0.01"
+    words = ["detect", "--star", "G2V", "--star", "K3V", "-m", "7.4,3.7", *flags.split()]
     command = [sys.executable, "-c", script, *words, "--output", "out"]
-    run = subprocess.Popen(
+    process = subprocess.Popen(
         [*command, "--cluster", "local:2", "--keep-after", "0"],
         cwd=tmp_path,
         stdout=subprocess.PIPE,
@@ -225,18 +203,18 @@ def test_interrupted_cluster_ends_its_workers(stop: signal.Signals, tmp_path: Pa
     shards = tmp_path / "out" / "checkpoint"
     while not list(shards.glob("[!.]*.npz")):
         time.sleep(0.01)
-        assert run.poll() is None
-    workers = [child for child in psutil.Process(run.pid).children() if "spawn_main" in " ".join(child.cmdline())]
+        assert process.poll() is None
+    workers = [child for child in psutil.Process(process.pid).children() if "spawn_main" in " ".join(child.cmdline())]
     assert len(workers) == 2
     assert all(os.getpgid(worker.pid) == worker.pid for worker in workers)
-    os.killpg(run.pid, stop) if stop == signal.SIGINT else run.send_signal(stop)
+    os.killpg(process.pid, stop) if stop == signal.SIGINT else process.send_signal(stop)
     try:
         # Twice what is promised, for machines with other work.
-        _, errors = run.communicate(timeout=10)
+        _, errors = process.communicate(timeout=10)
     finally:
         with suppress(ProcessLookupError):
-            os.killpg(run.pid, signal.SIGKILL)
-    assert run.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143}[stop]
+            os.killpg(process.pid, signal.SIGKILL)
+    assert process.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143}[stop]
     assert len(errors.splitlines()) == 1, errors
     assert "kept in 'out/checkpoint', and the same command with --resume continues from there" in errors
     kept = sum(int(p.stem.split("-")[-1]) for p in shards.glob("[!.]*.npz"))
@@ -344,18 +322,13 @@ def test_shards_whose_workers_have_left_are_sent_to_others(
         pool = Pool(workers)
         (pid,) = workers._client.run(os.getpid).values()
 
-        def kill() -> None:
-            while pool.standing.shards < 5:
-                time.sleep(0.005)
-            os.kill(pid, signal.SIGKILL)
-
-        threading.Thread(target=kill).start()
+        kill_after(pool, 5, lambda: os.kill(pid, signal.SIGKILL))
         found = pool.detect(quiet, flares, realisations=150_000, seed=6)
         workers.close()
     same(found, engine.detect(quiet, flares, realisations=150_000, seed=6))
 
 
-class LeftWithItsResult:
+class Leaves:
     """A finished task whose worker leaves while the result is transferred."""
 
     status = "finished"
@@ -367,27 +340,41 @@ class LeftWithItsResult:
         raise TimeoutError
 
 
-def test_shard_whose_worker_leaves_with_its_result_is_sent_again(
-    tmp_path: Path, engine: Engine, scene: list[Expectation]
+class Disconnects(Leaves):
+    """A finished task whose scheduler leaves while the result is transferred."""
+
+    def result(self, timeout: float) -> None:
+        raise ConnectionResetError("Connection reset by peer")
+
+
+@pytest.mark.parametrize("kind", [Leaves, Disconnects])
+def test_end_during_a_transfer_is_noticed(
+    kind: type[Leaves], tmp_path: Path, engine: Engine, scene: list[Expectation]
 ) -> None:
+    """Send a shard again whose worker leaves with its result, and report a scheduler that is lost."""
     with by_hand(tmp_path) as (_, file):
         workers = DaskWorkers(str(file))
-        send, given = workers._send, list[LeftWithItsResult]()
+        send, given = workers._send, list[Leaves]()
 
         def lose_the_first(attempt: Any) -> None:
             if given:
                 send(attempt)
                 return
-            given.append(LeftWithItsResult())
+            given.append(kind())
             workers._sent[given[0]] = attempt  # type: ignore[index]
             threading.Thread(target=workers._came, args=(attempt, given[0])).start()
 
         workers._send = lose_the_first  # type: ignore[method-assign]
-        found = Pool(workers).detect(scene[0], scene[1:], realisations=N, seed=1)
+        if kind is Leaves:
+            found = Pool(workers).detect(scene[0], scene[1:], realisations=N, seed=1)
+            assert given[0].asked == 3
+            assert workers.retries == 1
+            same(found, engine.detect(scene[0], scene[1:], realisations=N, seed=1))
+        else:
+            with pytest.raises(DeviceError) as error:
+                Pool(workers).detect(scene[0], scene[1:], realisations=N, seed=1)
+            assert error.value.kind == "lost"
         workers.close()
-    assert given[0].asked == 3
-    assert workers.retries == 1
-    same(found, engine.detect(scene[0], scene[1:], realisations=N, seed=1))
 
 
 @pytest.fixture(scope="module")
@@ -419,20 +406,16 @@ def test_example_for_batch_systems_runs(system: str, line: str) -> None:
 
 
 @pytest.mark.parametrize("by", ["address", "file"])
-def test_existing_cluster_is_used(
-    cluster: tuple[str, Path], by: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_existing_cluster_is_used(cluster: tuple[str, Path], by: str, tmp_path: Path) -> None:
     """Name it by address and by scheduler file on the command line; tables equal those of one machine."""
-    monkeypatch.chdir(tmp_path)
-    Path("study.toml").write_text(small().toml())
-    flags = ["detect", "study.toml", "--no-pictures", "--quiet"]
+    (tmp_path / "study.toml").write_text(small().toml())
+    words = ("detect", "study.toml", "--no-pictures", "--quiet")
     where = cluster[0] if by == "address" else str(cluster[1])
-    for folder, more in (("one", []), ("many", ["--cluster", where])):
-        done = CliRunner().invoke(app, [*flags, "--output", folder, *more])
-        assert done.exit_code == 0, done.output
+    run(*words, "--output", "one", folder=tmp_path)
+    run(*words, "--output", "many", "--cluster", where, folder=tmp_path)
     for name in ("detection.ecsv", "tails.ecsv", "roc.ecsv", "departures.ecsv"):
-        assert Path("many", name).read_bytes() == Path("one", name).read_bytes()
-    assert '"retries": 0' in Path("many/run.json").read_text()
+        assert (tmp_path / "many" / name).read_bytes() == (tmp_path / "one" / name).read_bytes()
+    assert '"retries": 0' in (tmp_path / "many/run.json").read_text()
 
 
 def test_lost_scheduler_raises(tmp_path: Path, scene: list[Expectation]) -> None:
@@ -440,34 +423,9 @@ def test_lost_scheduler_raises(tmp_path: Path, scene: list[Expectation]) -> None
         workers = DaskWorkers(str(file))
         pool = Pool(workers)
 
-        def kill() -> None:
-            while pool.standing.shards < 5:
-                time.sleep(0.005)
-            scheduler.kill()
-
-        threading.Thread(target=kill).start()
+        kill_after(pool, 5, scheduler.kill)
         with pytest.raises(DeviceError) as error:
             pool.detect(scene[0], scene[1:], realisations=1_000_000, seed=1)
         assert error.value.kind == "lost"
         workers.stop()
         workers.close()
-
-
-def test_scheduler_lost_during_a_fetch_raises() -> None:
-    workers = DaskWorkers.__new__(DaskWorkers)
-    workers._lock, workers._where = threading.Lock(), "tcp://host:8786"
-    awaited: Future[Any] = Future()
-
-    class Lost:
-        status = "finished"
-
-        def result(self, timeout: float) -> None:
-            raise ConnectionResetError("Connection reset by peer")
-
-    sent: Any = Lost()
-    attempt = _Attempt(awaited, None)  # type: ignore[arg-type]
-    workers._sent = {sent: attempt}
-    workers._came(attempt, sent)
-    with pytest.raises(DeviceError) as error:
-        awaited.result(timeout=1)
-    assert error.value.kind == "lost"

@@ -1,17 +1,24 @@
-"""Intervals of detection probabilities have their coverage, by plain normals without a device."""
+"""Intervals of probabilities have their coverage, by plain normals, and their ends, by scipy."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from marks import long_but
+from scenes import instrument, star
 from scipy import optimize, stats
 
-from mauvecl.statistics.detection_interval import _orthant, detection_interval
-from mauvecl.statistics.intervals import central_counts, clopper_pearson
+from mauvecl import Engine
+from mauvecl.statistics.detection_interval import detection_interval
 
 #: Of the chi-squared statistic here.
 DOF = 48
+
+
+def exact(k: int, n: int) -> tuple[float, float]:
+    """Return Clopper and Pearson's interval."""
+    found = stats.binomtest(int(k), n).proportion_ci(method="exact")
+    return found.low, found.high
 
 
 def strength(kind: str, fap: float, probability: float) -> tuple[float, float]:
@@ -27,7 +34,7 @@ def counted(kind: str, fap: float, probability: float, n: int, seeds: int) -> tu
     """Count flares above a simulated threshold and the ends of its interval; return counts and correlation per seed."""
     rng = np.random.default_rng([round(1e4 * fap), round(1e4 * probability), n, len(kind)])
     _, push = strength(kind, fap, probability)
-    low, high = central_counts(n, fap)
+    low, high = (int(count) for count in stats.binom.ppf([0.025, 0.975], n, fap))
     ranks = [int(np.floor(fap * n * (1 + 1e-12))), max(low - 1, 1), high]
     above, shared = np.empty((seeds, 3), int), np.zeros(seeds)
     for seed in range(seeds):
@@ -65,7 +72,7 @@ def test_interval_has_nominal_coverage(kind: str, fap: float, n: int, seeds: int
         covered = np.mean([x.low <= probability <= x.high for x in found])
         error = 5 * np.sqrt(0.05 * 0.95 / seeds)
         assert 0.94 - error < covered < 0.97 + error
-        ends = [(clopper_pearson(int(few), n).low, clopper_pearson(int(many), n).high) for _, few, many in above[:100]]
+        ends = [(exact(few, n)[0], exact(many, n)[1]) for _, few, many in above[:100]]
         assert np.mean([x.high - x.low for x in found[:100]]) < 0.95 * np.mean([high - low for low, high in ends])
 
 
@@ -85,7 +92,7 @@ def test_ends_of_the_counts() -> None:
     """Compare no and all detections with Clopper and Pearson's interval, which an uncertain threshold widens."""
     sure = detection_interval((1000, 1000, 1000), 1000, 1e-3)
     assert (sure.value, sure.high) == (1.0, 1.0)
-    assert 0.99 < sure.low < clopper_pearson(1000, 1000).low + 1e-9
+    assert 0.99 < sure.low < exact(1000, 1000)[0] + 1e-9
     less = detection_interval((1000, 990, 1000), 1000, 1e-3)
     assert less.low < sure.low
     none = detection_interval((0, 0, 0), 1000, 1e-3)
@@ -97,10 +104,35 @@ def test_ends_of_the_counts() -> None:
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 0.96, 0.9999, 1.0])
-def test_orthant_probability_of_two_normals(correlation: float) -> None:
-    """Compare with scipy's bivariate normal."""
-    for h, k in ((2.33, -0.5), (3.09, 1.88), (1.28, 1.0)):
-        exact = stats.multivariate_normal.cdf(
-            [-h, -k], cov=[[1, correlation], [correlation, 1]], allow_singular=True, abseps=1e-10
-        )
-        assert _orthant(h, k, correlation) == pytest.approx(exact, abs=1e-7)
+def test_ends_combine_three_errors_that_are_correlated(correlation: float) -> None:
+    """Compare with Jeffreys's interval, the threshold's and scipy's bivariate normal, on the scale of quantiles."""
+    n = 1000
+    for fap, above in ((0.1, (500, 460, 545)), (0.01, (300, 270, 325)), (0.001, (30, 17, 48))):
+        middle, few, many = (stats.norm.ppf((k + 0.5) / (n + 1)) for k in above)
+        low, high = stats.norm.ppf(stats.beta.ppf([0.025, 0.975], above[0] + 0.5, n - above[0] + 0.5))
+        p = stats.norm.cdf(middle)
+        cov = [[1, correlation], [correlation, 1]]
+        corner = [stats.norm.ppf(fap), middle]
+        both = stats.multivariate_normal.cdf(corner, cov=cov, allow_singular=True, abseps=1e-10)
+        shared = (both - fap * p) / np.sqrt(fap * (1 - fap) * p * (1 - p))
+        ends = [
+            middle + sign * np.sqrt(one**2 + other**2 - 2 * shared * one * other)
+            for sign, one, other in ((-1, middle - low, middle - few), (1, high - middle, many - middle))
+        ]
+        found = detection_interval(above, n, fap, correlation)
+        assert (found.low, found.high) == pytest.approx(tuple(stats.norm.cdf(ends)), abs=1e-7)
+
+
+def test_false_alarms_have_the_exact_interval(engine: Engine) -> None:
+    """Compare with scipy's interval of Clopper and Pearson, also for none and all."""
+    n = 2000
+    quiet, flare = star(amplitudes=(0.24,), payload=instrument(part=True))
+    found = engine.detect(quiet, [flare], realisations=n, seed=3, statistics=("chi2",))
+    null = found.distribution("chi2")
+    for sigmas in (-10, 0, 2, 20):
+        cut = null.mean + sigmas * null.std
+        ours, above = found.false_alarm_probability(cut, "chi2"), null.above(cut)
+        assert ours.value == above / n
+        # A threshold within a bin of the histogram shares its values out.
+        ends = exact(int(np.floor(above)), n)[0], exact(int(np.ceil(above)), n)[1]
+        assert (ours.low, ours.high) == pytest.approx(ends, rel=1e-9)

@@ -10,7 +10,6 @@ import pytest
 
 from mauvecl import Expectation, Instrument, Linear, Nuisances, Sky, Source, expect
 from mauvecl.statistics.distributions import QuadraticForm
-from mauvecl.statistics.linear import Matched
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.statistics.statistic import Setting
 
@@ -18,12 +17,11 @@ FREE = float("inf")
 
 
 @cache
-def pair(star: str = "G2V", magnitude: float = 7.4, amplitude: float = 0.02) -> tuple[Expectation, Expectation]:
-    source = Source.from_library(star).at_magnitude(magnitude, "V", "vega")
+def pair(name: str = "G2V", magnitude: float = 7.4, amplitude: float = 0.02) -> tuple[Expectation, Expectation]:
+    source = Source.from_library(name).at_magnitude(magnitude, "V", "vega")
     mauve, sky = Instrument.load("mauve"), Sky.of_brightness(22.1)
-    return expect(source, mauve, exposure=50.0, sky=sky), expect(
-        source.flaring(amplitude), mauve, exposure=50.0, sky=sky
-    )
+    quiet, flare = (expect(one, mauve, exposure=50.0, sky=sky) for one in (source, source.flaring(amplitude)))
+    return quiet, flare
 
 
 def setting(quiet: Expectation, sd: dict[str, float]) -> Setting:
@@ -44,7 +42,7 @@ def test_costs_of_unknowns_equal_those_computed_elsewhere(
 ) -> None:
     """Compare with numbers of another program (Vega at V = 0) to 1 %, or half a digit of 0.23."""
     quiet, flare = pair(*star)
-    matched, plain = Matched(), Setting(quiet, ~quiet.saturated)
+    matched, plain = STATISTICS["matched"], Setting(quiet, ~quiet.saturated)
     weights, delta = matched.plain_weights(plain, flare), flare.signal_dn - quiet.signal_dn
     assert matched.closed_form(plain, flare, flare).mean == pytest.approx(known, rel=0.01)
     for sd, (naive, marginal) in (({"dark": 0.1}, dark), ({"light": 0.01}, light)):
@@ -112,12 +110,11 @@ def test_projected_out_spectra_do_not_change_the_statistic() -> None:
         assert after == pytest.approx(before, abs=1e-3)
 
 
-def test_degrees_of_freedom() -> None:
+def test_projected_out_unknowns_take_degrees_of_freedom() -> None:
     quiet, _ = pair()
     s = setting(quiet, {"dark": FREE, "light": 0.01})
-    assert STATISTICS["chi2"].dof(s) == quiet.wavelength_nm.size - 1
-    assert STATISTICS["chi2_element"].dof(s) == quiet.element_wavelength_nm.size - 1
-    assert STATISTICS["matched"].dof(s) == 1
+    wanted = {"chi2": quiet.wavelength_nm.size - 1, "chi2_element": quiet.element_wavelength_nm.size - 1, "matched": 1}
+    assert {name: STATISTICS[name].dof(s) for name in wanted} == wanted
 
 
 @pytest.mark.long

@@ -10,13 +10,13 @@ from scipy.ndimage import gaussian_filter1d
 
 from mauvecl import Comparison, Expectation, Instrument, Sky, Source, expect
 from mauvecl.statistics.distributions import QuadraticForm
-from mauvecl.statistics.smoothing import SMOOTHING_NM, Smoothing
+from mauvecl.statistics.smoothing import Smoothing
 
 
 def whole(quiet: Expectation, flare: Expectation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the rows, factors of squares and variances of modes of the paper's sum over every pixel."""
     n = quiet.wavelength_nm.size
-    sigma = SMOOTHING_NM / np.sqrt(8 * np.log(2)) / np.median(np.diff(quiet.wavelength_nm))
+    sigma = 10.5 / np.sqrt(8 * np.log(2)) / np.median(np.diff(quiet.wavelength_nm))
     rows = gaussian_filter1d(np.eye(n), sigma, axis=0, mode="nearest")
     factor = 1.0 / gaussian_filter1d(flare.recorded_light_dn, sigma, mode="nearest") / flare.exposure_s
     half = np.sqrt(factor)[:, None] * rows

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
 
-from mauvecl.store import stored_scenes
 
-
-@pytest.fixture(autouse=True)
-def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True, scope="module")
+def small_chunks() -> Iterator[None]:
     """Set chunks of some 64 rows, so that a small store has several."""
-    monkeypatch.setattr(stored_scenes, "CHUNK_BYTES", 64 * 197 * 2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mauvecl.store.stored_scenes.CHUNK_BYTES", 64 * 197 * 2)
+        yield

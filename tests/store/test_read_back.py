@@ -7,13 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stores import study
+from commands import run
+from stores import expectations, study
 
 from mauvecl import Engine, Study, bulk, read_frames
 from mauvecl.observations.reading import reduce_frames
-from mauvecl.store.export import Selection, export
-from mauvecl.store.layout import Store
-from mauvecl.study.cases import Case
 
 #: Stacks of two frames, and single frames of which the second is stored.
 STACKED: dict[str, Any] = {"observation": {"exposure_s": 10.0}}
@@ -26,7 +24,7 @@ def test_stores_are_read_back_with_their_metadata(tmp_path: Path, engine: Engine
     asked = study(40, **(STACKED if which == "stacked" else SINGLE))
     path = _written(tmp_path, asked, engine, ending)
     frames = read_frames(f"{path}[star-1/flare-1]")
-    _, x = Case(asked).expectations
+    _, x = expectations(asked)
     raw = bulk.read(tmp_path / "frames.zarr", "star-1/flare-1").values.reshape(-1, x.wavelength_nm.size)
     n = 2 if which == "stacked" else 1
     np.testing.assert_allclose(frames.flux, raw - n * (x.bias_dn + x.dark_dn), rtol=1e-12, atol=1e-9)
@@ -64,4 +62,5 @@ def _written(folder: Path, asked: Study, engine: Engine, ending: str) -> Path:
     bulk.realise(asked, folder / "frames.zarr", engine)
     if ending == "zarr":
         return folder / "frames.zarr"
-    return export(Selection.of(Store.open(folder / "frames.zarr")), folder / f"frames.{ending}")
+    run("export", "frames.zarr", f"frames.{ending}", folder=folder)
+    return folder / f"frames.{ending}"

@@ -6,12 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from commands import run
 from refusals import refused
 from stores import Painter, study
 
 from mauvecl import bulk, read_frames
-from mauvecl.store.export import Selection, export
-from mauvecl.store.layout import Store
 
 PAINTER = Painter()
 #: Rows of the store.
@@ -27,8 +26,9 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def selected(folder: Path, rows: tuple[int, int] | None = None) -> Selection:
-    return Selection.of(Store.open(folder / "s.zarr"), rows=rows)
+def exported(folder: Path, *words: str) -> str:
+    """Return the refusal of an export."""
+    return run("export", "s.zarr", *words, folder=folder, code=2).stderr
 
 
 #: Calls with the folder, the key of the error, and what its sentence names.
@@ -40,8 +40,6 @@ CALLS: dict[str, tuple[Callable[[Path], object], str, *tuple[str, ...]]] = {
     "no such array": (lambda at: bulk.read(at / "s.zarr", "star-9/quiescent"), "scenes", "'star-9/quiescent'"),
     "a frame beyond the exposure": (
         lambda at: bulk.realise(study(ROWS, bulk={"frames": [7]}), at / "t.zarr", PAINTER), "bulk.frames"),
-    "rows beyond the store": (lambda at: selected(at, (10, 60)), "rows", f"0:{ROWS}"),
-    "an unknown format": (lambda at: export(selected(at), at / "s.txt"), "file", "h5", "hdf5"),
     "frames of an unnamed array": (lambda at: read_frames(at / "s.zarr"), "hdu", "star-1/quiescent",
                                    "FILE[star-1/flare-1]"),
     "frames of an unknown array": (lambda at: read_frames(f"{at / 's.zarr'}[star-2]"), "hdu", "star-2"),
@@ -56,13 +54,12 @@ def test_bad_input_raises(name: str, folder: Path) -> None:
     assert (folder / "notes" / "mine.txt").read_text() == "keep me"
 
 
-def test_export_without_a_chunk_raises(folder: Path) -> None:
+def test_bad_exports_are_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert f"0:{ROWS}" in exported(folder, "s.fits", "--rows", "10:60")
+    assert "hdf5" in exported(folder, "s.txt")
+    with monkeypatch.context() as patch:
+        patch.setattr("mauvecl.store.export.MAX_BYTES", 1000)
+        assert "rows" in exported(folder, "s.fits")
     (folder / "s.zarr" / "star-1/quiescent/c/0/0").unlink()
-    with refused("store", "star-1/quiescent/c/0/0"):
-        selected(folder)
-
-
-def test_export_of_too_many_rows_raises(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mauvecl.store.export.MAX_BYTES", 1000)
-    with refused("rows"):
-        selected(folder)
+    assert "star-1/quiescent/c/0/0" in exported(folder, "s.fits")
+    assert not (folder / "s.fits").exists()
