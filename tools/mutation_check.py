@@ -299,15 +299,15 @@ MUTATIONS: dict[str, Mutation] = {
         ),
     ),
     "durations without the error of their level": (
-        "test_errors_of_durations_include_that_of_the_level",
+        "test_error_of_a_fitted_duration_is_that_of_least_squares",
         ("grid.information + left + mean**2 * likelihood.level_variance) / level", "grid.information + left) / level"),
     ),
     "brighter flares on a higher level": (
-        "test_errors_of_durations_include_that_of_the_level",
+        "test_error_of_a_fitted_duration_is_that_of_least_squares",
         ("along = per_amplitude + mean * in_level", "along = per_amplitude - mean * in_level"),
     ),
     "light summed above a known level": (
-        "test_errors_of_durations_include_that_of_the_level",
+        "test_error_of_a_summed_duration_includes_that_of_its_level",
         ("variance += _level_variance(process, time, noise, quiet, near)", "pass"),
     ),
     "a slow decay on top of the fast one": (

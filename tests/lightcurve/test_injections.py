@@ -145,25 +145,18 @@ def test_threshold_by_counting_is_that_of_its_rate(stares: Stares) -> None:
     assert abs(rows[0]["threshold"] - rows[1]["threshold"]) < 2 * (rows[0]["threshold_high"] - rows[0]["threshold_low"])
 
 
-#: Rays that add about as much noise again as the frames have.
-RAYS = {"cosmic_rays": {"rate_per_cm2_s": 200.0}}
-
-
 @pytest.mark.long
-@pytest.mark.parametrize("processes", [{}, RAYS], ids=["no rays", "cosmic rays"])
 @pytest.mark.parametrize("half_width", [15.0, 40.0])
-def test_injections_are_found_as_often_as_flares_that_are_drawn(
-    stares: Stares, half_width: float, processes: dict[str, Any]
-) -> None:
+def test_injections_are_found_as_often_as_flares_that_are_drawn(stares: Stares, half_width: float) -> None:
     """Search drawn stares, with 40 flares of the size of which inject finds half.
 
-    Within 4 standard errors of both, which fails once in 10^4 runs: a flare that comes out a sixth too bright, or
-    frames without the rays, are noticed.
+    Within 4 standard errors of both, which fails once in 10^4 runs: a flare that comes out a sixth too bright is
+    noticed.
     """
     frames = {"duration_s": 20_000.0, "jitters": {"light": 0.01}, "search": True}
     search = {"half_widths_s": [15.0, 40.0, 110.0], "window_s": 400.0, "per": "day", "false_alarms": 0.1, "nulls": 0}
     widths = {"half_width_low_s": half_width, "half_width_high_s": half_width, "count": 400, "positions": 60}
-    asked = {"stare": frames, "search": search, "processes": processes}
+    asked = {"stare": frames, "search": search}
     answer = inject(study(**asked, injections=widths | {"sizes": 8, "widths": 1}), stares)
     (limit,) = answer.table[:1]
     size = float(limit["e50"])
