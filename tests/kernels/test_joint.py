@@ -63,6 +63,8 @@ def by_polynomial(x: Expectation, pixel: int = 0) -> np.ndarray:
     assert scene.joint
     level = scene.levels[0, pixel]
     shape, sd = np.array([level[f"c{k}"] for k in range(5)], float), float(level["c1"])
+    if not scene.quartic:
+        shape[4] = 0.0
     return exact.of_polynomial(shape / sd, sd, float(scene.base_dn[0, pixel]), *span(x, pixel))
 
 
