@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -271,6 +272,16 @@ def test_rotation_is_no_flare(period_d: float, cadence_s: float, noise: float) -
     assert not detected(analysis)
     assert analysis.level.used.mean() > 0.95
     assert float(np.median(analysis.level.error)) == pytest.approx(noise, rel=0.1)
+
+
+def test_standard_deviation_of_a_varying_star_is_that_of_its_light() -> None:
+    """The process of a star that shows three rotations may have another standard deviation."""
+    rng = np.random.default_rng(7)
+    time = np.arange(300) * 1800.0
+    flux = 1 + 0.021 * np.sin(2 * np.pi * time / (2 * 86_400)) + 2e-4 * rng.standard_normal(time.size)
+    messages = analysed(Frames.of(time, flux, np.full(time.size, 2e-4))).analysis.messages
+    (stated,) = [found for one in messages if (found := re.search(r"standard deviation of (\S+) %, by rotation", one))]
+    assert float(stated[1]) == pytest.approx(100 * flux.std() / flux.mean(), rel=0.05)
 
 
 @pytest.mark.parametrize("name", [pytest.param("fast-2min", marks=pytest.mark.long), "slow-30min"])
