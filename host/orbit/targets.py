@@ -19,8 +19,9 @@ from ..sky.helioecliptic import parse_position
 from ..stars import well_known
 from ..stars.star_names import near_names
 from ..stars.well_known import by_key, name_key
-from ..tables.coordinates import EXPECTED, is_missing_position
+from ..tables.coordinates import EXPECTED
 from ..tables.ecsv import parse_ecsv
+from ..tables.missing import is_missing_position
 from ..tables.times import offline
 from .earth import direction
 

@@ -10,7 +10,6 @@ import numpy as np
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
-from .missing import is_missing
 from .names import divided_unit
 
 #: Signs, quotes and blanks of typeset text, which are read as those of a keyboard.
@@ -54,12 +53,6 @@ def unit_in_name(name: str) -> str:
     base, unit = divided_unit(name)
     tail = re.split(r"[\s_.]+", base)[1:]
     return next((found for text in (unit, *tail[-1:]) if text and (found := angle_unit(text))), "")
-
-
-def is_missing_position(text: str) -> bool:
-    """Return whether a text is a pair of missing values, such as "nan nan" or "--, --"."""
-    words = re.split(r"\s*[,;]\s*|\s+", text.strip().strip("()[]").strip())
-    return len(words) == 2 and all(map(is_missing, words))
 
 
 def position(text: str) -> tuple[float, float]:

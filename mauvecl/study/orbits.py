@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import ValidationError, field_validator, model_validator
 
 from mauvecl.host.orbit.observing_limits import Limits
-from mauvecl.host.tables.coordinates import is_missing_position
+from mauvecl.host.tables.missing import is_missing_position
 from mauvecl.host.tables.names import DECLINATIONS, RIGHT_ASCENSIONS, SPECTRAL_TYPES, STARS, key_of
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Slider, Unit, Widget, first
