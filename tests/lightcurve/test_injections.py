@@ -189,7 +189,7 @@ def test_light_of_star_and_flare_is_lost_in_pointing_drifts(stares: Stares) -> N
 
 
 def test_flare_of_an_event_has_its_signal_to_noise(stares: Stares) -> None:
-    """Value of the search for a bright flare against the S/N of its light: the bank and the baseline lose a tenth at most."""
+    """Value of the search for a bright flare against the S/N of its light: bank and baseline lose a tenth at most."""
     event = Event(1500.0, 60.0, 0.5)
     given = [{"peak_s": event.peak_s, "half_width_s": event.half_width_s, "amplitude": event.amplitude}]
     drawn = stare(study(events=given, stare={"duration_s": 3000.0}, search={"half_widths_s": [42.0, 77.0]}), stares)
