@@ -189,11 +189,11 @@ def test_light_of_star_and_flare_is_lost_in_pointing_drifts(stares: Stares) -> N
 
 
 def test_flare_of_an_event_has_its_signal_to_noise(stares: Stares) -> None:
-    """Value of the search for a bright flare against the S/N of its light: banks lose 2 % at most."""
+    """Value of the search for a bright flare against the S/N of its light: bank and baseline lose a tenth at most."""
     event = Event(1500.0, 60.0, 0.5)
     given = [{"peak_s": event.peak_s, "half_width_s": event.half_width_s, "amplitude": event.amplitude}]
     drawn = stare(study(events=given, stare={"duration_s": 3000.0}, search={"half_widths_s": [42.0, 77.0]}), stares)
     (row,), (flare,) = drawn.found, drawn.events
-    assert 0.95 < row["value"] / flare["snr"] < 1.02
+    assert 0.9 < row["value"] / flare["snr"] < 1.02
     square = SHAPES["davenport2014"].square_integral
     assert square == pytest.approx(0.72148, rel=1e-4)
