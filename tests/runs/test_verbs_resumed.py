@@ -13,7 +13,7 @@ import pytest
 from commands import run
 
 PLAN = """
-plan = {targets = [{name = "eps Eri"}, {name = "GJ 205"}], hours = 10, injections = 10}
+plan = {targets = [{name = "eps Eri"}, {name = "GJ 205"}], hours = 10, injections = 20}
 orbit = {days = 3, step_s = 300}
 search = {half_widths_s = [120]}
 """

@@ -195,9 +195,25 @@ def test_second_writer_raises(path: Path, engine: Engine) -> None:
     assert bulk.verify(path) == []
 
 
+@pytest.fixture
+def described_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Study], None]:
+    """Return a function that describes a store once for all its runs, which then begin to write at once."""
+
+    def describe(asked: Study) -> None:
+        store = Store(tmp_path, asked)
+        described, scenes = store.description(), store.scenes
+        monkeypatch.setattr(Store, "description", lambda self: described)
+        monkeypatch.setattr(Store, "scenes", property(lambda self: scenes))
+
+    return describe
+
+
 @pytest.mark.long
-def test_random_kills_lose_nothing(tmp_path: Path, painted: dict[str, bytes]) -> None:
+def test_random_kills_lose_nothing(
+    tmp_path: Path, painted: dict[str, bytes], described_once: Callable[[Study], None]
+) -> None:
     """Kill a run at random moments, within about the time that it takes, and resume it; files have the same bits."""
+    described_once(study(1000))
     path, kills, moments = tmp_path / "frames.zarr", 0, random.Random(5)
     began = time.monotonic()
     killed(forked(lambda: bulk.realise(study(1000), path, Painter())))  # type: ignore[arg-type]
@@ -216,8 +232,9 @@ def test_random_kills_lose_nothing(tmp_path: Path, painted: dict[str, bytes]) ->
 
 
 @pytest.mark.long
-def test_kill_at_every_step_of_writing_loses_nothing(tmp_path: Path) -> None:
+def test_kill_at_every_step_of_writing_loses_nothing(tmp_path: Path, described_once: Callable[[Study], None]) -> None:
     """Kill before each fsync, rename and line of digests."""
+    described_once(study(200))
     step = 0
     while True:
         path, counted = tmp_path / f"{step}.zarr", iter(range(step + 1))
