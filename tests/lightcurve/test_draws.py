@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refused
 from scenes import NEAR, instrument, star
 from scipy import special
 
@@ -189,3 +191,33 @@ def test_components_equal_the_expectations(stares: Stares) -> None:
     known = components.coefficients(month)
     assert known.shape == (518_400, 6)
     assert components.means(known).shape == (518_400, 3)
+
+
+def test_bad_requests_for_frames_raise(stares: Stares) -> None:
+    payload = instrument(part=True)
+    quiet, flare = star(amplitudes=(1.0,), exposure=5.0, payload=payload)
+    n = quiet.wavelength_nm.size
+    one, ones = np.ones((1, n)), np.ones((10, 1))
+    stare, components = Stare.of(50.0), Components.of(quiet, [flare], one)
+    twice, many = (Components.of(quiet, [flare], rows) for rows in (np.vstack([one, 2 * one]), np.eye(n)[:9]))
+    cases: list[tuple[str, Components, Stare, Any, dict[str, Any]]] = [
+        ("seed", components, stare, None, {"seed": -1}),
+        ("count", components, stare, None, {"count": 0}),
+        ("method", components, stare, None, {"method": "frames"}),
+        ("flare", components, stare, ones[1:], {}),
+        ("flare_coefficients", components, stare, -ones, {}),
+        ("amplitudes", components, stare, ones, {"amplitudes": np.ones(3)}),
+        ("frame_s", components, Stare.of(40.0, frame_s=4.0), None, {}),
+        ("light", components, Stare.of(50.0, jitters={"light": 0.15}), None, {}),
+        ("flare", components, stare, 1e9 * ones, {}),
+        ("method", components, stare, 4000 * ones, {"method": "cumulants"}),
+        ("weights", twice, stare, None, {"method": "cumulants"}),
+        ("weights", many, stare, None, {}),
+    ]
+    for key, *given, how in cases:
+        with refused(key):
+            stares.frames(*given, **({"seed": 1} | how))
+    with refused("n_frames", value=10):
+        Components.of(replace(quiet, n_frames=10), [], one)
+    with refused("weights", value=(1, 3)):
+        Components.of(quiet, [], np.ones((1, 3)))
