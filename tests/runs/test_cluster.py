@@ -76,13 +76,19 @@ def kill_after(pool: Pool, shards: int, kill: Callable[[], object]) -> threading
 def test_killed_worker_is_replaced(workers: DaskWorkers, engine: Engine, scene: list[Expectation]) -> None:
     """Kill a counting process: another one counts its shard, and the answer has the same bits."""
     quiet, *flares = scene
-    n, pids = 400_000, list(workers._client.run(os.getpid).values())
+    n, pids, killed = 150_000, workers._client.run(os.getpid), list[int]()
     pool = Pool(workers)
-    killer = kill_after(pool, 10, lambda: os.kill(pids[0], signal.SIGKILL))
+
+    def kill_a_busy_one() -> None:
+        busy = [pids[address] for address, tasks in workers._client.processing().items() if tasks]
+        killed.append(busy[0])
+        os.kill(busy[0], signal.SIGKILL)
+
+    killer = kill_after(pool, 10, kill_a_busy_one)
     found = pool.detect(quiet, flares, realisations=n, seed=6)
     killer.join()
     same(found, engine.detect(quiet, flares, realisations=n, seed=6))
-    assert pids[0] not in workers._client.run(os.getpid).values()
+    assert killed[0] not in workers._client.run(os.getpid).values()
     assert pool.standing.retries >= 1, "the shard in its hands was counted again"
 
 
