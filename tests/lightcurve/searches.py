@@ -7,8 +7,7 @@ from functools import cache
 import numpy as np
 from scenes import instrument
 
-from mauvecl import Sky, Source, expect
-from mauvecl.lightcurve.flares.shapes import SHAPES
+from mauvecl import SHAPES, Sky, Source, expect
 from mauvecl.lightcurve.search.bank import Bank, Baseline
 from mauvecl.lightcurve.search.survey import Survey
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates, frame_nuisances

@@ -7,13 +7,12 @@ import pytest
 from refusals import refused
 from searches import DAVENPORT, survey
 
+from mauvecl import Sinusoid, Stare
 from mauvecl.lightcurve.defaults import per_day
 from mauvecl.lightcurve.search.bank import Baseline
 from mauvecl.lightcurve.search.flare_fit import SingleFlareFit
 from mauvecl.lightcurve.search.importance_sampling import sample_rate
 from mauvecl.lightcurve.search.sampled_rate import sampled_rate
-from mauvecl.lightcurve.stares.curves import Sinusoid
-from mauvecl.lightcurve.stares.stare import Stare
 
 
 def drawn(one, rng, count, farther=1.0):
