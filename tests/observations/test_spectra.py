@@ -82,6 +82,7 @@ def rare() -> float:
     return max(rate.threshold(0.2) for rate in rates)
 
 
+@pytest.mark.long
 def test_frames_of_other_wavelengths_or_units_are_searched_in_white_light() -> None:
     frames = drawn(np.random.default_rng(2))
     nm = frames.wavelength_nm

@@ -56,6 +56,7 @@ def test_tail_of_a_bright_flare_without_its_peak_is_an_event(
     assert abs(event.energy.fitted_s - truth) < 2.5 * (high - low)
 
 
+@pytest.mark.long
 def test_end_of_a_search_at_its_largest_number_of_events_is_stated(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(503)
     time = np.arange(1000) * 20.0

@@ -236,6 +236,7 @@ def test_closed_forms_follow_the_simulation_of_the_page(server: Server, more: di
 # Pictures
 
 
+@pytest.mark.long
 def test_pictures_state_what_the_answer_is(server: Server) -> None:
     async def work(talk: Talk) -> None:
         drawn = await talk.answer(link(unknown="nothing"))

@@ -457,6 +457,7 @@ UNUSABLE: list[tuple[str, bytes, str]] = [
 ]  # fmt: skip
 
 
+@pytest.mark.long
 def test_unusable_spectra_leave_no_answer(server: Server) -> None:
     """Whatever was there before; a message on a file names the fields of this file, and what they advise works."""
     angstrom = rows_of(np.arange(1700.0, 10_001.0, 10), np.full(831, 1e-12))
