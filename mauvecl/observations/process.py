@@ -45,9 +45,6 @@ SCALES = (1.5, 3.0)
 SMOOTH_QUALITY = 2**-0.5
 #: Largest number of iterations of a fit, and the change of log likelihood at which it has converged.
 ITERATIONS, CONVERGED = 80, 1e-3
-#: Step of the logarithms of parameters for derivatives: rounding errors of a log likelihood of 1e5 divided by a shorter
-#: step would lead fits elsewhere on another processor.
-STEP = 1e-5
 #: Number of parameters of each kind of term.
 SIZES: dict[Kind, int] = {"correlated": 2, "smooth": 2, "rotation": 5}
 
@@ -434,9 +431,6 @@ def _fitted(data: Binned, terms: tuple[ProcessTerm, ...], log_excess: float) -> 
 
     found = minimize(
         cost, np.clip(start, low, high), method="L-BFGS-B", bounds=bounds,
-        options={
-            "maxiter": ITERATIONS, "eps": STEP,
-            "ftol": CONVERGED / max(abs(cost(np.clip(start, low, high))), 1.0),
-        },
+        options={"maxiter": ITERATIONS, "ftol": CONVERGED / max(abs(cost(np.clip(start, low, high))), 1.0)},
     )  # fmt: skip
     return made(found.x), 2 * float(found.fun) + start.size * float(np.log(data.values.size))
