@@ -21,10 +21,11 @@ from refusals import refused
 import mauvecl
 
 TABLES = Path(__file__).parent / "data" / "refusals"
+CONTENT = {path: tomllib.loads(path.read_text(encoding="utf-8")) for path in sorted(TABLES.glob("*.toml"))}
 ROWS = [
     pytest.param(path, row, id=f"{path.stem}: {row.get('run') or row['call']}")
-    for path in sorted(TABLES.glob("*.toml"))
-    for row in tomllib.loads(path.read_text(encoding="utf-8"))["refusal"]
+    for path, table in CONTENT.items()
+    for row in table["refusal"]
 ]
 
 
@@ -32,13 +33,13 @@ ROWS = [
 def _names(path: Path) -> dict[str, Any]:
     """Return the public names, and what the table's setup makes of them."""
     names = {name: getattr(mauvecl, name) for name in mauvecl.__all__} | {"mauvecl": mauvecl, "np": np, "u": u}
-    exec(tomllib.loads(path.read_text(encoding="utf-8")).get("setup", ""), names)
+    exec(CONTENT[path].get("setup", ""), names)
     return names
 
 
 @pytest.mark.parametrize(("path", "row"), ROWS)
 def test_bad_input_is_refused(path: Path, row: dict[str, Any], tmp_path: Path) -> None:
-    for name, text in (tomllib.loads(path.read_text(encoding="utf-8")).get("files", {}) | row.get("files", {})).items():
+    for name, text in (CONTENT[path].get("files", {}) | row.get("files", {})).items():
         (tmp_path / name).write_text(text, encoding="utf-8")
     if "call" in row:
         with refused(row["key"], *row["says"]):
@@ -49,5 +50,5 @@ def test_bad_input_is_refused(path: Path, row: dict[str, Any], tmp_path: Path) -
     sentence = reported.removeprefix("mauvecl: ").strip()
     for fact in (row["key"], *row["says"]):
         assert fact in sentence, sentence
-    # Notes on what was assumed may precede the sentence; nothing follows it.
+    # Notes on what was assumed may precede the sentence.
     assert not re.search(r"Traceback|internal error", reported), reported

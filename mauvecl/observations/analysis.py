@@ -160,11 +160,11 @@ class Analysis:
                 'search.frame.light = "free", the default, searches without the light that all pixels share.'
             )
         if self.level.process.terms:
-            # The standard deviation of a process differs from that of a light curve which shows few periods of it.
-            level = self.level.level[self.level.used]
+            # A light curve that shows few periods of a process has another standard deviation than the process.
+            spread = self.level.level[self.level.used].std() / self.survey.level
             lines.append(
-                f"The quiescent light is not constant: its fitted level has a standard deviation of "
-                f"{100 * level.std() / level.mean():.2g} %, by {self.level.process.describe()}."
+                "The quiescent light is not constant: its fitted level has a standard deviation of "
+                f"{100 * spread:.2g} %, by {self.level.process.describe(self.unit)}."
             )
         if not self.likeness.alike:
             lines.append(

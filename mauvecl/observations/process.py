@@ -140,11 +140,12 @@ class Process:
         """Standard deviation of the process, without the noise of frames."""
         return float(np.sqrt(sum(term.sd**2 for term in self.terms)))
 
-    def describe(self) -> str:
-        """Return the terms with their periods or time scales."""
+    def describe(self, unit: float) -> str:
+        """Return a description of the terms; `unit` is the light of the star, to which standard deviations relate."""
         words = {"correlated": "correlated noise", "smooth": "smooth variability", "rotation": "rotation"}
         parts = [
-            f"{words[term.kind]} ({'period' if term.kind == 'rotation' else 'time scale'} {_time(term.scale_s)})"
+            f"{words[term.kind]} ({'period' if term.kind == 'rotation' else 'time scale'} {_time(term.scale_s)}, "
+            f"{100 * term.sd / unit:.2g} % in the process)"
             for term in self.terms
         ]
         return ", ".join(parts) if parts else "constant light"
