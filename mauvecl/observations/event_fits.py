@@ -177,8 +177,8 @@ class Grid:
         box, outer : ndarray, shape (2, 2)
             First and largest range of the peak and of the logarithm of the half-width.
         before : Grid, optional
-            Grid of the same window and family, whose means are taken where the range is the same: they take most of
-            the time.
+            Grid of the same window and family. Its means are reused where the range is the same, because they take
+            most of the time.
         """
         window = likelihood.window
         n_node = NODES if len(family.weights) == 1 else NODES_OF_MANY
@@ -348,7 +348,7 @@ def _single(
     box : ndarray, shape (2, 2)
         Range of the peak and of the logarithm of the half-width from which the grid begins.
     last : Grid, optional
-        Grid of the first fit, if it is one of the family.
+        Grid of the first fit, if that was a fit of the same family.
     """
     outer = _ranges(window)
     box = np.column_stack([np.maximum(box[:, 0], outer[:, 0]), np.minimum(box[:, 1], outer[:, 1])])

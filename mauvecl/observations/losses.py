@@ -35,8 +35,8 @@ MOST_FLARING, MOST_ACTIVE, MOST_EXCESS = 0.1, 0.3, 1.5
 #: Time scale from which a process is slow, however long the light curve (assumed: 2 d, twelve times the longest loss
 #: that is searched).
 SLOW_S = 172_800.0
-#: Standard deviation of a process, in those of the noise of a mean over its time scale, below which losses of light
-#: cannot have made it (assumed: losses of an S/N of 5 in 1 % of the frames have 0.5).
+#: Smallest standard deviation of a process that losses of light may have caused, relative to the noise of a mean over
+#: its time scale (assumed: losses with an S/N of 5 in 1 % of the frames give 0.5).
 LEAST_LOSS = 0.5
 #: Largest share of the frames in losses; more of them are the level of the star, before or after a step (assumed).
 MOST_LOST = 0.4
