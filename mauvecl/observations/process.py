@@ -347,7 +347,9 @@ def fit_process(data: Binned, start: Process | None = None, steps: Steps | None 
             if (size + SIZES[term.kind]) * VALUES_PER_PARAMETER <= data.values.size:
                 options.append(_fitted(data, (*best.terms, term), np.log(best.excess)))
                 steps.step()
-        tried |= {one.name: min(bic, tried.get(one.name, np.inf)) for one, bic in options}
+        # A combination has several starting points.
+        for one, bic in options:
+            tried[one.name] = min(bic, tried.get(one.name, np.inf))
         other, lowest = min(options, key=lambda pair: pair[1], default=(best, np.inf))
         if not lowest < value:
             break

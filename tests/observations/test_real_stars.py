@@ -284,6 +284,16 @@ def test_standard_deviation_of_a_varying_star_is_that_of_its_light() -> None:
     assert float(stated[1]) == pytest.approx(100 * flux.std() / flux.mean(), rel=0.05)
 
 
+def test_fitted_process_is_the_best_of_those_that_were_tried() -> None:
+    """Fits begin at several points, of which the best counts."""
+    rng = np.random.default_rng(8)
+    time = np.arange(600) * 1800.0
+    phase = 2 * np.pi * time / 40_600.0
+    flux = 1 + 0.022 * np.cos(phase) + 0.008 * np.cos(2 * phase + 1.1) + 8e-4 * rng.standard_normal(time.size)
+    process = analysed(Frames.of(time, flux, np.full(time.size, 8e-4))).analysis.level.process
+    assert min(process.bic, key=lambda one: one[1]) == (process.name, 0.0)
+
+
 @pytest.mark.parametrize("name", [pytest.param("fast-2min", marks=pytest.mark.long), "slow-30min"])
 def test_files_of_rotating_stars_have_no_flare(name: str) -> None:
     analysis = analysed(read_frames(CASES / "rotating-star" / f"{name}.fits"), false_alarms=0.01, per="year").analysis
