@@ -256,13 +256,15 @@ KINDS = ("detection", "map", "limit", "measure", "change", "periods", "completen
 @pytest.mark.parametrize("kind", KINDS)
 def test_cancel_ends_every_computation(server: Server, kind: str) -> None:
     """Cancel each computation once it has started, and compute the next one; progress never falls."""
-    many = link(realisations="4000000", targets="eps Eri", visits="100")
+    bands = ",".join(f"{start}-{start + 150}" for start in range(210, 450, 12))
+    many = link(realisations="4000000", targets="eps Eri", visits="100", changes=bands)
 
     async def work(talk: Talk) -> tuple[float, float]:
         await talk.answer(many)
         n = await talk.say("simulate", kind=kind, link=many)
         shares, left = [0.0], []
-        while "waiting" in (reported := await talk.next()).get("message", "waiting") or len(shares) < 5:
+        # The first reports suffice: some computations last a second on a fast machine.
+        while "waiting" in (reported := await talk.next()).get("message", "waiting") or len(shares) < 2:
             assert "ended" not in reported, reported
             shares.append(reported.get("progress") or 0.0)
             left += re.findall(r"about (\d+) s left", reported.get("message", ""))
