@@ -7,7 +7,8 @@ searched with a wrong process would be too long or too short.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +34,8 @@ MAX_COMPARED, PARAMETERS = 8, 3
 #: Departures of flares from their shape that are tried for the criterion.
 DEPARTURES = (0.0, 0.03, 0.2)
 #: Shortest period of rotation (assumed: 0.2 d), and the rise of the criterion for a faster process of which
-#: the frames show less than three periods (assumed).
-FASTEST_ROTATION_S, SEEN_ONCE = 17_280.0, 20.0
+#: the frames show fewer periods or time scales than a number (both assumed).
+FASTEST_ROTATION_S, SEEN_ONCE, REPEATED = 17_280.0, 20.0, 10.0
 #: Share of the frames in events that may change in the last alternation.
 SETTLED = 0.002
 #: Smallest number of quiescent frames to which a process is fitted; with fewer, the longest events are shortened.
@@ -108,35 +109,53 @@ def fit_quiet_light(
     other, others = alternate(survey, others, None, steps)
     if float((others ^ taken).mean()) <= SETTLED:
         return fitted, taken
-    first, second = criterion(fitted, taken), criterion(other, others)
+    first = criterion(fitted, taken)
+    second = criterion(other, others, further=_light_of_events(fitted, taken))
     return (other, others) if second < first else (fitted, taken)
 
 
-def criterion(survey: SeriesSurvey, taken: Bool, shapeless: bool = False) -> float:
-    """Return the Bayesian information criterion of a process and the flares of the events above `PROVISIONAL`.
+@dataclass(frozen=True, eq=False)
+class _EventLight:
+    """Light of the flares that fit an event."""
 
-    A process of minutes that is seen once, and no more, costs `SEEN_ONCE`: stars and instruments repeat what they do.
-    In independent noise, or if `shapeless`, the light of an event may have any smooth shape.
-    """
-    found, _ = detect_events(survey, PROVISIONAL)
-    start, frame_s, size = survey.stare.start_s, survey.stare.frame_s, float(np.log(survey.stare.n_frames))
+    event: Detection
+    rows: slice
+    light: Float  # along the direction of the event, shape (n_row,)
+    photon: Float  # variance that it adds
+    n_flares: int
+
+
+def _light_of_events(survey: SeriesSurvey, taken: Bool) -> list[_EventLight]:
+    """Return the light of the events above `PROVISIONAL`."""
     fits = []
-    for one in found:
-        flares, scale, photon = flares_of(survey, taken, one)
+    for event in detect_events(survey, PROVISIONAL)[0]:
+        flares, scale, photon = flares_of(survey, taken, event)
         lights = [_light_of(survey, each.peak_s, each.half_width_s, each.amplitude) for each in flares]
         first, stop = min(rows.start for rows, _ in lights), max(rows.stop for rows, _ in lights)
-        mine = np.zeros(stop - first)
+        total = np.zeros(stop - first)
         for rows, flux in lights:
-            mine[rows.start - first : rows.stop - first] += flux
-        fits.append((one, slice(first, stop), scale * mine, photon * mine, len(flares)))
+            total[rows.start - first : rows.stop - first] += flux
+        fits.append(_EventLight(event, slice(first, stop), scale * total, photon * total, len(flares)))
+    return fits
 
-    def cost(epsilon: float, fits: list[tuple[Detection, slice, Float, Float, int]], kept: Bool) -> float:
+
+def criterion(survey: SeriesSurvey, taken: Bool, shapeless: bool = False, further: Sequence[_EventLight] = ()) -> float:
+    """Return the Bayesian information criterion of a process and the flares of the events above `PROVISIONAL`.
+
+    A process of minutes that is hardly seen to repeat costs `SEEN_ONCE`: stars and instruments repeat what they do.
+    In independent noise, or if `shapeless`, the light of an event may have any smooth shape, or depart from that of its
+    flares, or of `further` ones, by a process.
+    """
+    start, frame_s, size = survey.stare.start_s, survey.stare.frame_s, float(np.log(survey.stare.n_frames))
+    fits = _light_of_events(survey, taken)
+
+    def cost(epsilon: float, fits: list[_EventLight], kept: Bool) -> float:
         """Return the criterion of some frames, with flares that depart by a share from their shape."""
         light, extra = np.zeros_like(survey.sums), np.zeros(start.size)
-        for one, rows, mine, photons, _ in fits:
-            light[rows] += mine[:, None] * survey.bank.directions[one.direction]
-            extra[rows] += photons + (epsilon * mine) ** 2
-        total = PARAMETERS * size * sum(count for *_, count in fits)
+        for fit in fits:
+            light[fit.rows] += fit.light[:, None] * survey.bank.directions[fit.event.direction]
+            extra[fit.rows] += fit.photon + (epsilon * fit.light) ** 2
+        total = PARAMETERS * size * sum(fit.n_flares for fit in fits)
         for process, column in zip(survey.processes, (survey.sums - light).T, strict=True):
             noise = (survey.variance * process.excess**2 + extra)[kept]
             if fits and not process.terms:
@@ -152,24 +171,56 @@ def criterion(survey: SeriesSurvey, taken: Bool, shapeless: bool = False) -> flo
     total = min(cost(epsilon, fits, every) for epsilon in DEPARTURES)
     shapeless = shapeless or not any(process.terms for process in survey.processes)
     if fits and shapeless and survey.sums.shape[1] == 1:
-        free = cost(0.0, [], ~taken)
-        for one, *_ in fits:
-            rows = slice(one.first, one.last + 1)
-            data = Binned(start[rows], survey.sums[rows, 0], survey.variance[rows], survey.stare.frame_s)
-            process = fit_process(data) if one.last - one.first >= MIN_QUIET else Process((), 1.0)
-            alone = process.covariance(data.time_s, data.variance * process.excess**2)
-            free += (PARAMETERS + process.n_parameters) * size - 2 * level_fit(alone, data.values).log_likelihood
-        total = min(total, free)
+        alone = sum(_criterion_alone(survey, fit.event, size, fits, further) for fit in fits)
+        total = min(total, cost(0.0, [], ~taken) + alone)
     return total + (SEEN_ONCE if _seen_once(survey) else 0.0)
 
 
+def _criterion_alone(
+    survey: SeriesSurvey, event: Detection, size: float, *alternatives: Sequence[_EventLight]
+) -> float:
+    """Return the criterion of the frames of an event, whose light has a process of its own, for light curves.
+
+    Parameters
+    ----------
+    survey, event
+    size : float
+        Cost of half a parameter.
+    *alternatives
+        Flares to which the process is added; the first ones are those of the events. The smallest criterion counts,
+        which may be that without flares.
+    """
+    rows = slice(event.first, event.last + 1)
+    nothing = np.zeros(event.last + 1 - event.first)
+    values = [(0, nothing, nothing)]
+    for fits in alternatives:
+        light, photon = np.zeros((2, survey.stare.n_frames))
+        for fit in fits:
+            light[fit.rows] += fit.light * survey.bank.directions[fit.event.direction, 0]
+            photon[fit.rows] += fit.photon
+        inside = sum(fit.n_flares for fit in fits if event.first <= fit.event.last and fit.event.first <= event.last)
+        if inside:
+            values += [(inside - 1, light[rows], photon[rows] + (epsilon * light[rows]) ** 2) for epsilon in DEPARTURES]
+    costs = []
+    for more, light, extra in values:
+        data = Binned(
+            survey.stare.start_s[rows],
+            survey.sums[rows, 0] - light,
+            survey.variance[rows] + extra,
+            survey.stare.frame_s,
+        )
+        process = fit_process(data) if event.last - event.first >= MIN_QUIET else Process((), 1.0)
+        covariance = process.covariance(data.time_s, data.variance * process.excess**2)
+        n_parameters = PARAMETERS * (1 + more) + process.n_parameters
+        costs.append(n_parameters * size - 2 * level_fit(covariance, data.values).log_likelihood)
+    return min(costs)
+
+
 def _seen_once(survey: SeriesSurvey) -> bool:
-    """Return whether a process is faster than rotation, but shows less than three periods."""
+    """Return whether a process is faster than rotation, but too slow to be seen to repeat."""
     span = survey.stare.duration_s
     return any(
-        term.kind != "correlated" and span / 3 < term.scale_s < FASTEST_ROTATION_S
-        for process in survey.processes
-        for term in process.terms
+        span / REPEATED < term.scale_s < FASTEST_ROTATION_S for process in survey.processes for term in process.terms
     )
 
 
