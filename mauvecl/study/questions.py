@@ -19,6 +19,10 @@ from mauvecl.study.sections import Section
 MAGNITUDES, EXPOSURES_S = (4.0, 6.0, 8.0, 10.0, 12.0), (5.0, 50.0, 600.0)
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from mauvecl.study.stare_section import EventChoice, StareQuestion
+
     QuantityName = str
 else:
     QuantityName = Literal[tuple(QUANTITIES)]
@@ -269,3 +273,23 @@ def formula_grid(*, magnitude: bool = True, exposure_s: float | None = None) -> 
     axes = [Axis(quantity="magnitude", values=MAGNITUDES)] if magnitude else []
     exposures = EXPOSURES_S if exposure_s is None else (exposure_s,)
     return Sweep(axes=(*axes, Axis(quantity="exposure", values=exposures)))
+
+
+def check_sweep(sweep: Sweep, stare: StareQuestion, events: Sequence[EventChoice]) -> None:
+    """Raise InputError if a swept quantity has no effect on the stare."""
+    sizes = ("amplitude", "peak", "equivalent_duration_s", "energy_erg")
+    fixed = {
+        "exposure": True,
+        "amplitude": bool(stare.energies_erg)
+        if not events
+        else all(any(getattr(event, size) is not None for size in sizes) for event in events),
+        "flare_temperature": bool(events) and all(event.temperature_k is not None for event in events),
+    }
+    for axis in sweep.axes:
+        if fixed.get(axis.quantity):
+            raise InputError(
+                f"a sweep over {axis.quantity.replace('_', ' ')} changes no flare of this stare",
+                "a quantity that [stare] and [[events]] do not fix",
+                key="sweep",
+                value=axis.quantity,
+            )

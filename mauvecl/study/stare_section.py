@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Self
 
@@ -22,7 +21,6 @@ from mauvecl.study.sections import Section
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.flares.shapes import Shape
-    from mauvecl.study.questions import Sweep
 
 #: Orbital period rounded down to a multiple of the frame time, s.
 ORBIT_FRAMES_S = 5680.0
@@ -165,23 +163,3 @@ class EventChoice(Section):
             return shape_of(self.shape or default)
         columns = read_columns("flare shape", "values", self.shape_file)
         return TableShape(columns[:, 0], columns[:, 1], self.shape_file.stem, shortened(self.shape_file.name))
-
-
-def check_sweep(sweep: Sweep, stare: StareQuestion, events: Sequence[EventChoice]) -> None:
-    """Raise InputError if a swept quantity has no effect on the stare."""
-    sizes = ("amplitude", "peak", "equivalent_duration_s", "energy_erg")
-    fixed = {
-        "exposure": True,
-        "amplitude": bool(stare.energies_erg)
-        if not events
-        else all(any(getattr(event, size) is not None for size in sizes) for event in events),
-        "flare_temperature": bool(events) and all(event.temperature_k is not None for event in events),
-    }
-    for axis in sweep.axes:
-        if fixed.get(axis.quantity):
-            raise InputError(
-                f"a sweep over {axis.quantity.replace('_', ' ')} changes no flare of this stare",
-                "a quantity that [stare] and [[events]] do not fix",
-                key="sweep",
-                value=axis.quantity,
-            )

@@ -33,7 +33,7 @@ from mauvecl.statistics.nuisances import join_names
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import amplitude_column, place_columns
 from mauvecl.study.messages import collect_messages
-from mauvecl.study.stare_section import check_sweep
+from mauvecl.study.questions import check_sweep
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:

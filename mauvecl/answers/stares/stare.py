@@ -31,8 +31,8 @@ from mauvecl.schema.tables import Column, View, number, percent, records, table_
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import place_columns
 from mauvecl.study.messages import collect_messages
+from mauvecl.study.questions import check_sweep
 from mauvecl.study.stare_expectation import energy_of, orbit_lines, threshold_line, unused_lines
-from mauvecl.study.stare_section import check_sweep
 from mauvecl.study.study import Study
 from mauvecl.study.surveys import survey_star
 
