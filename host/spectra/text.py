@@ -17,8 +17,8 @@ from mauvecl.schema.errors import InputError
 
 from ..tables.medium import medium_of
 from ..tables.table import Values
-from ..tables.text_lines import Header, NumberLines, Split
-from ..tables.text_table import cells_of, keywords_of
+from ..tables.text_lines import NumberLines
+from ..tables.text_table import keywords_of
 from ..tables.units import is_stated
 from .column_choice import AXES, listed
 from .column_roles import Role, divided, is_unit, role_of, words_of
@@ -37,7 +37,9 @@ _PROSE = re.compile(
 _NUMBERED = re.compile(r"(?:col(?:umn)?s?\.?\s*)?[(\[]?(\d{1,3})[)\]]?\s*[:=.)\-]?\s+(.+)", re.IGNORECASE)
 
 
-def text_table(text: str, name: str, origin: str, asked: Sequence[str], wavelength: bool, flux: bool) -> SpectrumTable:
+def table_of_text(
+    text: str, name: str, origin: str, asked: Sequence[str], wavelength: bool, flux: bool
+) -> SpectrumTable:
     """Read the table of a text file.
 
     Parameters
@@ -48,7 +50,7 @@ def text_table(text: str, name: str, origin: str, asked: Sequence[str], waveleng
         Whether to search the header for the units of wavelength and flux.
     """
     lines = NumberLines(text, "wavelength and flux")
-    names, units = names_of(lines.header, lines.n, lines.split)
+    names, units = _names(lines)
     if lines.holds_arrays:
         return _table_of_arrays(lines, names, units, name, origin)
     columns = [
@@ -116,25 +118,23 @@ def _table_of_arrays(
     )  # fmt: skip
 
 
-def names_of(header: Header, n: int, split: Split) -> tuple[list[str], list[str]]:
-    """Return the names of `n` columns and the units below them; empty if there are none."""
-    if numbered := _numbered(header, n):
+def _names(lines: NumberLines) -> tuple[list[str], list[str]]:
+    """Return the names of columns and the units below them; empty if there are none."""
+    if numbered := _numbered(lines):
         return numbered, []
-    rows = [(k, cells) for k, (line, _) in enumerate(header) if (cells := _cells(line, n, split))]
-    scored = [(_recognised(cells), k, cells) for k, cells in rows]
-    naming = [one for one in scored if one[0] > 0]
-    if naming:
-        most = max(score for score, _, _ in naming)
-        _, k, cells = next(one for one in reversed(naming) if one[0] == most)
-        return cells, _units(header, k, n, split)
-    unmarked = [k for k, (line, is_remark) in enumerate(header) if not is_remark and line]
-    if len(unmarked) == 1 and _may_name(header[unmarked[0]][0], cells := dict(rows).get(unmarked[0], [])):
-        return cells, _units(header, unmarked[0], n, split)
-    return _of_another_length(header, n), []
+    rows = {k: cells for k, (line, _) in enumerate(lines.header) if (cells := _cells(line, lines))}
+    # The last of the lines that name most columns.
+    score, k = max(((_recognised(cells), k) for k, cells in rows.items()), default=(0, 0))
+    if score > 0:
+        return rows[k], _units(lines, k)
+    unmarked = [k for k, (line, is_comment) in enumerate(lines.header) if not is_comment and line]
+    if len(unmarked) == 1 and _may_name(lines.header[unmarked[0]][0], cells := rows.get(unmarked[0], [])):
+        return cells, _units(lines, unmarked[0])
+    return _of_another_length(lines), []
 
 
 def _may_name(line: str, cells: Sequence[str]) -> bool:
-    """Return whether the only line that is not a remark names columns, some of them unknown."""
+    """Return whether the only line that is no comment names columns, some of them unknown."""
     is_marked = bool(re.search(r"[,;|\t]", line.strip()))
     kinds = {role_of(cell).kind for cell in cells}
     if len(cells) == 2:
@@ -142,16 +142,16 @@ def _may_name(line: str, cells: Sequence[str]) -> bool:
     return is_marked or (kinds > {"unknown"} and all(re.match(r"[^\W\d]", cell) for cell in cells))
 
 
-def _cells(line: str, n: int, split: Split) -> list[str]:
-    """Divide a line of a header into `n` cells; return an empty list if it has another number."""
-    if n < 2 or _PROSE.search(line):
+def _cells(line: str, lines: NumberLines) -> list[str]:
+    """Divide a line of a header into a cell for each column; return an empty list if it has another number."""
+    if lines.n < 2 or _PROSE.search(line):
         return []
     line = re.sub(r"^\s*(?:units?(?:\s*[:=]|\s)|(?:columns?|names?)\s*[:=])\s*", "", line, flags=re.IGNORECASE)
-    divisions = [cells_of(line.strip("|"), mark) for mark in ",;|\t" if mark in line]
-    divisions += [split(line), _bracketed(line), line.split(), re.split(r"\s{2,}", line.strip())]
+    divisions = [line.strip("|").split(mark) for mark in ",;|\t" if mark in line]
+    divisions += [lines.split(line), _bracketed(line), line.split(), re.split(r"\s{2,}", line.strip())]
     for division in divisions:
         cells = [cell.strip().strip("\"'").strip() for cell in division]
-        if len(cells) == n and any(cells):
+        if len(cells) == lines.n and any(cells):
             # The index of a data frame has no name.
             return [cell or str(k + 1) for k, cell in enumerate(cells)]
     return []
@@ -175,10 +175,10 @@ def _recognised(cells: Sequence[str]) -> int:
     return sum(1 if is_unit(cell) else 2 for cell, kind in zip(cells, kinds, strict=True) if kind != "unknown")
 
 
-def _units(header: Header, names_at: int, n: int, split: Split) -> list[str]:
+def _units(lines: NumberLines, names_at: int) -> list[str]:
     """Return the cells of the line of units below the names, if any; IPAC tables have types in between."""
-    for k, (line, _) in enumerate(header[names_at + 1 : names_at + 3]):
-        cells = _cells(line, n, split)
+    for k, (line, _) in enumerate(lines.header[names_at + 1 : names_at + 3]):
+        cells = _cells(line, lines)
         is_all = any(is_unit(cell) for cell in cells) and all(is_unit(c) or not is_stated(c) for c in cells)
         # "A star" is not a unit, and "nm banana" contains an unknown unit.
         is_some = any(len(cell) > 1 and is_unit(cell) for cell in cells) and not any(c.endswith(":") for c in cells)
@@ -187,34 +187,34 @@ def _units(header: Header, names_at: int, n: int, split: Split) -> list[str]:
     return []
 
 
-def _numbered(header: Header, n: int) -> list[str]:
+def _numbered(lines: NumberLines) -> list[str]:
     """Return names from lines such as "column 2: flux"; columns without such a line are named by number."""
     found: dict[int, str] = {}
-    for line, _ in header:
-        if (match := _NUMBERED.fullmatch(line.strip())) and 1 <= int(match[1]) <= n:
+    for line, _ in lines.header:
+        if (match := _NUMBERED.fullmatch(line.strip())) and 1 <= int(match[1]) <= lines.n:
             found.setdefault(int(match[1]), re.split(r"[,;:]|\s-\s", match[2])[0].strip()[:60])
-    names = [found.get(k + 1, str(k + 1)) for k in range(n)]
+    names = [found.get(k + 1, str(k + 1)) for k in range(lines.n)]
     return names if len(found) > 1 and _recognised(names) else []
 
 
-def _of_another_length(header: Header, n: int) -> list[str]:
+def _of_another_length(lines: NumberLines) -> list[str]:
     """Return the names of a line with fewer cells than the rows, for the columns from the left.
 
-    Raises InputError if a line that is not a remark has another number of names than columns.
+    Raises InputError if a line that is no comment has another number of names than columns.
     """
-    for line, is_remark in reversed(header):
+    for line, is_comment in reversed(lines.header):
         cells = [cell.strip("\"' ") for cell in re.split(r"[,;\t|]", line)]
         cells = cells if len(cells) > 1 else _bracketed(line)
-        if not all(cells) or _PROSE.search(line) or not 1 < len(cells) <= n + 8:
+        if not all(cells) or _PROSE.search(line) or not 1 < len(cells) <= lines.n + 8:
             continue
         kinds = [role_of(cell).kind if words_of(divided(cell)[0]) else "unknown" for cell in cells]
         if "flux" not in kinds or not any(kind in AXES for kind in kinds):
             continue
         is_plain = set(kinds) <= {"wavelength", "flux", "unknown"} and not any(role_of(c).logarithm for c in cells)
         in_order = is_plain and kinds.index("flux") > kinds.index("wavelength")
-        if is_remark and len(cells) < n:
-            return [*cells, *(str(k + 1) for k in range(len(cells), n))]
-        if not is_remark or not in_order:
-            fault = f"its line of names has {len(cells)} ({listed(cells)}) for {n} columns"
+        if is_comment and len(cells) < lines.n:
+            return [*cells, *(str(k + 1) for k in range(len(cells), lines.n))]
+        if not is_comment or not in_order:
+            fault = f"its line of names has {len(cells)} ({listed(cells)}) for {lines.n} columns"
             raise InputError(fault, "one for each", key="columns", value=cells)
     return []

@@ -34,13 +34,9 @@ def text_of(content: bytes) -> str:
     except UnicodeDecodeError as error:
         if b"\0" in content[:4096]:
             raise InputError("is not text (it holds null bytes)", "text", key="file") from error
-        line = content[: error.start].count(b"\n") + 1
-        raise InputError(
-            f"is not text in UTF-8 (byte 0x{content[error.start]:02x} in line {line})",
-            "UTF-8: save it so",
-            key="file",
-            value=content[error.start],
-        ) from error
+        line, odd = content[: error.start].count(b"\n") + 1, content[error.start]
+        fault = f"is not text in UTF-8 (byte 0x{odd:02x} in line {line})"
+        raise InputError(fault, "UTF-8: save it so", key="file", value=odd) from error
     if "\0" in text:
         raise InputError("is not text (it holds null bytes)", "text", key="file")
     return text
@@ -120,7 +116,8 @@ def is_csv(text: str) -> bool:
 def _of_csv(lines: list[str], named: str, first: int) -> tuple[list[str], str]:
     """Return the line of names and the rows of a CSV file, without comments, and the separator of cells.
 
-    Names may be the last comment above the rows; without any, columns are called col1, col2 and so on.
+    Names may be the last comment above the rows; without any, columns are called col1, col2 and so on. Raises
+    InputError for the first row with another number of cells than the first line.
     """
     data = [line for line in lines if line.strip() and not line.startswith("#")]
     separator = max(SEPARATORS, key=lambda one: data[0].count(one) if data else 0)
@@ -136,24 +133,30 @@ def _of_csv(lines: list[str], named: str, first: int) -> tuple[list[str], str]:
         ends = data[0].rstrip(" ").endswith(separator)
         if ends or rows[0].count(separator) > data[0].count(separator):
             data = [data[0].rstrip(" ").removesuffix(separator), *(row.removesuffix(separator) for row in rows)]
-    _check_lengths(data, separator, named, first)
+    for number, line in enumerate(data, first):
+        n, wanted = (one.count(separator) + 1 for one in (line, data[0]))
+        if n != wanted and '"' not in line and '"' not in data[0]:
+            # The file may be cut short.
+            fault = f"{named} has {n} cells in row {number}"
+            raise InputError(fault, f"{wanted} as in the first line", key="file", value=n)
     return data, separator
 
 
 def _are_units(cells: list[str], below: list[str]) -> bool:
     """Return whether the cells below the names of columns are units of the numbers below them."""
+    pairs = zip(cells, below, strict=False)
+    return any(cells) and all(
+        not cell or (is_number(number) and not is_number(cell) and _is_unit(cell)) for cell, number in pairs
+    )
+
+
+def _is_unit(text: str) -> bool:
     import astropy.units as u
 
-    for cell, number in zip(cells, below, strict=False):
-        if cell and (is_number(cell) or not is_number(number)):
-            return False
-        try:
-            known = not cell or time_unit(cell) is not None or u.Unit(cell) is not None
-        except (ValueError, TypeError):
-            known = False
-        if not known:
-            return False
-    return any(cells)
+    try:
+        return time_unit(text) is not None or u.Unit(text) is not None
+    except (ValueError, TypeError):
+        return False
 
 
 def cells_of(line: str, separator: str) -> list[str]:
@@ -169,16 +172,6 @@ def is_number(cell: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _check_lengths(lines: list[str], separator: str, named: str, first: int) -> None:
-    """Raise InputError for the first row with another number of cells than the first line, as if cut short."""
-    for number, line in enumerate(lines, first):
-        n, wanted = (one.count(separator) + 1 for one in (line, lines[0]))
-        if n != wanted and '"' not in line and '"' not in lines[0]:
-            raise InputError(
-                f"{named} has {n} cells in row {number}", f"{wanted} as in the first line", key="file", value=n
-            )
 
 
 def keywords_of(lines: Sequence[str]) -> dict[str, str]:
