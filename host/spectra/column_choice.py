@@ -80,12 +80,8 @@ def _named(name: str, names: Sequence[str]) -> int:
         return place
     indices = indices or [i for i, one in enumerate(names) if plain(one) == plain(name)]
     if len(indices) != 1:
-        raise InputError(
-            f"{'several columns are' if indices else 'no column is'} named {shortened(name)}",
-            f"one of {listed(names)}",
-            key="columns",
-            value=name,
-        )
+        fault = f"{'several columns are' if indices else 'no column is'} named {shortened(name)}"
+        raise InputError(fault, f"one of {listed(names)}", key="columns", value=name)
     return indices[0]
 
 
@@ -95,11 +91,9 @@ def _wavelength(names: Sequence[str], roles: Sequence[Role]) -> tuple[int, ...]:
     low, high = ([i for i, role in enumerate(roles) if role.kind == f"{side} edge"] for side in ("lower", "upper"))
     if low or high:
         return _only("lower edge of the bins", names, low), _only("upper edge of the bins", names, high)
+    fault = f"no column is recognised as the wavelength among {listed(names) or 'none'}"
     raise InputError(
-        f"no column is recognised as the wavelength among {listed(names) or 'none'}",
-        "one named wavelength: name two columns as in FILE[wavelength,flux]",
-        key="columns",
-        value=names,
+        fault, "one named wavelength: name two columns as in FILE[wavelength,flux]", key="columns", value=names
     )
 
 
@@ -113,12 +107,9 @@ def _flux(names: Sequence[str], roles: Sequence[Role], wavelength: tuple[int, ..
         return unknown[0]
     shown = (unknown or rest or [0])[0]
     held = [f"{names[i].strip()[:40]} ({roles[i].kind})" for i in rest]
-    raise InputError(
-        f"no column is recognised as a star's flux, only {listed(held) or 'the wavelength'}",
-        f"one named flux: name the column as in {as_typed(names[shown], 'column', shown, names)}",
-        key="columns",
-        value=held,
-    )
+    fault = f"no column is recognised as a star's flux, only {listed(held) or 'the wavelength'}"
+    expected = f"one named flux: name the column as in {as_typed(names[shown], 'column', shown, names)}"
+    raise InputError(fault, expected, key="columns", value=held)
 
 
 def _best(scored: list[tuple[int, int]]) -> list[int]:
@@ -130,16 +121,10 @@ def _only(what: str, names: Sequence[str], indices: Sequence[int]) -> int:
     if len(indices) == 1:
         return indices[0]
     if not indices:
-        raise InputError(
-            f"no column is the {what} among {listed(names) or 'none'}",
-            "both edges or the wavelength itself",
-            key="columns",
-            value=names,
-        )
+        fault = f"no column is the {what} among {listed(names) or 'none'}"
+        raise InputError(fault, "both edges or the wavelength itself", key="columns", value=names)
     several = [names[i].strip() for i in indices]
+    fault = f"{len(several)} columns may be the {what}: {listed(several)}"
     raise InputError(
-        f"{len(several)} columns may be the {what}: {listed(several)}",
-        f"one: name it as in {as_typed(several[-1], 'column', indices[-1], names)}",
-        key="columns",
-        value=several,
+        fault, f"one: name it as in {as_typed(several[-1], 'column', indices[-1], names)}", key="columns", value=several
     )

@@ -159,45 +159,32 @@ def _is_same(stated: object, unit: Any) -> bool:
 def _power(values: Float, base: str, limits: tuple[float, float], column: str) -> Float:
     logarithms = values * np.log10(np.e) if base == "e" else values
     finite = logarithms[np.isfinite(logarithms)]
-    outside = finite.size and not (limits[0] <= finite.min() and finite.max() <= limits[1])
     # Linear fluxes under a wrong name are all but zero.
-    if outside or (finite.size and np.abs(finite).max() < 1e-3):
-        raise InputError(
-            f"column {column} is named as a logarithm and holds {values[np.isfinite(values)].min():g} to "
-            f"{values[np.isfinite(values)].max():g}",
-            f"logarithms from {limits[0]:g} to {limits[1]:g}",
-            key=column,
-            value=(values[np.isfinite(values)].min(), values[np.isfinite(values)].max()),
-        )
+    if finite.size and (finite.min() < limits[0] or finite.max() > limits[1] or np.abs(finite).max() < 1e-3):
+        low, high = values[np.isfinite(values)].min(), values[np.isfinite(values)].max()
+        fault = f"column {column} is named as a logarithm and holds {low:g} to {high:g}"
+        raise InputError(fault, f"logarithms from {limits[0]:g} to {limits[1]:g}", key=column, value=(low, high))
     with np.errstate(over="ignore"):
         return np.asarray(10.0**logarithms)
 
 
 def _check_flux_unit(unit: Any, role: Role) -> None:
     kind = flux_kind(unit)
-    if kind == "total" and not role.total:
-        raise InputError(
-            f"the unit {unit} is not a flux density (it is not per wavelength or frequency)",
-            "one such as erg / (s cm2 Angstrom), or a column whose name says lambda F_lambda, such as lamFlam",
-            key="flux_unit",
-            value=unit,
-        )
-    if kind == "density" and role.total:
-        raise InputError(
-            f"the column's name says lambda F_lambda and its unit {unit} a flux density",
-            "them to agree",
-            key="flux_unit",
-            value=unit,
-        )
-    if kind == "surface brightness":
-        raise InputError(
-            f"the unit {unit} is per solid angle",
-            "the flux of the whole star, such as erg / (s cm2 Angstrom)",
-            key="flux_unit",
-            value=unit,
-        )
+    usual = "one such as erg / (s cm2 Angstrom)"
     if kind == "other":
-        raise InputError.of("flux_unit", str(unit), "one such as erg / (s cm2 Angstrom)")
+        raise InputError.of("flux_unit", str(unit), usual)
+    if kind == "total" and not role.total:
+        fault = f"the unit {unit} is not a flux density (it is not per wavelength or frequency)"
+        expected = f"{usual}, or a column whose name says lambda F_lambda, such as lamFlam"
+    elif kind == "density" and role.total:
+        fault = f"the column's name says lambda F_lambda and its unit {unit} a flux density"
+        expected = "them to agree"
+    elif kind == "surface brightness":
+        fault = f"the unit {unit} is per solid angle"
+        expected = "the flux of the whole star, such as erg / (s cm2 Angstrom)"
+    else:
+        return
+    raise InputError(fault, expected, key="flux_unit", value=unit)
 
 
 def _in_nm(values: Float, flux: Float, scale: _Scale) -> tuple[Float, Float]:
@@ -230,12 +217,9 @@ def _joined(segments: list[tuple[Float, Float]], messages: list[str]) -> tuple[F
     nm, flux = segments[0]
     for more, added in segments[1:]:
         if more[-1] <= nm[-1]:
-            raise InputError(
-                f"a segment of {more[0]:g}-{more[-1]:g} nm lies within another, which ends at {nm[-1]:g} nm",
-                "segments side by side: choose one by its name, as in FILE[name]",
-                key="table",
-                value=(more[0], more[-1]),
-            )
+            fault = f"a segment of {more[0]:g}-{more[-1]:g} nm lies within another, which ends at {nm[-1]:g} nm"
+            expected = "segments side by side: choose one by its name, as in FILE[name]"
+            raise InputError(fault, expected, key="table", value=(more[0], more[-1]))
         if more[0] <= nm[-1]:
             middle = (more[0] + nm[-1]) / 2
             messages.append(f"two segments overlap at {more[0]:g}-{nm[-1]:g} nm and are cut at {middle:g} nm")
@@ -251,21 +235,15 @@ def _check_assumed_flux(flux: Float, raw: RawSpectrum) -> None:
     if not finite.size:
         return
     low, high = float(finite.min()), float(finite.max())
-    if low >= LIKELY_MAGNITUDES[0] and high <= LIKELY_MAGNITUDES[1]:
-        raise InputError(
-            f"fluxes of {low:g} to {high:g} without a unit look like magnitudes",
-            "a flux density: `flux_unit` names its unit",
-            key="flux_unit",
-            value=(low, high),
-        )
     said = _THROUGHPUT.search(f"{raw.table.remarks}\n{raw.table.origin}".replace("_", " "))
-    if said and low >= 0.0 and 1e-3 <= high <= 1.0:
-        raise InputError(
-            f"values of {low:g} to {high:g} without a unit and the word {said[0]!r} speak of a throughput",
-            "a star's flux: `flux_unit` names its unit",
-            key="flux_unit",
-            value=(low, high),
-        )
+    if low >= LIKELY_MAGNITUDES[0] and high <= LIKELY_MAGNITUDES[1]:
+        fault, expected = f"fluxes of {low:g} to {high:g} without a unit look like magnitudes", "a flux density"
+    elif said and low >= 0.0 and 1e-3 <= high <= 1.0:
+        fault = f"values of {low:g} to {high:g} without a unit and the word {said[0]!r} speak of a throughput"
+        expected = "a star's flux"
+    else:
+        return
+    raise InputError(fault, f"{expected}: `flux_unit` names its unit", key="flux_unit", value=(low, high))
 
 
 def _merged(nm: Float, flux: Float, messages: list[str]) -> tuple[Float, Float]:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
 
-from .number_check import BRIGHTEST, FAINTEST, check_values
 from .point_noise import point_noise
 from .wavelength_range import MIN_MEASURED, NEEDED_NM, SPAN_NM, is_gap, likely_unit, measured_part
 
@@ -19,6 +18,13 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
+#: Range of wavelengths, nm, from gamma rays to metre waves, whose products stay within double precision.
+NEAREST_NM, FARTHEST_NM = 1e-6, 1e9
+#: Smallest relative distance of two wavelengths; each conversion rounds by about 1e-16.
+CLOSEST = 1e-12
+#: Range of a spectrum's largest flux, erg s-1 cm-2 A-1, from 1e-21 for the faintest stars to 1e10 at a white dwarf's
+#: surface, with margins.
+FAINTEST, BRIGHTEST = 1e-40, 1e30
 #: Largest fraction of the brightest pixel's light that a continuation may add to the outermost pixel (a choice).
 MAX_CONTINUED = 0.01
 #: Widths over which a level at an end or join, and the brightest flux (a resolution element), are averaged, nm.
@@ -28,14 +34,14 @@ MIN_JOIN_SNR = 5.0
 
 
 def check_points(name: str, wavelength: Float, flux: Float) -> None:
-    """Raise InputError unless wavelengths and fluxes have equal length, and wavelengths are finite and increasing."""
+    """Raise InputError for points that are no spectrum.
+
+    Wavelengths and fluxes, nm and erg s-1 cm-2 A-1, must have equal length and be in range; wavelengths must be finite,
+    increasing and distinct.
+    """
     if wavelength.ndim != 1 or wavelength.shape != flux.shape or wavelength.size < 2:
-        raise InputError(
-            f"spectrum {name} has {wavelength.shape} wavelengths and {flux.shape} fluxes",
-            "two equal columns",
-            key="flux",
-            value=flux.shape,
-        )
+        fault = f"spectrum {name} has {wavelength.shape} wavelengths and {flux.shape} fluxes"
+        raise InputError(fault, "two equal columns", key="flux", value=flux.shape)
     bad = np.flatnonzero(~(np.isfinite(wavelength) & (wavelength > 0.0)))
     if bad.size:
         raise InputError.of(
@@ -44,13 +50,23 @@ def check_points(name: str, wavelength: Float, flux: Float) -> None:
     back = np.flatnonzero(np.diff(wavelength) <= 0)
     if back.size:
         i = int(back[0])
-        raise InputError(
-            f"spectrum {name}: wavelength {wavelength[i + 1]:g} nm at point {i + 2} follows {wavelength[i]:g} nm",
-            "increasing wavelengths",
-            key="wavelength",
-            value=wavelength[i + 1],
-        )
-    check_values(name, wavelength, flux)
+        fault = f"spectrum {name}: wavelength {wavelength[i + 1]:g} nm at point {i + 2} follows {wavelength[i]:g} nm"
+        raise InputError(fault, "increasing wavelengths", key="wavelength", value=wavelength[i + 1])
+    outside = np.flatnonzero((wavelength < NEAREST_NM) | (wavelength > FARTHEST_NM))
+    if outside.size:
+        where = f"spectrum {name}, point {outside[0] + 1}"
+        raise InputError.of("wavelength", wavelength[outside[0]], f"{NEAREST_NM:g} to {FARTHEST_NM:g} nm", where=where)
+    close = np.flatnonzero(np.diff(wavelength) < CLOSEST * wavelength[1:])
+    if close.size:
+        i = int(close[0])
+        first, second = (float(one) for one in wavelength[i : i + 2])
+        same = f"{first!r} and {second!r} nm at points {i + 1} and {i + 2} are the same to within rounding"
+        expected = f"wavelengths that differ by {CLOSEST:g} of their value"
+        raise InputError(f"spectrum {name}: wavelengths {same}", expected, key="wavelength", value=first)
+    # Undefined ends are cut later.
+    largest = float(np.abs(flux[np.isfinite(flux)]).max(initial=0.0))
+    if largest and not FAINTEST <= largest <= BRIGHTEST:
+        raise InputError.of("flux", largest, f"{FAINTEST:g} to {BRIGHTEST:g}", where=f"spectrum {name}, largest value")
 
 
 def check_measured(name: str, wavelength: Float, unit: str = "nm") -> None:
@@ -61,12 +77,8 @@ def check_measured(name: str, wavelength: Float, unit: str = "nm") -> None:
     low, high = float(wavelength[0]), float(wavelength[-1])
     likely = likely_unit(low, high, "nm") if unit == "nm" else None
     meant = f"; as numbers these look like {likely}: `wavelength_unit={likely!r}`" if likely else ""
-    raise InputError(
-        f"spectrum {name} covers {low:g}-{high:g} nm, {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm",
-        f"at least a third, which `extend` can continue{meant}",
-        key="extend",
-        value=(low, high),
-    )
+    fault = f"spectrum {name} covers {low:g}-{high:g} nm, {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
+    raise InputError(fault, f"at least a third, which `extend` can continue{meant}", key="extend", value=(low, high))
 
 
 def check_covers(
@@ -74,12 +86,9 @@ def check_covers(
 ) -> None:
     """Raise InputError if a spectrum's range does not cover that of the pixels."""
     if span_nm[0] > needed_nm[0] or span_nm[1] < needed_nm[1]:
-        raise InputError(
-            f"spectrum {name} spans {span_nm[0]:g}-{span_nm[1]:g} nm",
-            f"at least {of}{needed_nm[0]:g}-{needed_nm[1]:g} nm: `extend` continues it by a library spectrum",
-            key="extend",
-            value=span_nm,
-        )
+        fault = f"spectrum {name} spans {span_nm[0]:g}-{span_nm[1]:g} nm"
+        expected = f"at least {of}{needed_nm[0]:g}-{needed_nm[1]:g} nm: `extend` continues it by a library spectrum"
+        raise InputError(fault, expected, key="extend", value=span_nm)
 
 
 def coverage(wavelength: Float) -> str:
@@ -99,12 +108,8 @@ def without_undefined_ends(name: str, wavelength: Float, flux: Float) -> tuple[F
     stop = int(high[0]) if high.size else wavelength.size
     kept = wavelength[start:stop]
     if kept.size < 2:
-        raise InputError(
-            f"spectrum {name} has no defined flux in {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm",
-            "some",
-            key="flux",
-            value=name,
-        )
+        fault = f"spectrum {name} has no defined flux in {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
+        raise InputError(fault, "some", key="flux", value=name)
     note = f"cut to {kept[0]:.1f}-{kept[-1]:.1f} nm: undefined flux beyond"
     return kept, flux[start:stop], (note,)
 
@@ -120,23 +125,16 @@ def check_flux(name: str, wavelength: Float, flux: Float) -> None:
     inside = (wavelength >= NEEDED_NM[0]) & (wavelength <= NEEDED_NM[1])
     most, least = (float(f(flux[inside])) if inside.any() else 0.0 for f in (np.max, np.min))
     if max(abs(most), abs(least)) > BRIGHTEST or 0.0 < most < FAINTEST:
-        raise InputError(
-            f"spectrum {name}: the highest flux in 200-700 nm is {most:.3g} and the lowest {least:.3g} erg/s/cm2/A",
-            f"{FAINTEST:g} to {BRIGHTEST:g}",
-            key="flux",
-            value=(least, most),
-        )
+        fault = f"spectrum {name}: the highest flux in 200-700 nm is {most:.3g} and the lowest {least:.3g} erg/s/cm2/A"
+        raise InputError(fault, f"{FAINTEST:g} to {BRIGHTEST:g}", key="flux", value=(least, most))
     if most <= 0.0:
         what = "every flux is zero" if not flux.any() else f"no flux in 200-700 nm is above zero, the highest {most:g}"
         raise InputError(f"spectrum {name}: {what}", "some light", key="flux", value=most)
     if least < -most:
         at = wavelength[inside][int(np.argmin(flux[inside]))]
-        raise InputError(
-            f"spectrum {name}: flux {least:g} at {at:g} nm lies farther below zero than any in 200-700 nm lies above",
-            "at most measured noise: the value may mark a missing measurement",
-            key="flux",
-            value=least,
-        )
+        fault = f"flux {least:g} at {at:g} nm lies farther below zero than any in 200-700 nm lies above"
+        expected = "at most measured noise: the value may mark a missing measurement"
+        raise InputError(f"spectrum {name}: {fault}", expected, key="flux", value=least)
 
 
 def remarks(wavelength: Float, flux: Float) -> tuple[str, ...]:
@@ -224,13 +222,10 @@ def continued(
             continue
         word = "starts" if is_blue else "ends"
         if share > MAX_CONTINUED:
-            raise InputError(
-                f"spectrum {name} {word} at {end:g} nm, where it is bright: {share:.1%} of the brightest "
-                "pixel's light would be invented",
-                f"a spectrum to {goal:g} nm: `extend` continues it by a library spectrum",
-                key="extend",
-                value=end,
-            )
+            invented = f"{share:.1%} of the brightest pixel's light would be invented"
+            fault = f"spectrum {name} {word} at {end:g} nm, where it is bright: {invented}"
+            expected = f"a spectrum to {goal:g} nm: `extend` continues it by a library spectrum"
+            raise InputError(fault, expected, key="extend", value=end)
         messages.append(
             f"it {word} at {end:g} nm and is continued to {goal:g} nm at its end's level, {level:.3g}: at most "
             f"{100 * share:.2g} % of the brightest pixel's light"
@@ -316,13 +311,11 @@ def _join(
     """Return the range in which two spectra are compared, widened by the noise of the first, and their means."""
     low, high = max(wavelength[0], beyond[0]), min(wavelength[-1], beyond[-1])
     if not low < high:
-        raise InputError(
+        fault = (
             f"spectrum {name} spans {wavelength[0]:g}-{wavelength[-1]:g} nm and its extension {extension}"
-            f" {beyond[0]:g}-{beyond[-1]:g} nm",
-            "them to overlap",
-            key="extend",
-            value=extension,
+            f" {beyond[0]:g}-{beyond[-1]:g} nm"
         )
+        raise InputError(fault, "them to overlap", key="extend", value=extension)
     noise = point_noise(flux)
     for width in JOIN_NM * 2.0 ** np.arange(6):
         join = np.clip([low, low + width] if blue else [high - width, high], low, high)
@@ -331,10 +324,8 @@ def _join(
         error = float(np.sqrt(np.sum(noise[near] ** 2))) / max(int(near.sum()), 1)
         if own > MIN_JOIN_SNR * error and other > 0.0 and np.isfinite(own / other):
             return join, own, other
-    raise InputError(
+    fault = (
         f"spectrum {name} and its extension {extension} have mean fluxes of {own:g} and {other:g} "
-        f"at {join[0]:g}-{join[1]:g} nm",
-        "light in both to scale by",
-        key="extend",
-        value=extension,
+        f"at {join[0]:g}-{join[1]:g} nm"
     )
+    raise InputError(fault, "light in both to scale by", key="extend", value=extension)

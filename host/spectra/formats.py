@@ -95,7 +95,7 @@ def _tables(
     from ..tables.table import MemoryTable
     from ..tables.text_table import text_of
     from .fits_files import fits_tables
-    from .text import text_tables
+    from .text import table_of_text
 
     form = form_of(content[:4096])
     if form == "FITS":
@@ -110,7 +110,7 @@ def _tables(
         table = MemoryTable(parse_ecsv(text, "it"), "it")
         own = table.header.get("name")
         return [_in_memory(table, own.strip()[:80] if isinstance(own, str) and own.strip() else name, origin)]
-    return text_tables(text, name, f"text {origin}", asked, *units)
+    return [table_of_text(text, name, f"text {origin}", asked, *units)]
 
 
 def _in_memory(file: MemoryTable, name: str, origin: str, label: str = "") -> SpectrumTable:

@@ -73,11 +73,9 @@ def stated_units(
             raise InputError.of("flux_unit", distinct, "one: `flux_unit` says which", where="its header")
         distinct = [_spelt(next_to[1].strip())]
     if flux and not distinct and not is_named and (match := _NO_FLUX.search(text)):
+        fault = f"its header speaks of {match[1] or match[2]!r}"
         raise InputError(
-            f"its header speaks of {match[1] or match[2]!r}",
-            "a flux density: `flux_unit` names its unit",
-            key="flux_unit",
-            value=match[1] or match[2],
+            fault, "a flux density: `flux_unit` names its unit", key="flux_unit", value=match[1] or match[2]
         )
     rest = re.sub(_FLUX.pattern, " FLUXUNIT ", text)
     lengths = _lengths(rest) if wavelength else []

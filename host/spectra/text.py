@@ -1,42 +1,45 @@
-"""Reader of text files: columns of numbers, with or without a header of names and units."""
+"""Reader of spectra in text: names and units of columns from a header that mixes them with prose.
+
+A line names columns if it has as many cells as the data have columns, and names a wavelength and another known column;
+"vacuum wavelengths" over two columns is prose.
+"""
 
 from __future__ import annotations
 
-import csv
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
 
 from ..tables.medium import medium_of
-from ..tables.missing import is_missing
 from ..tables.table import Values
-from ..tables.text_table import keywords_of, number_in
-from .column_choice import AXES
-from .column_roles import Role, role_of
+from ..tables.text_lines import NumberLines
+from ..tables.text_table import keywords_of
+from ..tables.units import is_stated
+from .column_choice import AXES, listed
+from .column_roles import Role, divided, is_unit, role_of, words_of
 from .header_units import stated_units
 from .spectrum_table import SpectrumTable
-from .text_header import Header, Split, names_of
 
 #: Units of a text file without stated units (the paper's rule).
 IMPLIED_UNITS = ("nm", "erg / (s cm2 Angstrom)")
 #: Gaia DR3's sampled mean spectra: 343 fluxes at 336 + 2 i nm (documentation of gaiadr3.xp_sampled_mean_spectrum).
 GAIA_NM, GAIA_FLUX = 336.0 + 2.0 * np.arange(343), "W m-2 nm-1"
-_REMARK = re.compile(r"^\s*(#|%|!|;|//|\\|\|)")
-_NUMBER = re.compile(r"[+-]?(?:\d[\d_]*[.,]?\d*|[.,]\d+)(?:[eEdD][+-]?\d+)?(?![\w.])")
-_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eEdD][+-]?\d+)?")
-_NOT_FINITE = {"nan", "inf", "-inf"}
+
+#: Words that occur in prose but not in names of columns.
+_PROSE = re.compile(
+    r"\b(?:and|at|is|are|the|for|with|vs|versus|from|by|on|was|were|this|that|has|have)\b", re.IGNORECASE
+)
+_NUMBERED = re.compile(r"(?:col(?:umn)?s?\.?\s*)?[(\[]?(\d{1,3})[)\]]?\s*[:=.)\-]?\s+(.+)", re.IGNORECASE)
 
 
-def text_tables(
+def table_of_text(
     text: str, name: str, origin: str, asked: Sequence[str], wavelength: bool, flux: bool
-) -> list[SpectrumTable]:
+) -> SpectrumTable:
     """Read the table of a text file.
 
     Parameters
@@ -46,38 +49,24 @@ def text_tables(
     wavelength, flux : bool
         Whether to search the header for the units of wavelength and flux.
     """
-    header, lines = _divided(text.splitlines())
-    if not lines:
-        raise InputError("does not contain numbers", "two columns: wavelength and flux", key="columns")
-    split, messages = _splitter([line for _, line in lines])
-    rows = [(number, line, split(line)) for number, line in lines]
-    n = len(rows[0][2])
-    names, units = names_of(header, n, split)
-    remarks = "\n".join(line for line, _ in header)
-    if any(cell.strip()[:1] in ("(", "[") for cell in rows[0][2]):
-        return [_table_of_arrays(names, units, rows, name, origin, header)]
+    lines = NumberLines(text, "wavelength and flux")
+    names, units = _names(lines)
+    if lines.holds_arrays:
+        return _table_of_arrays(lines, names, units, name, origin)
+    columns = [
+        lines.column(k, names[k] if names else str(k + 1), units[k] if units else "")
+        for k in range(lines.n if names else max(lines.n, 2))
+    ]
     if names:
-        columns = [_column(rows, k, names[k], units[k] if units else "") for k in range(n)]
         roles = [role_of(one.name, one.unit) for one in columns]
     else:
-        columns = [_column(rows, k, str(k + 1)) for k in range(max(n, 2))]
-        roles = _roles_by_number(n, asked, messages)
-    roles = _with_units_of(remarks, roles, wavelength, flux, is_named=bool(names))
-    keywords = keywords_of([f"# {line}" for line, _ in header])
-    return [
-        SpectrumTable(columns, name, origin, implied_units=IMPLIED_UNITS, remarks=remarks, messages=tuple(messages),
-                  medium=partial(medium_of, keywords), known_roles=roles)
-    ]  # fmt: skip
-
-
-Row = tuple[int, str, list[str]]
-
-
-def _column(rows: Sequence[Row], place: int, name: str, unit: str = "") -> Values:
-    """Return a column, whose numbers are parsed when they are read."""
-    return Values(
-        name, (len(rows),), lambda start, stop: np.array([_value(row, place) for row in rows[start:stop]]), unit
-    )
+        roles = _roles_by_number(lines.n, asked, lines.messages)
+    roles = _with_units_of(lines.comments, roles, wavelength, flux, is_named=bool(names))
+    keywords = keywords_of([f"# {line}" for line, _ in lines.header])
+    return SpectrumTable(
+        columns, name, origin, implied_units=IMPLIED_UNITS, remarks=lines.comments, messages=tuple(lines.messages),
+        medium=partial(medium_of, keywords), known_roles=roles,
+    )  # fmt: skip
 
 
 def _roles_by_number(n: int, asked: Sequence[str], messages: list[str]) -> list[Role]:
@@ -105,154 +94,127 @@ def _with_units_of(remarks: str, roles: Sequence[Role], wavelength: bool, flux: 
     return [role if role.unit else replace(role, unit=unit) for role, unit in zip(roles, units, strict=True)]
 
 
-def _divided(lines: Sequence[str]) -> tuple[Header, list[tuple[int, str]]]:
-    """Divide a text into its header, including all remarks, and its numbered lines of data."""
-    numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
-    remarks = {number for number, line in numbered if _REMARK.match(line)}
-    start = _first_of_data([(number, line) for number, line in numbered if number not in remarks])
-    header: Header = []
-    data: list[tuple[int, str]] = []
-    for number, line in numbered:
-        if number in remarks and not (line.lstrip()[0] == "|" and data):
-            header.append((line.strip().lstrip("#%!;/\\| "), True))
-            continue
-        kept = line.split("#", 1)[0].rstrip()
-        if number < start:
-            header.append((kept, False))
-        else:
-            data.append((number, kept.strip()))
-    return header, data
-
-
-def _first_of_data(lines: Sequence[tuple[int, str]]) -> float:
-    """Return the number of the first line of data, which starts with two numbers or, if there is none, with one."""
-    starting = [(number, line) for number, line in lines if _starts_with_number(line)]
-    for number, line in starting:
-        cells = re.split(r"[\s;|]+", line.strip())
-        cells = line.split(",") if len(cells) == 1 else cells
-        # A line of a preamble, such as "2 columns" or "912 s", has no second number.
-        if sum(bool(_NUMBER.match(cell)) or is_missing(cell) or cell.lower() in _NOT_FINITE for cell in cells) > 1:
-            return number
-    return starting[0][0] if starting else float("inf")
-
-
-def _starts_with_number(line: str) -> bool:
-    cell = re.split(r"[\s;|]+|,\s|,(?=[^\d])", line.strip().strip("|").strip())[0].strip("\"'(")
-    return bool(_NUMBER.match(cell)) or cell.lower() in _NOT_FINITE
-
-
-def _splitter(lines: list[str]) -> tuple[Split, list[str]]:
-    """Return a function that divides lines into cells, and messages; decimal commas become points."""
-    sample = lines[:50] + lines[-5:]
-    messages: list[str] = []
-    commas = any("," in line for line in sample)
-    points = any("." in line for line in sample)
-    for mark in (";", "\t", "|"):
-        if all(mark in line for line in sample):
-            decimal = commas and not points
-            if decimal:
-                messages.append("its decimal commas are read as points")
-            return partial(_cells, mark=mark, decimal=decimal), messages
-    if any('"' in line for line in sample):
-        return (lambda line: next(csv.reader([line], skipinitialspace=True))), messages
-    if not commas:
-        return str.split, messages
-    blanks = [line.split() for line in sample]
-    if all(len(cells) > 1 for cells in blanks) and not any(c.endswith(",") for cells in blanks for c in cells[:-1]):
-        if points or not all(_DECIMAL_COMMA.fullmatch(c) or "," not in c for cells in blanks for c in cells):
-            raise InputError(
-                f"line {shortened(sample[0], 60)} mixes commas, points and blanks",
-                "decimal points and one kind of mark between columns",
-                key="columns",
-                value=sample[0],
-            )
-        messages.append("its decimal commas are read as points")
-        return partial(_cells, mark=None, decimal=True), messages
-    cells = [line.split(",") for line in sample]
-    if not points and all(len(row) > 1 and re.fullmatch(r"\s*\d+\s*", row[1]) for row in cells) and len(cells) > 1:
-        raise InputError(
-            f"line {shortened(sample[0], 60)} may hold decimal commas or columns",
-            "decimal points",
-            key="columns",
-            value=sample[0],
-        )
-    return (
-        lambda line: line.replace(",", " , ").split(" , ") if ",," in line else re.split(r"\s*,\s*|\s+", line)
-    ), messages
-
-
-def _cells(line: str, mark: str | None, decimal: bool) -> list[str]:
-    cells = (line.strip("|") if mark == "|" else line).split(mark)
-    return [cell.strip().replace(",", ".") if decimal else cell.strip() for cell in cells]
-
-
-def _value(row: Row, place: int) -> float:
-    number, line, cells = row
-    if len(cells) <= place:
-        what = "one column" if len(cells) == 1 else f"{len(cells)} columns"
-        raise InputError(
-            f"line {number}: {shortened(line, 60)} has {what}", "wavelength and flux", key="columns", value=line
-        )
-    try:
-        return number_in(cells[place])
-    except ValueError as error:
-        raise InputError(
-            f"line {number}: {shortened(line, 60)} is not numeric", "wavelength and flux", key="columns", value=line
-        ) from error
-
-
 def _table_of_arrays(
-    names: Sequence[str], units: Sequence[str], rows: Sequence[Row], name: str, origin: str, header: Header
+    lines: NumberLines, names: Sequence[str], units: Sequence[str], name: str, origin: str
 ) -> SpectrumTable:
     """Return a table whose cells contain arrays, with a spectrum per row, as in Gaia's files."""
-    n = len(rows[0][2])
     if not names:
         # Gaia's files have no column of wavelengths.
-        names = next((cells for line, _ in header if len(cells := line.split(",")) == n), [])
+        names = next((cells for line, _ in lines.header if len(cells := line.split(",")) == lines.n), [])
     if not names:
         raise InputError(
             "contains arrays in its cells and no names of columns", "names in its first line", key="columns"
         )
-    columns = [
-        Values(names[k].strip(), (len(rows),), _array_reader(rows, k), units[k] if units else "") for k in range(n)
-    ]
+    columns = [lines.column(k, names[k].strip(), units[k] if units else "") for k in range(lines.n)]
     known = {column.name.lower(): column for column in columns}
-    if "source_id" in known and "wavelength" not in known and "flux" in known:
-        if np.shape(known["flux"].cells)[-1:] == GAIA_NM.shape:
-            columns = [
-                known["source_id"],
-                Values.of("wavelength", GAIA_NM, "nm"),
-                replace(known["flux"], unit=GAIA_FLUX),
-            ]
-        return SpectrumTable(
-            columns,
-            name,
-            f"{origin}, Gaia DR3 sampled XP spectrum",
-            row_title="Gaia DR3 {}",
-            notes=("wavelengths 336 + 2 i nm, W m-2 nm-1: Gaia DR3's documentation",),
-        )
+    if "source_id" not in known or "wavelength" in known or "flux" not in known:
+        return SpectrumTable(columns, name, origin, implied_units=IMPLIED_UNITS, remarks=lines.comments)
+    if np.shape(known["flux"].cells)[-1:] == GAIA_NM.shape:
+        flux = replace(known["flux"], unit=GAIA_FLUX)
+        columns = [known["source_id"], Values.of("wavelength", GAIA_NM, "nm"), flux]
     return SpectrumTable(
-        columns, name, origin, implied_units=IMPLIED_UNITS, remarks="\n".join(line for line, _ in header)
-    )
+        columns, name, f"{origin}, Gaia DR3 sampled XP spectrum", row_title="Gaia DR3 {}",
+        notes=("wavelengths 336 + 2 i nm, W m-2 nm-1: Gaia DR3's documentation",),
+    )  # fmt: skip
 
 
-def _array_reader(rows: Sequence[Row], place: int) -> Callable[[int, int], Any]:
-    def read(start: int, stop: int) -> Any:
-        cells = [cells[place].strip() if place < len(cells) else "" for _, _, cells in rows[start:stop]]
-        if not any(cell[:1] in ("(", "[") for cell in cells):
-            return np.array(cells)
-        arrays = [_array(cell) for cell in cells]
-        if len({array.size for array in arrays}) == 1:
-            return np.array(arrays)
-        values = np.empty(len(arrays), object)
-        values[:] = arrays
-        return values
+def _names(lines: NumberLines) -> tuple[list[str], list[str]]:
+    """Return the names of columns and the units below them; empty if there are none."""
+    if numbered := _numbered(lines):
+        return numbered, []
+    rows = {k: cells for k, (line, _) in enumerate(lines.header) if (cells := _cells(line, lines))}
+    # The last of the lines that name most columns.
+    score, k = max(((_recognised(cells), k) for k, cells in rows.items()), default=(0, 0))
+    if score > 0:
+        return rows[k], _units(lines, k)
+    unmarked = [k for k, (line, is_comment) in enumerate(lines.header) if not is_comment and line]
+    if len(unmarked) == 1 and _may_name(lines.header[unmarked[0]][0], cells := rows.get(unmarked[0], [])):
+        return cells, _units(lines, unmarked[0])
+    return _of_another_length(lines), []
 
-    return read
+
+def _may_name(line: str, cells: Sequence[str]) -> bool:
+    """Return whether the only line that is no comment names columns, some of them unknown."""
+    is_marked = bool(re.search(r"[,;|\t]", line.strip()))
+    kinds = {role_of(cell).kind for cell in cells}
+    if len(cells) == 2:
+        return is_marked and bool(kinds & set(AXES))
+    return is_marked or (kinds > {"unknown"} and all(re.match(r"[^\W\d]", cell) for cell in cells))
 
 
-def _array(cell: str) -> Any:
-    try:
-        return np.array([number_in(one) for one in cell.strip().strip("()[]").split(",")])
-    except ValueError as error:
-        raise InputError.of("cell", cell, "an array of numbers") from error
+def _cells(line: str, lines: NumberLines) -> list[str]:
+    """Divide a line of a header into a cell for each column; return an empty list if it has another number."""
+    if lines.n < 2 or _PROSE.search(line):
+        return []
+    line = re.sub(r"^\s*(?:units?(?:\s*[:=]|\s)|(?:columns?|names?)\s*[:=])\s*", "", line, flags=re.IGNORECASE)
+    divisions = [line.strip("|").split(mark) for mark in ",;|\t" if mark in line]
+    divisions += [lines.split(line), _bracketed(line), line.split(), re.split(r"\s{2,}", line.strip())]
+    for division in divisions:
+        cells = [cell.strip().strip("\"'").strip() for cell in division]
+        if len(cells) == lines.n and any(cells):
+            # The index of a data frame has no name.
+            return [cell or str(k + 1) for k, cell in enumerate(cells)]
+    return []
+
+
+def _bracketed(line: str) -> list[str]:
+    """Divide at blanks and commas, but keep a unit in brackets with the preceding name."""
+    brackets = r"[\[(](?:[^\[\]()]|\([^()]*\))*[\])]"
+    return re.findall(rf"[^\s\[(,]+(?:\s+in\s+[^\s,]+|(?:\s*{brackets})+[^\s,]*)?|{brackets}", line)
+
+
+def _recognised(cells: Sequence[str]) -> int:
+    """Count the cells that name a spectrum's columns; 0 without a wavelength and another column."""
+    kinds = [role_of(cell).kind for cell in cells]
+    is_named = any(kind in AXES and not is_unit(cell) for cell, kind in zip(cells, kinds, strict=True))
+    # "resolution 5 nm" does not name columns; "nm error flux" does.
+    others = {*kinds} - {*AXES, "unknown"} if is_named else {*kinds} & {"flux", "model", "magnitude", "counts"}
+    if not others or not {*kinds} & {*AXES}:
+        return 0
+    # Names have precedence over the units below them.
+    return sum(1 if is_unit(cell) else 2 for cell, kind in zip(cells, kinds, strict=True) if kind != "unknown")
+
+
+def _units(lines: NumberLines, names_at: int) -> list[str]:
+    """Return the cells of the line of units below the names, if any; IPAC tables have types in between."""
+    for k, (line, _) in enumerate(lines.header[names_at + 1 : names_at + 3]):
+        cells = _cells(line, lines)
+        is_all = any(is_unit(cell) for cell in cells) and all(is_unit(c) or not is_stated(c) for c in cells)
+        # "A star" is not a unit, and "nm banana" contains an unknown unit.
+        is_some = any(len(cell) > 1 and is_unit(cell) for cell in cells) and not any(c.endswith(":") for c in cells)
+        if is_all or (k == 0 and is_some):
+            return cells
+    return []
+
+
+def _numbered(lines: NumberLines) -> list[str]:
+    """Return names from lines such as "column 2: flux"; columns without such a line are named by number."""
+    found: dict[int, str] = {}
+    for line, _ in lines.header:
+        if (match := _NUMBERED.fullmatch(line.strip())) and 1 <= int(match[1]) <= lines.n:
+            found.setdefault(int(match[1]), re.split(r"[,;:]|\s-\s", match[2])[0].strip()[:60])
+    names = [found.get(k + 1, str(k + 1)) for k in range(lines.n)]
+    return names if len(found) > 1 and _recognised(names) else []
+
+
+def _of_another_length(lines: NumberLines) -> list[str]:
+    """Return the names of a line with fewer cells than the rows, for the columns from the left.
+
+    Raises InputError if a line that is no comment has another number of names than columns.
+    """
+    for line, is_comment in reversed(lines.header):
+        cells = [cell.strip("\"' ") for cell in re.split(r"[,;\t|]", line)]
+        cells = cells if len(cells) > 1 else _bracketed(line)
+        if not all(cells) or _PROSE.search(line) or not 1 < len(cells) <= lines.n + 8:
+            continue
+        kinds = [role_of(cell).kind if words_of(divided(cell)[0]) else "unknown" for cell in cells]
+        if "flux" not in kinds or not any(kind in AXES for kind in kinds):
+            continue
+        is_plain = set(kinds) <= {"wavelength", "flux", "unknown"} and not any(role_of(c).logarithm for c in cells)
+        in_order = is_plain and kinds.index("flux") > kinds.index("wavelength")
+        if is_comment and len(cells) < lines.n:
+            return [*cells, *(str(k + 1) for k in range(len(cells), lines.n))]
+        if not is_comment or not in_order:
+            fault = f"its line of names has {len(cells)} ({listed(cells)}) for {lines.n} columns"
+            raise InputError(fault, "one for each", key="columns", value=cells)
+    return []

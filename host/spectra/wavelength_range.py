@@ -60,35 +60,21 @@ def check_assumed_unit(values: Float, unit: str) -> None:
     if not finite.size or factor is None:
         return
     low, high = float(finite.min()), float(finite.max())
-    numbers = f"wavelengths from {low:g} to {high:g} without a stated unit"
     own = _part(low * factor, high * factor)
     other = likely_unit(low, high, unit)
-    if own < MIN_MEASURED and other is not None:
-        raise InputError(
-            f"{numbers} look like {other}",
-            f"their unit: `wavelength_unit={other!r}`",
-            key="wavelength_unit",
-            value=unit,
-        )
     elsewhere = 0.0 if other is None else _part(low * _USUAL_UNITS[other], high * _USUAL_UNITS[other])
-    if other is not None and elsewhere >= max(own, 1.0 - 1e-9):
-        raise InputError(
-            f"{numbers} cover {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm in {other} as well as in {unit}",
-            f"their unit: `wavelength_unit={unit!r}` or `wavelength_unit={other!r}`",
-            key="wavelength_unit",
-            value=unit,
-        )
-    if own < MIN_MEASURED:
-        raise InputError(
-            f"{numbers} would hold {own:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm in {unit}",
-            "at least a third, or their unit: `wavelength_unit` names it",
-            key="wavelength_unit",
-            value=unit,
-        )
-    if low * factor < PLAUSIBLE_NM[0] or high * factor > PLAUSIBLE_NM[1]:
-        raise InputError(
-            f"{numbers} would extend beyond {PLAUSIBLE_NM[0]:g}-{PLAUSIBLE_NM[1]:g} nm in {unit}",
-            "their unit: `wavelength_unit` names it",
-            key="wavelength_unit",
-            value=unit,
-        )
+    named = "their unit: `wavelength_unit` names it"
+    if own < MIN_MEASURED and other is not None:
+        fault, expected = f"look like {other}", f"their unit: `wavelength_unit={other!r}`"
+    elif other is not None and elsewhere >= max(own, 1.0 - 1e-9):
+        fault = f"cover {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm in {other} as well as in {unit}"
+        expected = f"their unit: `wavelength_unit={unit!r}` or `wavelength_unit={other!r}`"
+    elif own < MIN_MEASURED:
+        fault = f"would hold {own:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm in {unit}"
+        expected = f"at least a third, or {named}"
+    elif low * factor < PLAUSIBLE_NM[0] or high * factor > PLAUSIBLE_NM[1]:
+        fault, expected = f"would extend beyond {PLAUSIBLE_NM[0]:g}-{PLAUSIBLE_NM[1]:g} nm in {unit}", named
+    else:
+        return
+    numbers = f"wavelengths from {low:g} to {high:g} without a stated unit"
+    raise InputError(f"{numbers} {fault}", expected, key="wavelength_unit", value=unit)

@@ -160,12 +160,10 @@ def check_cells(lines: list[str], what: str) -> None:
     most = limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")
     widest = max(map(len, lines), default=0)
     if widest * len(lines) > most:
-        raise InputError(
-            f"{what} has a line of {widest} characters among {len(lines)}",
-            f"less than {most >> 20} MiB together if each were as long; MAUVECL_LARGEST_CONTENT_MIB sets the limit",
-            key="MAUVECL_LARGEST_CONTENT_MIB",
-            value=widest,
-        )
+        fault = f"{what} has a line of {widest} characters among {len(lines)}"
+        limit = "MAUVECL_LARGEST_CONTENT_MIB"
+        expected = f"less than {most >> 20} MiB together if each were as long; {limit} sets the limit"
+        raise InputError(fault, expected, key=limit, value=widest)
     if widest > LONGEST_LINE:
         fault = f"{what} has a line of {widest} characters"
         raise InputError(fault, f"at most {LONGEST_LINE}", key="file", value=widest)

@@ -80,13 +80,11 @@ def check_sizes(content: Content) -> None:
             raise InputError(f"has a header {number} with impossible sizes", WHOLE, key="file", value=number)
         size = abs(bits) // 8 * groups * (extra + math.prod(axes) if axes else 0)
         if start + size > len(content):
-            raise InputError(
+            fault = (
                 f"is truncated: its extension {number} should have {size} bytes, of which "
-                f"{max(0, len(content) - start)} are present",
-                "a whole file",
-                key="file",
-                value=len(content),
+                f"{max(0, len(content) - start)} are present"
             )
+            raise InputError(fault, "a whole file", key="file", value=len(content))
         place = start + -(-size // BLOCK) * BLOCK
     raise InputError(f"has more than {MAX_EXTENSIONS} extensions", "fewer", key="file", value=MAX_EXTENSIONS)
 
@@ -146,20 +144,12 @@ def check_extensions(hdus: Any) -> None:
             fault = f"has several columns named {odd!r} in extension {number}"
             raise InputError(fault, "another name for each", key="columns", value=odd)
         if None in names:
-            raise InputError(
-                f"has a column whose TTYPE{names.index(None) + 1} is empty in extension {number}",
-                "a name for each column",
-                key="columns",
-                value=number,
-            )
+            fault = f"has a column whose TTYPE{names.index(None) + 1} is empty in extension {number}"
+            raise InputError(fault, "a name for each column", key="columns", value=number)
         size = sum(np.dtype(column.format.recformat).itemsize for column in hdu.columns)
         if size != hdu.header["NAXIS1"]:
-            raise InputError(
-                f"has rows of {hdu.header['NAXIS1']} bytes in extension {number}, whose columns take {size}",
-                WHOLE,
-                key="file",
-                value=number,
-            )
+            fault = f"has rows of {hdu.header['NAXIS1']} bytes in extension {number}, whose columns take {size}"
+            raise InputError(fault, WHOLE, key="file", value=number)
 
 
 class FileContent:

@@ -61,12 +61,8 @@ def rows_of(hdu: Any, telescope: str, asked: bool) -> tuple[Any, tuple[str, ...]
     header = hdu.header
     shape = [int(header.get(f"NAXIS{k + 1}", 0)) for k in range(int(header["NAXIS"]))]
     if sum(n > 1 for n in shape) > 2 or shape[0] < 2:
-        raise InputError(
-            f"holds an image of {' x '.join(map(str, shape))} pixels",
-            "a spectrum of one dimension, rows of spectra, or a table",
-            key="table",
-            value=shape,
-        )
+        fault = f"holds an image of {' x '.join(map(str, shape))} pixels"
+        raise InputError(fault, "a spectrum of one dimension, rows of spectra, or a table", key="table", value=shape)
     flux = np.asanyarray(hdu.data).reshape(-1, shape[0])
     if len(flux) == 1:
         return flux[0], (), ()
@@ -116,23 +112,15 @@ def axis_of(header: Any, primary: Any, n: int) -> tuple[Any, str | None, str, tu
         flag, unit = 1, re.sub(r"^\s*(log|dex)\w*[\s(\[]*|[)\]\s]+$", "", unit, flags=re.IGNORECASE) or None
     if flag != 1 and "LOG" not in kind:
         if unit is None and start < 10.0 and abs(step) < 0.01:
-            raise InputError(
-                f"has an axis from {start:g} in steps of {step:g} without a unit or type",
-                "CTYPE1 and CUNIT1",
-                key="CUNIT1",
-                value=(start, step),
-            )
+            fault = f"has an axis from {start:g} in steps of {step:g} without a unit or type"
+            raise InputError(fault, "CTYPE1 and CUNIT1", key="CUNIT1", value=(start, step))
         return value, unit, name, ()
     if algorithm == "LOG" and name in ("WAVE", "AWAV", "FREQ", "ENER") and flag != 1 and start > 20.0:
         # Greisen et al. 2006 (A&A 446, 747), equation 5: the value at the reference pixel times an exponential.
         with np.errstate(over="ignore"):
             return start * np.exp(step * pixel / start), unit, name, (f"logarithmic axis {kind}",)
     if not 1.0 < start < 6.0:
-        raise InputError(
-            f"has a logarithmic axis from {start:g}",
-            f"logarithms to base ten or the form {name}-LOG",
-            key="CTYPE1",
-            value=start,
-        )
+        fault = f"has a logarithmic axis from {start:g}"
+        raise InputError(fault, f"logarithms to base ten or the form {name}-LOG", key="CTYPE1", value=start)
     with np.errstate(over="ignore"):
         return 10.0**value, unit, name, ("wavelengths from logarithms to base ten",)

@@ -34,13 +34,9 @@ def text_of(content: bytes) -> str:
     except UnicodeDecodeError as error:
         if b"\0" in content[:4096]:
             raise InputError("is not text (it holds null bytes)", "text", key="file") from error
-        line = content[: error.start].count(b"\n") + 1
-        raise InputError(
-            f"is not text in UTF-8 (byte 0x{content[error.start]:02x} in line {line})",
-            "UTF-8: save it so",
-            key="file",
-            value=content[error.start],
-        ) from error
+        line, odd = content[: error.start].count(b"\n") + 1, content[error.start]
+        fault = f"is not text in UTF-8 (byte 0x{odd:02x} in line {line})"
+        raise InputError(fault, "UTF-8: save it so", key="file", value=odd) from error
     if "\0" in text:
         raise InputError("is not text (it holds null bytes)", "text", key="file")
     return text
@@ -86,17 +82,17 @@ def text_table(
     separator, units = "", []
     if commas:
         lines, separator = _of_csv(lines, named, first)
-        if len(lines) > 2 and all(re.fullmatch(r"-+", cell) for cell in _cells(lines[2], separator)):
+        if len(lines) > 2 and all(re.fullmatch(r"-+", cell) for cell in cells_of(lines[2], separator)):
             # VizieR writes units and dashes below the names.
-            units, lines = _cells(lines[1], separator), [lines[0], *lines[3:]]
-        elif len(lines) > 2 and _are_units(_cells(lines[1], separator), _cells(lines[2], separator)):
-            units, lines = _cells(lines[1], separator), [lines[0], *lines[2:]]
+            units, lines = cells_of(lines[1], separator), [lines[0], *lines[3:]]
+        elif len(lines) > 2 and _are_units(cells_of(lines[1], separator), cells_of(lines[2], separator)):
+            units, lines = cells_of(lines[1], separator), [lines[0], *lines[2:]]
     check_cells(lines, named)
     how: dict[str, Any] = {"delimiter": separator, "format": "ascii.csv"} if commas else {"format": "ascii"}
     zeros = _LEADING_ZERO.search(text) is not None
     if texts or zeros:
-        names = [cell.strip().strip("\"'") for cell in (lines[0].split(separator) if separator else lines[0].split())]
-        columns = zip(*(_cells(line, separator) for line in lines[1:]), strict=False) if zeros else ()
+        names = cells_of(lines[0], separator)
+        columns = zip(*(cells_of(line, separator) for line in lines[1:]), strict=False) if zeros else ()
         numbered = {name for name, cells in zip(names, columns, strict=False) if any(map(_ZERO.fullmatch, cells))}
         kept = [name for name in names if name.casefold() in texts or name in numbered]
         how["converters"] = dict.fromkeys(kept, str)
@@ -113,19 +109,20 @@ def is_csv(text: str) -> bool:
     rows = [line for line in text[:20_000].splitlines() if line.strip() and line[0] not in "#%!;"][1:50]
     separator = next((one for one in SEPARATORS[:2] if rows and all(one in row for row in rows)), "")
     # Decimal commas stand between columns that blanks divide.
-    return bool(separator) and not any(re.search(r"\d\s+[-+.\d]", cell) for cell in _cells(rows[0], separator)
+    return bool(separator) and not any(re.search(r"\d\s+[-+.\d]", cell) for cell in cells_of(rows[0], separator)
                                        if not is_dated(cell))  # fmt: skip
 
 
 def _of_csv(lines: list[str], named: str, first: int) -> tuple[list[str], str]:
     """Return the line of names and the rows of a CSV file, without comments, and the separator of cells.
 
-    Names may be the last comment above the rows; without any, columns are called col1, col2 and so on.
+    Names may be the last comment above the rows; without any, columns are called col1, col2 and so on. Raises
+    InputError for the first row with another number of cells than the first line.
     """
     data = [line for line in lines if line.strip() and not line.startswith("#")]
     separator = max(SEPARATORS, key=lambda one: data[0].count(one) if data else 0)
     above = [line for line in lines[: lines.index(data[0])] if line.startswith("#")] if data else []
-    if data and all(is_number(cell) for cell in _cells(data[0], separator)):
+    if data and all(is_number(cell) for cell in cells_of(data[0], separator)):
         n = data[0].count(separator)
         alike = above and above[-1].count(separator) == n > 0
         names = above[-1].lstrip("# ") if alike else separator.join(f"col{k + 1}" for k in range(n + 1))
@@ -136,50 +133,45 @@ def _of_csv(lines: list[str], named: str, first: int) -> tuple[list[str], str]:
         ends = data[0].rstrip(" ").endswith(separator)
         if ends or rows[0].count(separator) > data[0].count(separator):
             data = [data[0].rstrip(" ").removesuffix(separator), *(row.removesuffix(separator) for row in rows)]
-    _check_lengths(data, separator, named, first)
+    for number, line in enumerate(data, first):
+        n, wanted = (one.count(separator) + 1 for one in (line, data[0]))
+        if n != wanted and '"' not in line and '"' not in data[0]:
+            # The file may be cut short.
+            fault = f"{named} has {n} cells in row {number}"
+            raise InputError(fault, f"{wanted} as in the first line", key="file", value=n)
     return data, separator
 
 
 def _are_units(cells: list[str], below: list[str]) -> bool:
     """Return whether the cells below the names of columns are units of the numbers below them."""
+    pairs = zip(cells, below, strict=False)
+    return any(cells) and all(
+        not cell or (is_number(number) and not is_number(cell) and _is_unit(cell)) for cell, number in pairs
+    )
+
+
+def _is_unit(text: str) -> bool:
     import astropy.units as u
 
-    for cell, number in zip(cells, below, strict=False):
-        if cell and (is_number(cell) or not is_number(number)):
-            return False
-        try:
-            known = not cell or time_unit(cell) is not None or u.Unit(cell) is not None
-        except (ValueError, TypeError):
-            known = False
-        if not known:
-            return False
-    return any(cells)
+    try:
+        return time_unit(text) is not None or u.Unit(text) is not None
+    except (ValueError, TypeError):
+        return False
 
 
-def _cells(line: str, separator: str) -> list[str]:
-    cells = line.split(separator) if separator else line.split()
-    return [cell.strip().strip("\"'") for cell in cells]
+def cells_of(line: str, separator: str) -> list[str]:
+    """Divide a line at a separator, by default at blanks, and remove the quotes of cells."""
+    cells = (line.strip("|") if separator == "|" else line).split(separator or None)
+    return [cell.strip().strip("\"'").strip() for cell in cells]
 
 
 def is_number(cell: str) -> bool:
     """Return whether a cell is a number or a missing one."""
-    if is_missing(cell) or cell.lower() in ("inf", "-inf"):
-        return True
     try:
-        float(cell)
+        number_in(cell)
     except ValueError:
         return False
-    return "_" not in cell
-
-
-def _check_lengths(lines: list[str], separator: str, named: str, first: int) -> None:
-    """Raise InputError for the first row with another number of cells than the first line, as if cut short."""
-    for number, line in enumerate(lines, first):
-        n, wanted = (one.count(separator) + 1 for one in (line, lines[0]))
-        if n != wanted and '"' not in line and '"' not in lines[0]:
-            raise InputError(
-                f"{named} has {n} cells in row {number}", f"{wanted} as in the first line", key="file", value=n
-            )
+    return True
 
 
 def keywords_of(lines: Sequence[str]) -> dict[str, str]:

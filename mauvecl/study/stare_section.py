@@ -155,7 +155,7 @@ class EventChoice(Section):
 
     def load_shape(self, default: str) -> Shape:
         """Return the shape, or the published shape named `default` if none is given."""
-        from mauvecl.host.tables.columns import read_columns
+        from mauvecl.host.tables.text_lines import read_columns
         from mauvecl.lightcurve.flares.shapes import TableShape, shape_of
         from mauvecl.schema.text import shortened
 

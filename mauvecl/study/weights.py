@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.files.parsing import LARGEST, SMALLEST, read_text
-from mauvecl.host.tables.columns import columns
+from mauvecl.host.tables.text_lines import columns
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 

@@ -16,7 +16,7 @@ import numpy as np
 from mauvecl.host.spectra.conversion import ReadSpectrum
 from mauvecl.host.stars.flare_spectra import ObservedFlare
 from mauvecl.host.stars.source import Source
-from mauvecl.host.tables.columns import columns
+from mauvecl.host.tables.text_lines import columns
 from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened

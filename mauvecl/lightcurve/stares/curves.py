@@ -59,7 +59,7 @@ class Curve(Section):
     def _time_and_value(self) -> tuple[Float, Float]:
         import numpy as np
 
-        from mauvecl.host.tables.columns import read_columns
+        from mauvecl.host.tables.text_lines import read_columns
 
         rows = np.array(self.points) if self.file is None else read_columns("curve", "values", self.file)
         if self.file is not None:
