@@ -104,13 +104,13 @@ def spotted_binary(rng: np.random.Generator, days: float, frame_s: float) -> tup
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_eclipses_of_a_spotted_binary_are_no_flares(seed: int) -> None:
-    """Observe eight days of eclipses of 12 and 5 % in frames of 2 minutes.
+    """Observe five days of eclipses of 12 and 5 % in frames of 2 minutes.
 
     Either the eclipses are left out, or a message says that there are no verdicts.
     """
-    time, flux, depth, peaks = spotted_binary(np.random.default_rng([502, seed]), 8.0, 120.0)
+    time, flux, depth, peaks = spotted_binary(np.random.default_rng([502, seed]), 5.0, 120.0)
     frames = Frames.of(time, flux, np.full(time.size, 5e-4), exposure_s=120.0)
     answer = analyse(Study(), frames=frames)
     searched = np.array(answer.frames["reason"]) == ""
