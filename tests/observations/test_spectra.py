@@ -327,7 +327,7 @@ def test_intervals_of_temperature_and_energy_cover(threshold: float) -> None:
 
     They allow for drifts as large as the noise of the surroundings may hide; here nothing drifts: they are wide, and
     those of 68 % may cover 90 %. Without that allowance, 73 and 68 % of 150 held the truth, but with drifts of 5 % an
-    hour 53 and 52 % of 100. Intervals of half the width fail, by their pulls, for nine seeds in ten.
+    hour 53 and 52 % of 100. Intervals of half the width fail for some nine seeds in ten.
     """
     rng = np.random.default_rng(310)
     number, pulls = 48, {"temperature": list[float](), "energy bolometric": list[float]()}
