@@ -149,10 +149,11 @@ def test_losses_of_light_are_not_searched_and_flares_between_them_are_found() ->
     """Light curves of 5 h with twelve losses of 0.5 to 5 %, with and without flares of S/N 30 between them.
 
     Losses raise the light when they end, so that the light between them resembles flares. At one false alarm a month
-    0.04 are expected in all six, and none may be found: that fails by chance for 4 % of seeds.
+    0.03 are expected in all four, and none may be found: that fails by chance for 3 % of seeds. The threshold of a
+    month is extrapolated from the rates of a day, which take few simulations.
     """
     noise, found, false = 1e-3, 0, 0
-    for seed in range(420, 426):
+    for seed in range(420, 424):
         rng = np.random.default_rng(seed)
         time = np.arange(3600) * 5.0
         loss = np.zeros(time.size)
@@ -167,10 +168,12 @@ def test_losses_of_light_are_not_searched_and_flares_between_them_are_found() ->
             peaks = [float(whole[whole.size // 3]), float(whole[2 * whole.size // 3])]
             light += sum(0.02 * flare(time, 5.0, peak, 40.0) for peak in peaks)
         flux = light + noise * rng.standard_normal(time.size)
-        answer = analysed(Frames.of(time, flux, np.full(time.size, noise)), per="month")
+        answer = analysed(Frames.of(time, flux, np.full(time.size, noise)))
         analysis = answer.analysis
         observed = analysis.survey.time_s
-        spans = [(observed[one.first] - 60, observed[one.last] + 60) for one in detected(analysis)]
+        rare = max(rate.threshold(12 / 365.25) for rate in (analysis.modelled, analysis.measured))
+        sure = [one for one in detected(analysis) if one.value >= rare]
+        spans = [(observed[one.first] - 60, observed[one.last] + 60) for one in sure]
         found += sum(any(low < peak < high for low, high in spans) for peak in peaks)
         false += sum(not any(low < peak < high for peak in peaks) for low, high in spans)
         assert analysis.likeness.alike
@@ -178,7 +181,7 @@ def test_losses_of_light_are_not_searched_and_flares_between_them_are_found() ->
         assert lost[loss > 5 * noise].mean() > 0.9
         assert lost[loss < 0.1 * noise].mean() < 0.05
     assert false == 0
-    assert found == 6
+    assert found == 4
 
 
 @cache
@@ -242,7 +245,8 @@ def test_window_that_begins_in_a_tail_has_the_energy_relative_to_the_star(
     rng, frame_s, noise = np.random.default_rng([402, seed]), 5.0, 0.007
     time = (np.arange(140) + 0.5) * frame_s
     flux = 1 + 60 * flare(time, frame_s, -after_s, half_width_s) + noise * rng.standard_normal(time.size)
-    (event,) = detected(analysed(Frames.of(time, flux, np.full(140, noise))).analysis)
+    analysis = analysed(Frames.of(time, flux, np.full(140, noise)), false_alarms=5.0).analysis
+    event = max(detected(analysis), key=lambda one: one.value)
     right = 60 * half_width_s * DAVENPORT.equivalent_duration
     low, high = event.energy.low_s[0], event.energy.high_s[0]
     assert abs(event.energy.fitted_s - right) < 2.5 * (high - low)
@@ -362,19 +366,21 @@ def test_red_noise_has_as_many_false_alarms_as_promised() -> None:
 
 @pytest.mark.long
 def test_few_counts_have_their_mean_and_pulls() -> None:
-    """Counts of mean 3.64 with a flare: level within 1 %, pulls of unit deviation; fails once in a thousand times."""
+    """Counts of mean 3.64 with flares: level within 1 %, pulls of unit deviation; fails once in a thousand times."""
     rng = np.random.default_rng(406)
-    pulls, levels, number = [], [], 30
-    for _ in range(number):
-        time = (np.arange(1500) + 0.5) * 5.0
-        peak = rng.uniform(2500, 5000)
-        light = 3.64 * (1 + 6 * flare(time, 5.0, peak, 40.0))
-        analysis = analysed(Frames.of(time, rng.poisson(light).astype(np.float64)), per="day").analysis
-        best = max(analysis.events, key=lambda one: one.value)
-        first, last = best.first, best.last
-        truth = 6 * float(flare(time, 5.0, peak, 40.0)[first : last + 1].sum()) * 5.0
-        pulls.append((best.energy.summed_s - truth) / best.energy.summed_error_s)
+    pulls, levels = [], []
+    for _ in range(8):
+        time = (np.arange(4500) + 0.5) * 5.0
+        peaks = 7500 * np.arange(3) + rng.uniform(2500, 5000, 3)
+        added = np.array([3.64 * 6 * flare(time, 5.0, peak, 40.0) for peak in peaks])
+        frames = Frames.of(time, rng.poisson(3.64 + added.sum(axis=0)).astype(np.float64))
+        analysis = analysed(frames, false_alarms=5.0).analysis
         levels.append(float(np.median(analysis.level.level)))
+        for peak, light in zip(peaks, added, strict=True):
+            near = (one for one in detected(analysis) if abs(time[one.brightest] - peak) < 300)
+            one = max(near, key=lambda one: one.value)
+            truth = float(light[one.first : one.last + 1].sum()) / 3.64 * 5.0
+            pulls.append((one.energy.summed_s - truth) / one.energy.summed_error_s)
     assert np.mean(levels) == pytest.approx(3.64, rel=0.01)
-    low, high = np.sqrt(stats.chi2.ppf([0.0005, 0.9995], number - 1) / (number - 1))
+    low, high = np.sqrt(stats.chi2.ppf([0.0005, 0.9995], len(pulls) - 1) / (len(pulls) - 1))
     assert low < np.std(pulls, ddof=1) < high

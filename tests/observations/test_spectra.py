@@ -23,10 +23,10 @@ Float = NDArray[np.float64]
 SHAPE = SHAPES["davenport2014"]
 N, FRAME_S = 720, 5.0
 TIME = (np.arange(N) + 0.5) * FRAME_S
-# One false alarm per star-day needs few resampled frames.
-DAY: Any = {"per": "day"}
+# Ten false alarms per star-day need few simulated frames.
+OFTEN: Any = {"false_alarms": 10.0, "per": "day"}
 STAR: Any = [{"library": "M3V", "magnitude": 9.0, "distance_pc": 5.0}]
-STUDY = Study(star=STAR, search=DAY)
+STUDY = Study(star=STAR, search=OFTEN)
 Prepared = tuple[Any, Any, Any]
 
 
@@ -94,6 +94,13 @@ def test_frames_of_other_wavelengths_or_units_are_searched_in_white_light() -> N
         assert key in line
 
 
+@cache
+def analysed_counts() -> tuple[Frames, Any]:
+    """Return frames with a flare, and their answer."""
+    frames = drawn(np.random.default_rng(4), flare(1800.0, 60.0, 0.5))
+    return frames, analyse(STUDY, frames=frames)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("unit", ["erg / (s cm2 Angstrom)", "W / (m2 um)", "Jy"])
 def test_flux_densities_are_searched_by_their_spectrum_as_counts_are(unit: str) -> None:
@@ -101,7 +108,7 @@ def test_flux_densities_are_searched_by_their_spectrum_as_counts_are(unit: str) 
 
     The same draws have the same S/N to 2 %, since only the templates differ; temperatures agree to their errors.
     """
-    counts = drawn(np.random.default_rng(4), flare(1800.0, 60.0, 0.5))
+    counts, one = analysed_counts()
     nm = counts.wavelength_nm
     assert nm is not None
     standard = Study(star=[{"library": "B2IV", "magnitude": 9.0}])
@@ -116,7 +123,7 @@ def test_flux_densities_are_searched_by_their_spectrum_as_counts_are(unit: str) 
     assert counts.error is not None
     how: Any = {"exposure_s": FRAME_S, "wavelength_nm": nm, "name": "M3V"}
     fluxes = Frames.of(TIME, counts.flux * factor, counts.error * factor, unit=unit, **how)
-    one, other = (analyse(STUDY, frames=frames) for frames in (counts, fluxes))
+    other = analyse(STUDY, frames=fluxes)
     assert other.analysis.spectra is not None, other.messages
     row, same = (max(answer.rows, key=lambda each: each.event.value) for answer in (one, other))
     assert row.verdict == same.verdict == "detected"
@@ -250,7 +257,7 @@ def test_look_alikes_are_rejected_by_their_spectrum(kind: str, spectrum: str, si
     shape = flare(1800.0, 90.0, 1.0).sum(axis=1) / light().sum()
     added = flare(1800.0, 90.0, size) if not spectrum else size * np.outer(shape, model().unknowns(light())[spectrum])
     frames = drawn(np.random.default_rng(305), added)
-    analysis = analyse(Study(star=STAR, search=DAY | {"frame": {"light": 1e-6}}), frames=frames).analysis
+    analysis = analyse(Study(star=STAR, search=OFTEN | {"frame": {"light": 1e-6}}), frames=frames).analysis
     assert analysis.spectra is not None
     event, found = max(zip(analysis.events, analysis.spectra.found, strict=True), key=lambda pair: pair[0].value)
     assert abs(analysis.survey.time_s[event.brightest] - 1800.0) < 60
@@ -316,13 +323,15 @@ def test_detection_rate_follows_the_signal_to_noise(rare: float) -> None:
 
 @pytest.mark.long
 def test_intervals_of_temperature_and_energy_cover(threshold: float) -> None:
-    """68 % intervals of flares of S/N 20-100 cover 68 to 90 %; each binomial bound fails once in a thousand times.
+    """Intervals of 68 and 95 % of flares of S/N 20-100, and pulls; each bound fails once in a thousand times.
 
-    They allow for drifts as large as the noise of the surroundings may hide; here nothing drifts: they are wide.
-    Without that allowance, 73 and 68 % of 150 hold the truth, but with drifts of 5 % an hour 53 and 52 % of 100.
+    They allow for drifts as large as the noise of the surroundings may hide; here nothing drifts: they are wide, and
+    those of 68 % may cover 90 %. Without that allowance, 73 and 68 % of 150 held the truth, but with drifts of 5 % an
+    hour 53 and 52 % of 100. Intervals of half the width fail for some nine seeds in ten.
     """
     rng = np.random.default_rng(310)
-    number, inside = 100, {"temperature": 0, "energy bolometric": 0}
+    number, pulls = 48, {"temperature": list[float](), "energy bolometric": list[float]()}
+    inside = {name: np.zeros(2) for name in pulls}
     for _ in range(number):
         kelvin, size = rng.uniform(7000, 15_000), rng.uniform(0.5, 2.0)
         added = flare(rng.uniform(900, 2700), rng.uniform(30, 90), size, kelvin)
@@ -340,9 +349,14 @@ def test_intervals_of_temperature_and_energy_cover(threshold: float) -> None:
                  "energy bolometric": flares["energy bolometric"] * added[kept].sum() / frame}  # fmt: skip
         for name, value in truth.items():
             k = measured.column(name)
-            inside[name] += measured.low[0, 0, k] <= value <= measured.high[0, 0, k]
-    low, high = stats.binom.ppf([0.0005, 0.9995], number, [0.6827, 0.9])
-    assert all(low <= count <= high for count in inside.values()), inside
+            lows, highs, estimate = measured.low[:2, 0, k], measured.high[:2, 0, k], measured.estimates[0, k]
+            inside[name] += (lows <= value) & (value <= highs)
+            pulls[name].append((value - estimate) / abs((highs if value > estimate else lows)[0] - estimate))
+    low = stats.binom.ppf(0.0005, number, [0.6827, 0.95])
+    high = stats.binom.ppf(0.9995, number, [0.9, 1.0])
+    assert all(((low <= count) & (count <= high)).all() for count in inside.values()), inside
+    most = stats.chi2.ppf(0.999, number)
+    assert all(np.sum(np.square(values)) < most for values in pulls.values()), pulls
 
 
 def test_drifts_are_measured_next_to_a_short_event() -> None:
@@ -360,14 +374,15 @@ def test_drifts_are_measured_next_to_a_short_event() -> None:
 def test_answer_states_measurements_or_why_there_are_none() -> None:
     frames = drawn(np.random.default_rng(311), flare(1800.0, 60.0, 1.0))
     answer = analyse(STUDY, frames=frames)
-    (k,) = np.flatnonzero(np.asarray(answer.events["significant"]))
+    k = int(np.argmax([row.event.value for row in answer.rows]))
+    assert answer.events["significant"][k]
     event = answer.events[k]
     assert event["temperature_low"] < event["temperature"] < event["temperature_high"]
     assert event["energy_low"] < event["energy"] < event["energy_high"]
     assert event["unmeasured"] == ""
     assert {"area", "energy bolometric"} <= {str(name) for name in answer.measured["quantity"]}
     assert set(answer.tables) >= {"measured", "noise-per-pixel"}
-    unnamed = analyse(Study(search=DAY), frames=frames)
+    unnamed = analyse(Study(search=OFTEN), frames=frames)
     event = unnamed.events[k]
     assert np.isnan(event["energy"])
     assert "distance" in event["unmeasured"]
@@ -379,7 +394,7 @@ def verdicts(rise: float, **search: Any) -> tuple[dict[float, str], list[str]]:
     """Return the verdicts on a rise of the throughput, a cool flare that resembles it and a hot flare, and messages."""
     added = flare(1800.0, 60.0, 0.3, 5000.0) + flare(2900.0, 60.0, 1.0)
     added += rise * flare(900.0, 60.0, 1.0).sum(axis=1, keepdims=True) * light() / light().sum()
-    answer = analyse(Study(star=STAR, search=DAY | search), frames=drawn(np.random.default_rng(312), added))
+    answer = analyse(Study(star=STAR, search=OFTEN | search), frames=drawn(np.random.default_rng(312), added))
     # Noise has candidates of a smaller S/N.
     rows = [row for row in answer.rows if row.event.value > 5.0]
     found = {round(float(row.analysis.survey.time_s[row.event.brightest]), -2): row.verdict for row in rows}
@@ -387,9 +402,8 @@ def verdicts(rise: float, **search: Any) -> tuple[dict[float, str], list[str]]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("rise", [0.0, 0.3])
-def test_the_light_of_each_frame_is_free_by_default(rise: float) -> None:
-    found, messages = verdicts(rise)
+def test_the_light_of_each_frame_is_free_by_default() -> None:
+    found, messages = verdicts(0.3)
     assert found[2900.0] == "detected"
     assert 900.0 not in found
     (line,) = (line for line in messages if "level of each frame is free" in line)

@@ -45,7 +45,8 @@ def test_tail_of_a_bright_flare_without_its_peak_is_an_event(
     time = (np.arange(round(window * half_width_s / frame_s)) + 0.5) * frame_s
     flux = 1 + amplitude * flare(time, frame_s, -after * half_width_s, half_width_s)
     flux += noise * rng.standard_normal(time.size)
-    analysis = analysed(Frames.of(time, flux, np.full(time.size, noise)), per="month").analysis
+    # Rarer false alarms take long to simulate for windows this short.
+    analysis = analysed(Frames.of(time, flux, np.full(time.size, noise)), false_alarms=3.0).analysis
     event = max(analysis.events, key=lambda one: one.value)
     assert event.first == 0
     assert event.cut
@@ -132,13 +133,13 @@ def spotted_binary(rng: np.random.Generator, days: float, frame_s: float) -> tup
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_eclipses_of_a_spotted_binary_are_no_flares(seed: int) -> None:
-    """Observe eight days of eclipses of 12 and 5 % in frames of 2 minutes.
+    """Observe five days of eclipses of 12 and 5 % in frames of 2 minutes.
 
     Either the eclipses are left out, or a message says that there are no verdicts.
     """
-    time, flux, depth, peaks = spotted_binary(np.random.default_rng([502, seed]), 8.0, 120.0)
+    time, flux, depth, peaks = spotted_binary(np.random.default_rng([502, seed]), 5.0, 120.0)
     frames = Frames.of(time, flux, np.full(time.size, 5e-4), exposure_s=120.0)
     answer = analyse(Study(), frames=frames)
     searched = np.array(answer.frames["reason"]) == ""
