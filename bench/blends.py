@@ -15,9 +15,9 @@ from functools import cached_property
 import numpy as np
 
 from mauvecl.answers.stares.stare import _log_energy
-from mauvecl.lightcurve.flares.events import Event, coefficients
-from mauvecl.lightcurve.search.alarms import Alarm, alarms
-from mauvecl.lightcurve.search.blends import Factor
+from mauvecl.flares.events import Event, coefficients
+from mauvecl.search.alarms import Alarm, alarms
+from mauvecl.search.flare_fits import Factor
 from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 from mauvecl.study.surveys import StarSurvey, survey_star

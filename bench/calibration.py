@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from tables import processor, versions, write
 
 from mauvecl import Study, calibrate
-from mauvecl.host.instrument.curve import Curve
+from mauvecl.host.instrument.curves import Curve
 from mauvecl.host.stars.source import Source
 from mauvecl.observations.calibration.throughput import ERROR_KNOTS, ONE_STAR_ERROR
 from tests.observations.test_calibrated_coverage import deviations, relative

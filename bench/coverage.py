@@ -17,9 +17,8 @@ from astropy.table import Table
 from tables import processor, versions, write
 
 from mauvecl import BalmerFlare, Engine, FlareModel, Instrument, Nuisances, Source, expect, fit, forecast
-from mauvecl.results.measurements.flare_model import derived_values
-from mauvecl.results.measurements.reduction import Reduction
-from mauvecl.statistics.intervals import clopper_pearson
+from mauvecl.detection.distributions import clopper_pearson
+from mauvecl.fits.flare_model import Reduction, derived_values
 
 SNRS, TEMPERATURES_K = (3.0, 5.0, 10.0, 30.0, 100.0, 300.0), (6_000.0, 10_000.0, 20_000.0, 30_000.0)
 QUANTITIES = ("temperature", "amplitude", "flux 200-320 nm", "flux bolometric", "jump")

@@ -19,7 +19,7 @@ from astropy.table import Table
 from tables import processor, versions, write
 
 from mauvecl import Cooling, Engine, Event, FlareModel, Instrument, Nuisances, Source, Stare, expect, fit_cooling
-from mauvecl.statistics.intervals import clopper_pearson
+from mauvecl.detection.distributions import clopper_pearson
 
 COOLING = Cooling(14_000.0, 7000.0, 80.0)
 #: Amplitude and share of the fits, by what is unknown.

@@ -40,8 +40,8 @@ from mauvecl import (
     fit,
     fit_two_temperatures,
 )
-from mauvecl.results.measurements.fit import fit_sums
-from mauvecl.results.measurements.reduction import Reduction, drawn_sums
+from mauvecl.fits.flare_model import Reduction, drawn_sums
+from mauvecl.fits.spectrum import fit_sums
 
 #: Fits of the slower ways, and rounds.
 FRAMES, SLOW, ROUNDS = 10_000, 100, 5

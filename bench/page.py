@@ -15,7 +15,7 @@ from astropy.table import Table
 from page_server import page_server
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from mauvecl.statistics.registry import STATISTICS
+from mauvecl.detection.requests import STATISTICS
 
 CHANGES = 7
 #: What is changed, and what from and to; each change is another value between.

@@ -15,7 +15,7 @@ from tables import write
 
 from mauvecl import Study, limit
 from mauvecl.answers.limits.assumptions import what_matters
-from mauvecl.statistics.registry import STATISTICS
+from mauvecl.detection.requests import STATISTICS
 
 KEPT = ("amplitude", "exposure", "statistic", "magnitude", "low", "high", "closed_form", "check")
 

@@ -23,9 +23,9 @@ import numpy as np
 from astropy.table import Table
 from tables import write
 
+from mauvecl.detection.requests import DetectRequest, Shard
+from mauvecl.detection.snr import DetectionSums
 from mauvecl.device.engine import Engine
-from mauvecl.results.requests.requests import DetectRequest, Shard
-from mauvecl.results.shard_sums import DetectionSums
 from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.runs.cluster import DaskWorkers
 from mauvecl.runs.pool import LocalWorkers, Pool

@@ -26,9 +26,9 @@ from tables import processor, versions, write
 
 from mauvecl import Instrument, Sky, Source, __version__, expect
 from mauvecl.device.stare_engine import Stares
-from mauvecl.lightcurve.stares.frame_components import Components
-from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.lightcurve.stares.stare_requests import StaresRequest
+from mauvecl.flares.frames import Components
+from mauvecl.flares.stare import Stare
+from mauvecl.flares.stare_scene import StaresRequest
 
 REPEATS, FRAMES = 5, 200
 STARE = Stare.of(

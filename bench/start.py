@@ -25,7 +25,7 @@ import time
 from mauvecl.device.engine import Engine
 from mauvecl.device.toy_exposure import toy
 quiet, flare = toy(1600), toy(1600, flare=0.1)
-import mauvecl.results.detection.detection, pyopencl, scipy.special
+import mauvecl.detection.detection, pyopencl, scipy.special
 start = time.perf_counter()
 Engine().detect(quiet, [flare], realisations=64, seed=1)
 print(time.perf_counter() - start)

@@ -45,11 +45,9 @@ def main() -> None:
         rows.append((what, time.perf_counter() - started[0] - sum(r[1] for r in rows),
                      cpu_s() - started[1] - sum(r[2] for r in rows)))  # fmt: skip
 
-    from mauvecl.host.orbit.earth import direction
+    from mauvecl.host.orbit.geometry import TimeGrid, direction
     from mauvecl.host.orbit.orbit import Orbit
-    from mauvecl.host.orbit.season import zodiacal_light
-    from mauvecl.host.orbit.time_grid import TimeGrid
-    from mauvecl.host.orbit.visibility import Visibility
+    from mauvecl.host.orbit.visibility import Visibility, zodiacal_light
 
     done("imports")
     rng = np.random.default_rng(1)

@@ -21,7 +21,7 @@ INLINE floatv expansion_draw(floatv z, float offset, float slope, float cubic)
 }
 
 /* Counts of two neighbours from two words: a table uses one word per count, the expansion uses both words for both.
-   No pair mixes the two methods (mauvecl/noise/pixel_tables.py: _both_of_a_pair), because a word used twice would correlate the counts.
+   No pair mixes the two methods (mauvecl/noise/scene.py: _both_of_a_pair), because a word used twice would correlate the counts.
    Only a padded neighbour, which has no effect, may differ. */
 INLINE void poisson_pair(uintv first, uintv second, __global const Poisson *a, __global const Poisson *b,
                          __global const uint *tables, floatv *out)

@@ -1,4 +1,4 @@
-## Factors from tables of quantiles; see mauvecl/noise/priors.py.
+## Factors from tables of quantiles; see mauvecl/noise/disturbances.py.
 /* Factor of a prior, minus one, at the probability that a word represents. The top bit chooses an end of the table. The
    other 31 bits and 23 finer ones give the probability from that end times 2^32; octave and cell are bits of its float. */
 INLINE floatv quantile(uintv word, uintv finer, __global const float *table)

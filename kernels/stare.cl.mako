@@ -1,5 +1,5 @@
 ## Frames of stares. Only the strengths of a few spectra vary between frames and stares; see
-## mauvecl/lightcurve/stares/frame_components.py. Vector lanes are stares if pixels are drawn, and frames if sums are drawn.
+## mauvecl/flares/frames.py. Vector lanes are stares if pixels are drawn, and frames if sums are drawn.
 #define STARE_POINTERS(r) __global const StareJob *r stare_job, __global const uint *r numbers, __global const float *r known, \
     __global const float *r curves, __global const uint *r kinds, __global const float *r flares, __global const float *r amplitudes, \
     __global const float *r losses

@@ -47,37 +47,34 @@ if TYPE_CHECKING:
     from mauvecl.answers.signal.snr import snr
     from mauvecl.answers.stares.inject import inject
     from mauvecl.answers.stares.stare import stare
+    from mauvecl.detection.detection import Detection, departures
+    from mauvecl.detection.nuisances import Nuisances
+    from mauvecl.detection.statistics import Linear
     from mauvecl.device.engine import Engine
     from mauvecl.device.stare_engine import Stares
-    from mauvecl.host.expectation import Expectation, expect
+    from mauvecl.fits.flare_model import FlareModel
+    from mauvecl.fits.spectrum import fit, fit_two_temperatures, forecast
+    from mauvecl.fits.time_course import fit_cooling, measure_along
+    from mauvecl.flares.cooling import Cooling
+    from mauvecl.flares.curves import Sinusoid
+    from mauvecl.flares.energies import EnergyScale
+    from mauvecl.flares.events import Event
+    from mauvecl.flares.shapes import SHAPES, TableShape
+    from mauvecl.flares.stare import Stare
+    from mauvecl.host.exposure.expectation import Expectation, expect
+    from mauvecl.host.exposure.sky import Sky
+    from mauvecl.host.instrument.curves import PixelMap
     from mauvecl.host.instrument.instrument import Instrument
-    from mauvecl.host.instrument.pixel_map import PixelMap
-    from mauvecl.host.sky.zodiacal import Sky
     from mauvecl.host.stars.flare_spectra import BalmerFlare, Blackbody, FlareWithLines, ObservedFlare, TwoBlackbodies
     from mauvecl.host.stars.source import Source
-    from mauvecl.lightcurve.flares.cooling import Cooling
-    from mauvecl.lightcurve.flares.energies import EnergyScale
-    from mauvecl.lightcurve.flares.events import Event
-    from mauvecl.lightcurve.flares.shapes import SHAPES, TableShape
-    from mauvecl.lightcurve.stares.cooling_fit import fit_cooling
-    from mauvecl.lightcurve.stares.curves import Sinusoid
-    from mauvecl.lightcurve.stares.measured_bins import measure_along
-    from mauvecl.lightcurve.stares.stare import Stare
     from mauvecl.noise.comparison import Comparison
-    from mauvecl.noise.priors import Normal, Uniform
+    from mauvecl.noise.disturbances import Normal, Uniform
     from mauvecl.noise.processes import CosmicRays, Processes
     from mauvecl.observations.frames import Frames
     from mauvecl.observations.reading import read_frames
-    from mauvecl.results.detection.departures import departures
-    from mauvecl.results.detection.detection import Detection
-    from mauvecl.results.measurements.fit import fit, forecast
-    from mauvecl.results.measurements.flare_model import FlareModel
-    from mauvecl.results.measurements.two_temperatures import fit_two_temperatures
     from mauvecl.runs.cluster import DaskWorkers
     from mauvecl.runs.pool import LocalWorkers, Pool
     from mauvecl.schema.errors import InputError
-    from mauvecl.statistics.linear import Linear
-    from mauvecl.statistics.nuisances import Nuisances
     from mauvecl.store import bulk
     from mauvecl.study.study import PAPER_BUDGETS, Study
 
@@ -157,49 +154,49 @@ __all__ = [
 _HOMES = HOMES | {
     "BalmerFlare": "host.stars.flare_spectra",
     "Blackbody": "host.stars.flare_spectra",
-    "FlareModel": "results.measurements.flare_model",
+    "FlareModel": "fits.flare_model",
     "FlareWithLines": "host.stars.flare_spectra",
     "ObservedFlare": "host.stars.flare_spectra",
     "TwoBlackbodies": "host.stars.flare_spectra",
-    "fit": "results.measurements.fit",
-    "forecast": "results.measurements.fit",
+    "fit": "fits.spectrum",
+    "forecast": "fits.spectrum",
     "Comparison": "noise.comparison",
-    "Cooling": "lightcurve.flares.cooling",
+    "Cooling": "flares.cooling",
     "CosmicRays": "noise.processes",
     "DaskWorkers": "runs.cluster",
-    "Detection": "results.detection.detection",
-    "EnergyScale": "lightcurve.flares.energies",
+    "Detection": "detection.detection",
+    "EnergyScale": "flares.energies",
     "Engine": "device.engine",
-    "Event": "lightcurve.flares.events",
-    "Expectation": "host.expectation",
+    "Event": "flares.events",
+    "Expectation": "host.exposure.expectation",
     "Frames": "observations.frames",
     "read_frames": "observations.reading",
     "InputError": "schema.errors",
     "Instrument": "host.instrument.instrument",
-    "Linear": "statistics.linear",
+    "Linear": "detection.statistics",
     "LocalWorkers": "runs.pool",
-    "Normal": "noise.priors",
-    "Nuisances": "statistics.nuisances",
+    "Normal": "noise.disturbances",
+    "Nuisances": "detection.nuisances",
     "PAPER_BUDGETS": "study.study",
-    "PixelMap": "host.instrument.pixel_map",
+    "PixelMap": "host.instrument.curves",
     "Pool": "runs.pool",
     "Processes": "noise.processes",
-    "SHAPES": "lightcurve.flares.shapes",
-    "Sinusoid": "lightcurve.stares.curves",
-    "Sky": "host.sky.zodiacal",
+    "SHAPES": "flares.shapes",
+    "Sinusoid": "flares.curves",
+    "Sky": "host.exposure.sky",
     "Source": "host.stars.source",
-    "Stare": "lightcurve.stares.stare",
+    "Stare": "flares.stare",
     "Stares": "device.stare_engine",
     "Study": "study.study",
-    "TableShape": "lightcurve.flares.shapes",
-    "Uniform": "noise.priors",
+    "TableShape": "flares.shapes",
+    "Uniform": "noise.disturbances",
     "bulk": "store",
-    "departures": "results.detection.departures",
-    "expect": "host.expectation",
+    "departures": "detection.detection",
+    "expect": "host.exposure.expectation",
     "exposure_for": "answers.signal.exposures",
-    "fit_cooling": "lightcurve.stares.cooling_fit",
-    "fit_two_temperatures": "results.measurements.two_temperatures",
-    "measure_along": "lightcurve.stares.measured_bins",
+    "fit_cooling": "fits.time_course",
+    "fit_two_temperatures": "fits.spectrum",
+    "measure_along": "fits.time_course",
     "shortest_exposure": "answers.limits.limits",
     "smallest_amplitude": "answers.limits.limits",
     "what_matters": "answers.limits.assumptions",

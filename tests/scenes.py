@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl import SHAPES, Expectation, Frames, Instrument, Sky, Source, Stare, Study, analyse, expect
-from mauvecl.host.neighbours import Neighbour, Neighbours
+from mauvecl.flares.frames import Components
+from mauvecl.flares.stare_scene import StaresRequest
+from mauvecl.host.exposure.star import Neighbour, Neighbours
 from mauvecl.host.stars.bands import band
-from mauvecl.lightcurve.stares.frame_components import Components
-from mauvecl.lightcurve.stares.stare_requests import StaresRequest
 
 Float = NDArray[np.float64]
 

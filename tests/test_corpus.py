@@ -20,9 +20,9 @@ from corpus import CORPUS, Case, cases, mapping_of, value, written
 from refusals import refused
 
 from mauvecl import Source, read_frames
-from mauvecl.host.neighbour_table import read_neighbours
+from mauvecl.host.exposure.star import read_neighbours
 from mauvecl.host.spectra.formats import read_spectrum
-from mauvecl.host.stars.flare_table import read_flares
+from mauvecl.host.stars.flare import read_flares
 from mauvecl.observations.frames import Reason
 from mauvecl.study.orbits import PlanTarget, read_targets
 

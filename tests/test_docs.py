@@ -17,7 +17,7 @@ from mauvecl.cli.app import app
 from mauvecl.observations.mapping import FrameMapping
 
 ROOT = Path(__file__).parent.parent
-#: `mauvecl/results/detection/roc.py`, or with a name in it: `mauvecl/results/detection/roc.py: Roc`.
+#: `mauvecl/detection/detection.py`, or with a name in it: `mauvecl/detection/detection.py: Roc`.
 NAMED = re.compile(r"`((?:host|kernels|mauvecl|tests|bench|tools|docs)/[\w./*-]+\.\w+)(?::\s*(\w+))?[^`]*`")
 #: What defines a name, by a file's ending.
 DEFINITIONS = {

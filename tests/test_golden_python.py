@@ -67,9 +67,9 @@ from mauvecl import (
     what_matters,
 )
 from mauvecl.device.selftest import digests
-from mauvecl.host.neighbours import Neighbour, Neighbours
-from mauvecl.host.stars.catalogue import names
-from mauvecl.lightcurve.stares.frame_components import Components
+from mauvecl.flares.frames import Components
+from mauvecl.host.exposure.star import Neighbour, Neighbours
+from mauvecl.host.stars.library import names
 from mauvecl.observations.changes.periods import recover_periods
 from mauvecl.observations.line_index import MG_II_CONTINUUM_NM, MG_II_NM, line_index
 

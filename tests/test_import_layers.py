@@ -15,17 +15,17 @@ ROOT = Path(__file__).parent.parent
 #: Forbidden imports: upwards, upwards for types only, upwards inside a package, and pyopencl outside `device`.
 FORBIDDEN = {
     "noise/layout.py": ("import mauvecl.study.study", "mauvecl.noise.layout -> mauvecl.study.study"),
-    "results/detection/roc.py": (
+    "detection/detection.py": (
         "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from mauvecl.cli.app import main",
-        "mauvecl.results.detection.roc -> mauvecl.cli.app",
+        "mauvecl.detection.detection -> mauvecl.cli.app",
     ),
     "host/files/size_limits.py": (
         "from mauvecl.host.stars.source import Source",
         "mauvecl.host.files.size_limits -> mauvecl.host.stars.source",
     ),
-    "results/counts/tally.py": (
-        "from mauvecl.results.detection import roc",
-        "mauvecl.results.counts.tally -> mauvecl.results.detection.roc",
+    "fits/profile.py": (
+        "from mauvecl.search import search",
+        "mauvecl.fits.profile -> mauvecl.search.search",
     ),
     "answers/signal/snr.py": (
         "def late():\n    from mauvecl.answers.limits.limits import solve",

@@ -17,7 +17,7 @@ from refusals import refused
 from scenes import star
 
 from mauvecl import Blackbody, Source
-from mauvecl.host.stars.flare_table import flares_of, read_flares
+from mauvecl.host.stars.flare import flares_of, read_flares
 from mauvecl.study.sections import amplitudes_in
 
 

@@ -53,7 +53,7 @@ def keys(section: Any, kind: str) -> Iterator[str]:
 
 def columns() -> Iterator[str]:
     """Yield each column that a table of an answer or result can have, by the package that declares it."""
-    for package in ("answers", "results", "noise", "lightcurve", "store"):
+    for package in ("answers", "detection", "flares", "fits", "search", "noise", "store"):
         home = import_module(f"mauvecl.{package}")
         for found in pkgutil.walk_packages(home.__path__, f"{home.__name__}."):
             module = import_module(found.name)
@@ -126,7 +126,7 @@ def test_listing_covers_every_kind() -> None:
     for known in (
         "command mauvecl detect --fap",
         "study observation.exposure_s [s]",
-        "column results.detection: threshold",
+        "column detection: threshold",
         "python expect(1 source, required)",
         "python Engine.detect(realisations, required)",
     ):

@@ -24,9 +24,9 @@ from typer.testing import CliRunner
 
 from mauvecl.answers.files import write_table
 from mauvecl.cli.app import app
+from mauvecl.detection.requests import STATISTICS
 from mauvecl.runs.pool import LocalWorkers, Pool
 from mauvecl.schema.errors import InputError
-from mauvecl.statistics.registry import STATISTICS
 from mauvecl.web.closed_forms import ClosedForms
 from mauvecl.web.downloads import commands_and_programs
 from mauvecl.web.fields import FIELDS, UPLOADED_FILE, Choice, Number

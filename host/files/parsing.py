@@ -11,10 +11,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from mauvecl.host.files.size_limits import read_bytes
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import printable, shortened
-
-from .size_limits import read_bytes
 
 #: Range of absolute values of numbers from users, apart from 0; products of several stay within double precision.
 SMALLEST, LARGEST = 1e-30, 1e30

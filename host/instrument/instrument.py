@@ -1,8 +1,10 @@
-"""Validated, frozen record of an instrument's optics, spectrograph and detector."""
+"""Instruments: optics, spectrograph, line spread and detector, in Python and in TOML files."""
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,7 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
+from scipy.special import erf, ndtr
 
+from mauvecl.host.files.parsing import read_text, toml
+from mauvecl.host.instrument.curves import MAX_PIXELS, Curve, PixelMap, ThroughputErrors
+from mauvecl.host.instrument.paths import instrument_path, shipped_names
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Help, Range, Unit
@@ -19,15 +25,78 @@ from mauvecl.schema.physical import DetectorTemperature, Exposure, NotNegative, 
 from mauvecl.schema.quantities import count, is_quantity, numbers, word_of
 from mauvecl.schema.records import input_error
 from mauvecl.schema.section import Section
-
-from .curve import Curve
-from .instrument_file import read_values
-from .paths import instrument_path, shipped_names
-from .pixel_map import MAX_PIXELS, PixelMap
-from .throughput_errors import ThroughputErrors
+from mauvecl.schema.text import shortened
 
 if TYPE_CHECKING:
     from astropy.table import QTable
+
+#: Tags of sources: paper, datasheet, computation, assumption, user.
+TAGS = ("P", "D", "C", "A", "U")
+#: Largest number of files in a chain in which each extends the next.
+MAX_EXTENDED = 16
+
+
+def read_values(
+    path: Path, files: Mapping[str, type[Curve | PixelMap | ThroughputErrors]], seen: tuple[Path, ...] = ()
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return the values and sources of a file, merged over those of the file that it extends.
+
+    Parameters
+    ----------
+    files : mapping
+        Classes of the values that may be paths, relative to the file.
+    seen : tuple of Path
+        Files that extend this one.
+    """
+    if path.resolve() in seen:
+        raise InputError(f"{path.name} extends itself", "a chain of files that ends", key="extends", value=path.name)
+    if len(seen) == MAX_EXTENDED:
+        raise InputError(
+            f"{path.name} ends a chain of {MAX_EXTENDED} files that extend another",
+            "fewer",
+            key="extends",
+            value=path.name,
+        )
+    content = toml(read_text(path, "instrument file"), f"instrument file {shortened(str(path))}")
+    values: dict[str, Any] = {}
+    sources: dict[str, str] = {}
+    if "extends" in content:
+        values, sources = read_values(
+            instrument_path(content.pop("extends"), path.parent), files, (*seen, path.resolve())
+        )
+    for name, entry in content.items():
+        if name == "sources":
+            raise InputError(
+                f"{path.name}: unknown key 'sources'", "each value's source in the value's own table", key="sources"
+            )
+        values[name], sources[name] = _entry(name, entry, path, files.get(name))
+    return values, sources
+
+
+def _entry(
+    name: str, entry: Any, path: Path, kind: type[Curve | PixelMap | ThroughputErrors] | None
+) -> tuple[Any, str]:
+    """Return the value and source of an entry: a plain value, a table of value, tag and source, or a path."""
+    source = f"A: assumed, no source in {path.name}"
+    if isinstance(entry, dict):
+        unknown = [key for key in entry if key not in ("value", "tag", "source")]
+        if unknown or "value" not in entry:
+            what = f"the unknown key {unknown[0]!r}" if unknown else "no 'value'"
+            raise InputError(
+                f"{path.name}: the table {name} has {what}", "value, tag and source", key=name, value=entry
+            )
+        tag = entry.get("tag", "A")
+        if tag not in TAGS:
+            raise InputError.of("tag", tag, f"one of {', '.join(TAGS)}", where=f"{path.name}, {name}")
+        source = f"{tag}: {entry.get('source', f'no source in {path.name}')}"
+        entry = entry["value"]
+    if kind is not None and isinstance(entry, str):
+        read = kind.read(path.parent / entry)
+        return read, read.source
+    if kind is Curve and isinstance(entry, int | float) and not isinstance(entry, bool):
+        return Curve.flat(float(entry), source), source
+    return entry, source
+
 
 #: Energy of a photon times its wavelength, J nm, and the charge of an electron, C (exact SI values).
 HC_J_NM = 6.62607015e-34 * 299_792_458.0 * 1e9
@@ -494,3 +563,90 @@ FILES: dict[str, type[Curve | PixelMap | ThroughputErrors]] = dict.fromkeys((*CU
     "pixel_map": PixelMap,
     "throughput_errors": ThroughputErrors,
 }
+
+
+#: Cut-off of the Gaussian's tails, in sigma; less than 1e-15 lies beyond.
+REACH_SIGMA = 8.0
+#: Largest width of a panel in which a polynomial describes a pixel's fraction of a line, in sigma of the Gaussian.
+PANEL_SIGMA = 0.5
+
+
+@dataclass(frozen=True)
+class LineSpread:
+    """Line spread function, a top hat convolved with a Gaussian, and the pixels that sample it; all in nm."""
+
+    centres: tuple[float, ...]  # of the pixels
+    pixel: float  # width of a pixel
+    top_hat: float  # full width of the top hat
+    sigma: float  # of the Gaussian
+
+    @classmethod
+    def of(cls, instrument: Instrument) -> LineSpread:
+        """Return the line spread function of an instrument."""
+        return cls(
+            tuple(instrument.wavelength_nm.tolist()),
+            instrument.dispersion_nm_per_pixel,
+            instrument.top_hat_width_nm,
+            instrument.gaussian_fwhm_nm / np.sqrt(8 * np.log(2)),
+        )
+
+    @property
+    def reach(self) -> float:
+        """Largest distance of a line from a pixel's centre at which light reaches the pixel."""
+        return (self.top_hat + self.pixel) / 2 + REACH_SIGMA * self.sigma
+
+    @property
+    def mean_density(self) -> float:
+        """Integral of the square of the line spread function averaged over a pixel, nm^-1."""
+        offset = np.linspace(-self.reach, self.reach, 4001)
+        return float(np.trapezoid((self.landing(offset) / self.pixel) ** 2, offset))
+
+    def density(self, offset_nm: ArrayLike) -> Float:
+        """Return the line spread function, nm^-1, normalised to unit integral."""
+        x = np.asarray(offset_nm, np.float64)
+        if self.top_hat == 0:
+            return np.asarray(np.exp(-0.5 * (x / self.sigma) ** 2) / (self.sigma * np.sqrt(2 * np.pi)))
+        half = self.top_hat / 2
+        if self.sigma == 0:
+            return np.where(np.abs(x) <= half, 1 / self.top_hat, 0.0)
+        scale = self.sigma * np.sqrt(2)
+        return np.asarray((erf((x + half) / scale) - erf((x - half) / scale)) / (2 * self.top_hat))
+
+    def landing(self, offset_nm: Float) -> Float:
+        """Return the fraction of a line's light that falls on a pixel whose centre is `offset_nm` from the line."""
+        # The function is even; on the left of the line no digits cancel.
+        x = -np.abs(offset_nm)
+        half = self.pixel / 2
+        return np.asarray(self.below(x + half) - self.below(x - half))
+
+    def below(self, x: Float) -> Float:
+        """Return the fraction of a line's light that falls below x."""
+        if self.top_hat == 0:
+            return np.asarray(ndtr(x / self.sigma))
+        half = self.top_hat / 2
+        return (self._ramp(x + half) - self._ramp(x - half)) / self.top_hat
+
+    def _ramp(self, x: Float) -> Float:
+        """Integrate the Gaussian's distribution function from minus infinity to x."""
+        if self.sigma == 0:
+            return np.maximum(x, 0.0)
+        z = x / self.sigma
+        return np.asarray(self.sigma * (z * ndtr(z) + np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)))
+
+    def panel_edges(self, knots: Float) -> Float:
+        """Return the edges of panels in which every pixel's `landing` is smooth, shape (n_panel + 1,).
+
+        Panels also end at `knots`.
+        """
+        low, high = self.centres[0] - self.reach, self.centres[-1] + self.reach
+        parts = [np.array([low, high]), knots[(knots > low) & (knots < high)]]
+        if self.sigma > 0:
+            parts.append(np.linspace(low, high, int(np.ceil((high - low) / (PANEL_SIGMA * self.sigma))) + 1))
+        else:
+            # Without a Gaussian `landing` is a trapezoid, linear between these corners.
+            ends = np.append(np.asarray(self.centres) - self.pixel / 2, self.centres[-1] + self.pixel / 2)
+            parts += [ends - self.top_hat / 2, ends + self.top_hat / 2]
+        edges = np.unique(np.concatenate(parts))
+        # Knots that differ only by rounding would make empty panels.
+        kept: Float = edges[np.append(True, np.diff(edges) > 1e-9)]
+        return kept

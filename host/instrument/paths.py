@@ -7,10 +7,9 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
+from mauvecl.host.files.parsing import is_file
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
-
-from ..files.parsing import is_file
 
 
 def shipped_names() -> tuple[str, ...]:

@@ -1,21 +1,171 @@
-"""Position of the satellite: SGP4 near the epoch of its elements, a mean Sun-synchronous orbit far from it."""
+"""Orbits of the satellite, the limits of its observations, and its targets."""
 
 from __future__ import annotations
 
+import re
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
+from importlib import resources
+from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.exposure.sky import parse_position
+from mauvecl.host.files.parsing import read_text
+from mauvecl.host.orbit.geometry import (
+    GRAVITY,
+    J2,
+    RADIUS_KM,
+    Bodies,
+    TimeGrid,
+    Vectors,
+    direction,
+    subsatellite_point,
+    to_j2000,
+    unit,
+    utc_text,
+)
+from mauvecl.host.stars import library as well_known
+from mauvecl.host.stars.library import by_key, name_key, near_names
+from mauvecl.host.tables.coordinates import EXPECTED
+from mauvecl.host.tables.ecsv import parse_ecsv
+from mauvecl.host.tables.missing import is_missing_position
+from mauvecl.host.tables.times import offline
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DAY_S
+from mauvecl.schema.text import shortened
 
-from .earth import GRAVITY, Vectors, subsatellite_point, to_j2000, unit
-from .elements import Elements
-from .sun_and_moon import Bodies
-from .time_grid import TimeGrid, utc_text
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+
+@dataclass(frozen=True)
+class Elements:
+    """A two-line element set."""
+
+    first: str  # line 1
+    second: str  # line 2
+    source: str  # origin of the set, for reports
+
+    def __post_init__(self) -> None:
+        for number, line in enumerate((self.first, self.second), 1):
+            _check(line, number)
+        if self.first[2:7] != self.second[2:7]:
+            raise InputError(
+                f"orbital elements are of satellites {self.first[2:7]!r} and {self.second[2:7]!r}",
+                "one",
+                key="elements",
+                value=(self.first[2:7], self.second[2:7]),
+            )
+        if self.satellite.error:
+            raise InputError(
+                f"orbital elements {shortened(self.second)} are refused by SGP4 (error {self.satellite.error})",
+                "those of an orbit around the Earth",
+                key="elements",
+                value=self.second,
+            )
+
+    @classmethod
+    def read(cls, path: str | Path) -> Elements:
+        """Read the first set of a file; titles and comments are ignored.
+
+        Raises InputError if the file holds no set or a line's checksum is wrong.
+        """
+        path = Path(path)
+        return cls._of(read_text(path, "orbit file"), f"file {path.name}", shortened(str(path)))
+
+    @classmethod
+    def embedded(cls) -> Elements:
+        """Return the public elements of Mauve that the package contains."""
+        text = resources.files(__package__).joinpath("mauve.tle").read_text(encoding="utf-8")
+        return cls._of(text, "public catalogue, object 66756, embedded", "the embedded elements")
+
+    @classmethod
+    def _of(cls, text: str, source: str, named: str) -> Elements:
+        lines = [line.rstrip() for line in text.splitlines()]
+        for one, two in pairwise(lines):
+            if one.startswith("1 ") and two.startswith("2 "):
+                return cls(one, two, source)
+        raise InputError(
+            f"orbit file {named} holds no two lines of elements",
+            "a line '1 ...' before '2 ...'",
+            key="elements",
+            value=named,
+        )
+
+    @cached_property
+    def satellite(self) -> Any:
+        """Satellite record of `sgp4`."""
+        from sgp4.api import WGS72, Satrec
+
+        return Satrec.twoline2rv(self.first, self.second, WGS72)
+
+    @property
+    def name(self) -> str:
+        """NORAD catalogue number."""
+        return self.first[2:7].strip()
+
+    @property
+    def epoch_jd(self) -> float:
+        """Epoch as a Julian date, UTC."""
+        return float(self.satellite.jdsatepoch + self.satellite.jdsatepochF)
+
+    @property
+    def epoch(self) -> str:
+        """Epoch in ISO 8601, UTC, to the second."""
+        return utc_text(self.epoch_jd)
+
+    @property
+    def revolutions_per_day(self) -> float:
+        """Mean motion."""
+        return float(self.satellite.no_kozai) * 1440 / (2 * np.pi)
+
+    @property
+    def period_s(self) -> float:
+        """Anomalistic period, s."""
+        return DAY_S / self.revolutions_per_day
+
+    @property
+    def axis_km(self) -> float:
+        """Semi-major axis, from the mean motion by Kepler's third law."""
+        return float((GRAVITY / (2 * np.pi / self.period_s) ** 2) ** (1 / 3))
+
+    @property
+    def node_drift_deg_per_day(self) -> float:
+        """Eastward drift of the node due to J2; the mean Sun moves by 0.98565 deg per day."""
+        return float(np.degrees(-1.5 * self._oblate * np.cos(self.satellite.inclo)) * DAY_S)
+
+    @property
+    def latitude_rate_deg_per_day(self) -> float:
+        """Rate of the mean argument of latitude: mean motion plus the drift of the perigee."""
+        perigee = 0.75 * self._oblate * (5 * np.cos(self.satellite.inclo) ** 2 - 1)
+        return 360.0 * self.revolutions_per_day + float(np.degrees(perigee)) * DAY_S
+
+    @property
+    def _oblate(self) -> float:
+        """Common factor of the secular J2 rates, rad/s, with p the semi-latus rectum."""
+        p = self.axis_km * (1 - self.satellite.ecco**2)
+        return float(2 * np.pi / self.period_s * J2 * (RADIUS_KM / p) ** 2)
+
+
+def _check(line: str, number: int) -> None:
+    """Raise InputError unless a line has the right form and checksum (digits plus 1 per minus sign, modulo 10)."""
+    if len(line) < 69 or not line.isascii() or not line.startswith(f"{number} "):
+        raise InputError.of("elements", line, f"line {number} with 69 characters")
+    checksum = sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10
+    if line[68] != str(checksum):
+        raise InputError(
+            f"orbital elements {shortened(line)} end in the checksum {line[68]!r}",
+            f"{checksum}: one is wrong",
+            key="elements",
+            value=line,
+        )
+
 
 Kind = Literal["auto", "tle", "mean"]
 #: Days from the epoch beyond which reports state the possible error of SGP4.
@@ -224,3 +374,147 @@ class Track:
         """Period of a circular orbit at the mean distance, s."""
         axis = float(np.linalg.norm(self.of_date_km, axis=1).mean())
         return float(2 * np.pi * np.sqrt(axis**3 / GRAVITY))
+
+
+#: Timeout of a SIMBAD query, s.
+TIMEOUT_S = 10.0
+
+
+@dataclass(frozen=True)
+class Target:
+    """A position on the sky and the known properties of the star there."""
+
+    name: str
+    ra_deg: float  # ICRS, as the declination
+    dec_deg: float
+    source: str  # origin of the position
+    distance_pc: float | None = None
+    magnitude: float | None = None  # in V
+    spectral_type: str | None = None
+
+    @classmethod
+    def of(cls, text: str, *, name: str | None = None, simbad: bool = False) -> Target:
+        """Resolve a name of the embedded list or coordinates.
+
+        Parameters
+        ----------
+        text : str
+            A name, or ICRS coordinates: degrees ("290.0 -11.2") or sexagesimal ("19h22m00s -11d12m00s").
+        name : str, optional
+            Name of the target in reports. The default is the list's name, or `text`.
+        simbad : bool
+            Whether to query SIMBAD for a name that is not embedded (needs `mauvecl[names]` and a network).
+        """
+        if is_missing_position(text):
+            raise InputError(
+                f"target {shortened(text)} is a pair of missing values", EXPECTED, key="target", value=text
+            )
+        star = by_key().get(name_key(text))
+        if star is not None:
+            return cls(name or star.name, star.ra_deg, star.dec_deg, f"embedded list ({star.source})",
+                       star.distance_pc, star.magnitude, star.spectral_type)  # fmt: skip
+        if re.match(r"\s*[^\W\d]", text) and not re.match(r"\s*ra\W*\d", text, re.IGNORECASE):
+            if simbad:
+                return _from_simbad(text, name)
+            like = ", ".join(near_names(text, stars_only=True))
+            raise InputError(
+                f"target {shortened(text)} is not in the embedded list",
+                f"a name such as {like}, coordinates such as '290.0 -11.2', or `simbad=True` to ask SIMBAD",
+                key="target",
+                value=text,
+            )
+        with offline():
+            place = parse_position(text).icrs
+        return cls(name or text.strip(), float(place.ra.deg), float(place.dec.deg), "given")
+
+    @property
+    def direction(self) -> NDArray[np.float64]:
+        """Unit vector, ICRS, shape (3,)."""
+        return direction(self.ra_deg, self.dec_deg)
+
+
+@cache
+def _list() -> Table:
+    return parse_ecsv(well_known.text(), "the embedded list of stars")
+
+
+def target_table() -> Table:
+    """Return the embedded stars.
+
+    Returns
+    -------
+    Table
+        Columns name, ra, dec (deg, ICRS), distance (pc), V, spectral_type, other_names and source.
+    """
+    return _list().copy()
+
+
+#: ADQL query of SIMBAD (tried with astroquery 0.4.11). The left join keeps stars without a V magnitude.
+SIMBAD_QUERY = (
+    'SELECT basic.ra, basic.dec, basic.plx_value, basic.sp_type, allfluxes."V" FROM ident JOIN basic '
+    "ON ident.oidref = basic.oid LEFT JOIN allfluxes ON allfluxes.oidref = basic.oid WHERE ident.id = '{}'"
+)
+
+
+def _from_simbad(text: str, name: str | None) -> Target:
+    """Query SIMBAD, with a timeout."""
+    try:
+        from astroquery.simbad import Simbad
+    except ImportError:
+        raise InputError(
+            f"target {shortened(text)} is not in the embedded list and astroquery is missing",
+            "coordinates, or `pip install 'mauvecl[names]'`",
+            key="target",
+            value=text,
+        ) from None
+    query = SIMBAD_QUERY.format(text.strip().replace("'", "''"))
+    try:
+        table = _within(TIMEOUT_S, lambda: Simbad.query_tap(query))
+    except Exception as error:  # astroquery raises many kinds for a network failure
+        raise InputError(
+            f"target {shortened(text)} is not in the embedded list and SIMBAD did not answer within {TIMEOUT_S:g}"
+            f" s ({type(error).__name__})",
+            "a network, or coordinates",
+            key="target",
+            value=text,
+        ) from error
+    if table is None or len(table) == 0:
+        raise InputError(
+            f"target {shortened(text)} is unknown to SIMBAD", "another name, or coordinates", key="target", value=text
+        )
+    row = table[0]
+
+    def number(column: str) -> float | None:
+        value = row[column]
+        return None if np.ma.is_masked(value) or not np.isfinite(float(value)) else float(value)
+
+    parallax, ra, dec = number("plx_value"), number("ra"), number("dec")
+    if ra is None or dec is None:
+        raise InputError(
+            f"target {shortened(text)} has no coordinates in SIMBAD", "another name", key="target", value=text
+        )
+    distance = None if parallax is None or parallax <= 0 else 1000 / parallax
+    kind = None if np.ma.is_masked(row["sp_type"]) else str(row["sp_type"]).strip() or None
+    return Target(name or text.strip(), ra, dec, "SIMBAD", distance, number("V"), kind)
+
+
+def _within(seconds: float, ask: Callable[[], Any]) -> Any:
+    """Call a function and raise TimeoutError if it takes too long, since astroquery's requests may never return."""
+    answers: list[Any] = []
+    failed: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            answers.append(ask())
+        except Exception as error:
+            failed.append(error)
+
+    # A daemon thread does not delay the exit of the program.
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    if failed:
+        raise failed[0]
+    if not answers:
+        raise TimeoutError
+    return answers[0]

@@ -1,21 +1,170 @@
-"""Visibility of targets: windows, and exposure time per orbit, day and month."""
+"""Visibility of targets: windows, seasons, and the detector's temperature and particle hits along the orbit."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
+from importlib import resources
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import constraints
-from .constraints import Flags
-from .earth import Vectors
-from .observing_limits import Limits
-from .orbit import Orbit, Track
-from .radiation import proton_map
-from .time_grid import TimeGrid
+from mauvecl.host.exposure.sky import HelioEcliptic, zodiacal_brightness
+from mauvecl.host.orbit import geometry as constraints
+from mauvecl.host.orbit.geometry import Bodies, Flags, TimeGrid, Vectors, unit
+from mauvecl.host.orbit.observing_limits import Limits
+from mauvecl.host.orbit.orbit import Orbit, Track
+from mauvecl.host.tables.ecsv import parse_ecsv
+from mauvecl.schema.calls import validated
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DetectorTemperature, Duration, NotNegative, Share
+
+Energy = Literal[10, 30]
+
+
+@dataclass(frozen=True, eq=False)
+class FluxMap:
+    """Omnidirectional flux of trapped protons by sub-satellite point, cm^-2 s^-1."""
+
+    step_deg: float  # spacing of the grid
+    # By lower energy limit, MeV; each of shape (n_latitude, n_longitude), from latitude -90 and longitude -180.
+    flux: dict[int, NDArray[np.float64]]
+    source: str
+
+    def at(
+        self, longitude_deg: NDArray[np.float64], latitude_deg: NDArray[np.float64], above_mev: Energy = 10
+    ) -> NDArray[np.float64]:
+        """Interpolate the flux above an energy bilinearly, shape (n,)."""
+        if above_mev not in self.flux:
+            raise InputError.of("above_mev", above_mev, " or ".join(map(str, self.flux)))
+        grid = self.flux[above_mev]
+        row = np.clip((np.asarray(latitude_deg, float) + 90) / self.step_deg, 0, grid.shape[0] - 1)
+        column = (np.asarray(longitude_deg, float) + 180) / self.step_deg % grid.shape[1]
+        i, j = np.minimum(row.astype(int), grid.shape[0] - 2), column.astype(int) % grid.shape[1]
+        right, up, along = (j + 1) % grid.shape[1], row - i, column - np.floor(column)
+        south = (1 - along) * grid[i, j] + along * grid[i, right]
+        north = (1 - along) * grid[i + 1, j] + along * grid[i + 1, right]
+        return np.asarray((1 - up) * south + up * north)
+
+
+@lru_cache(maxsize=1)
+def proton_map() -> FluxMap:
+    """Return the map of AP8 at solar maximum, at an altitude of 510 km (see `tools/build_flux_map.py`)."""
+    text = resources.files(__package__).joinpath("protons.ecsv").read_text(encoding="utf-8")
+    table = parse_ecsv(text, "the embedded map of protons")
+    step = float(table.meta["step_deg"])
+    row = np.round((np.asarray(table["latitude"]) + 90) / step).astype(int)
+    column = np.round((np.asarray(table["longitude"]) + 180) / step).astype(int)
+    maps = {}
+    for energy in (10, 30):
+        grid = np.zeros((round(180 / step) + 1, round(360 / step)))
+        grid[row, column] = table[f"above_{energy}_mev"]
+        grid.setflags(write=False)
+        maps[energy] = grid
+    return FluxMap(step, maps, str(table.meta["source"]))
+
+
+@validated
+@dataclass(frozen=True)
+class Thermal:
+    """First-order thermal model of the detector: dT/dt = (T_end - T) / tau.
+
+    The model is an assumption. With the defaults the temperature varies by 3 deg C in every orbit, within the 13 to
+    21 deg C of the payload's documents.
+
+    Attributes
+    ----------
+    sunlit_c, shadow_c : float
+        Equilibrium temperatures in sunlight and in shadow, deg C.
+    time_constant_s : float
+    """
+
+    sunlit_c: DetectorTemperature = 21.0
+    shadow_c: DetectorTemperature = 13.0
+    time_constant_s: Duration = 3000.0
+
+    def temperature_c(
+        self, sunlight: NDArray[np.float64], step_s: float, start_c: float | None = None
+    ) -> NDArray[np.float64]:
+        """Return the temperature at the end of each step, deg C, shape (n,).
+
+        Parameters
+        ----------
+        sunlight : ndarray, shape (n,)
+            Visible fraction of the Sun's disk in each step, 0 to 1.
+        step_s : float
+            Length of a step. Sunlight is constant within a step, for which the solution is exact.
+        start_c : float, optional
+            Temperature before the first step. The default is the equilibrium for the mean sunlight.
+        """
+        from scipy.signal import lfilter
+
+        end = self.shadow_c + (self.sunlit_c - self.shadow_c) * sunlight
+        keep = float(np.exp(-step_s / self.time_constant_s))
+        start = float(end.mean()) if start_c is None else start_c
+        temperature, _ = lfilter([1 - keep], [1, -keep], end, zi=[keep * start])
+        return np.asarray(temperature)
+
+
+@validated
+@dataclass(frozen=True)
+class Particles:
+    """Particles that hit the detector: cosmic rays, and trapped protons that penetrate the shielding (assumption).
+
+    Attributes
+    ----------
+    cosmic_per_cm2_s : float
+        Rate of cosmic rays outside the South Atlantic Anomaly.
+    share : float
+        Fraction of the omnidirectional flux of trapped protons above 30 MeV that reaches the detector: a quarter of it
+        crosses either face of a thin plate.
+    """
+
+    cosmic_per_cm2_s: NotNegative = 1.0
+    share: Share = 0.5
+
+    def rate_per_cm2_s(self, track: Track) -> NDArray[np.float64]:
+        """Return the rate of hits along a track, cm^-2 s^-1, shape (n,)."""
+        return np.asarray(self.cosmic_per_cm2_s + self.share * proton_map().at(*track.subsatellite_deg, above_mev=30))
+
+
+#: Sources of the default values.
+THERMAL_SOURCE = "assumption: first-order heating and cooling between 13 and 21 deg C, the ends that are documented"
+PARTICLES_SOURCE = (
+    "assumption: 1 cm^-2 s^-1 of cosmic rays, and half of AP8's omnidirectional protons above 30 MeV, which some 4 mm "
+    "of aluminium let through"
+)
+
+
+def elongation_deg(sun: Vectors, target: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the angle between target and Sun, shape (n,), from unit vectors of shapes (3,) and (n, 3)."""
+    return np.asarray(np.degrees(np.arccos(np.clip(sun @ target, -1, 1))))
+
+
+def zodiacal_light(bodies: Bodies, target: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the zodiacal light behind a target, V mag arcsec^-2, shape (n,).
+
+    The value is NaN near the Sun, where the table has none. One time per day samples a year well enough.
+    """
+    pole = bodies.ecliptic_pole
+    latitude = float(np.degrees(np.arcsin(np.clip(target @ pole, -1, 1))))
+    flat = unit(bodies.sun - (bodies.sun @ pole)[:, None] * pole)
+    along = target - (target @ pole) * pole
+    size = float(np.linalg.norm(along))
+    # At the pole the longitude is arbitrary.
+    difference = np.degrees(np.arccos(np.clip(flat @ along / size, -1, 1))) if size > 1e-9 else np.zeros(len(flat))
+    positions = zip(difference, elongation_deg(bodies.sun, target), strict=True)
+    return np.array([_brightness(HelioEcliptic(float(x), abs(latitude), float(away))) for x, away in positions])
+
+
+def _brightness(place: HelioEcliptic) -> float:
+    try:
+        return zodiacal_brightness(place)
+    except InputError:
+        return float("nan")
+
 
 #: A limit as a function of a slice of steps that returns which targets are allowed, shape (steps or 1, k or 1).
 Rule = Callable[[slice], Flags]

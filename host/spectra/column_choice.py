@@ -6,10 +6,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from mauvecl.host.spectra.column_roles import Role
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
-
-from .column_roles import Role
 
 #: Largest number of names in a message.
 MAX_LISTED = 12

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
+from mauvecl.host.tables.units import SCALE, FluxKind, balanced, flux_kind, is_spectral, is_stated, unit_of
 from mauvecl.schema.errors import InputError
-
-from ..tables.units import SCALE, FluxKind, balanced, flux_kind, is_spectral, is_stated, unit_of
 
 Kind = Literal[
     "wavelength", "lower edge", "upper edge", "flux", "model", "error", "quality", "continuum", "counts", "background",

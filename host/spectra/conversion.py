@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.spectra.column_roles import Role
+from mauvecl.host.spectra.selection import RawSpectrum
+from mauvecl.host.spectra.wavelength_range import check_assumed_unit
+from mauvecl.host.tables.medium import Medium, unit_and_medium, vacuum_wavelengths
+from mauvecl.host.tables.units import flux_kind, is_spectral, is_stated, linear, unit_of
 from mauvecl.schema.errors import InputError
-
-from ..tables.medium import Medium, unit_and_medium, vacuum_wavelengths
-from ..tables.units import flux_kind, is_spectral, is_stated, linear, unit_of
-from .column_roles import Role
-from .selection import RawSpectrum
-from .wavelength_range import check_assumed_unit
 
 Float = NDArray[np.float64]
 

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.spectra.point_noise import point_noise
+from mauvecl.host.spectra.wavelength_range import MIN_MEASURED, NEEDED_NM, SPAN_NM, is_gap, likely_unit, measured_part
 from mauvecl.schema.errors import InputError
 
-from .point_noise import point_noise
-from .wavelength_range import MIN_MEASURED, NEEDED_NM, SPAN_NM, is_gap, likely_unit, measured_part
-
 if TYPE_CHECKING:
-    from ..instrument.line_spread import LineSpread
+    from mauvecl.host.instrument.instrument import LineSpread
 
 Float = NDArray[np.float64]
 
@@ -170,8 +169,7 @@ def remarks(wavelength: Float, flux: Float) -> tuple[str, ...]:
 
 @cache
 def _nominal_line() -> LineSpread:
-    from ..instrument.instrument import Instrument
-    from ..instrument.line_spread import LineSpread
+    from mauvecl.host.instrument.instrument import Instrument, LineSpread
 
     return LineSpread.of(Instrument.load("mauve"))
 

@@ -8,14 +8,13 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
+from mauvecl.host.spectra.column_roles import role_of
+from mauvecl.host.spectra.spectrum_table import SpectrumTable
+from mauvecl.host.tables.fits import column_values, open_fits, reading, text_at
+from mauvecl.host.tables.fits_images import axis_of, is_spectrum_image, is_survey_image, paired_images, rows_of
+from mauvecl.host.tables.medium import medium_of
+from mauvecl.host.tables.table import Values
 from mauvecl.schema.errors import InputError
-
-from ..tables.fits import column_values, open_fits, reading, text_at
-from ..tables.fits_images import axis_of, is_spectrum_image, is_survey_image, paired_images, rows_of
-from ..tables.medium import medium_of
-from ..tables.table import Values
-from .column_roles import role_of
-from .spectrum_table import SpectrumTable
 
 #: Units implied by the archives' tables, those of CALSPEC.
 IMPLIED_UNITS = ("Angstrom", "erg / (s cm2 Angstrom)")

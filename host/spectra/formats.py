@@ -8,18 +8,17 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mauvecl.host.files.parsing import parsing
+from mauvecl.host.files.size_limits import read_bytes, unpacked
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
-
-from ..files.parsing import parsing
-from ..files.size_limits import read_bytes, unpacked
 
 if TYPE_CHECKING:
     import astropy.units as u
 
-    from ..tables.table import MemoryTable
-    from .conversion import ReadSpectrum
-    from .spectrum_table import SpectrumTable
+    from mauvecl.host.spectra.conversion import ReadSpectrum
+    from mauvecl.host.spectra.spectrum_table import SpectrumTable
+    from mauvecl.host.tables.table import MemoryTable
 
 #: Largest number and length of messages in the table of a kept star, and length of the remarks on columns.
 MAX_NOTES, MAX_NOTE_LENGTH, MAX_REMARKS = 20, 400, 20_000
@@ -60,8 +59,8 @@ def read_spectrum(
     """
     import numpy as np
 
-    from .conversion import converted
-    from .selection import spectrum_in
+    from mauvecl.host.spectra.conversion import converted
+    from mauvecl.host.spectra.selection import spectrum_in
 
     try:
         place, asked = without_columns(path)
@@ -90,12 +89,12 @@ def _stem(name: str) -> str:
 def _tables(
     content: bytes, name: str, origin: str, asked: Sequence[str], units: tuple[bool, bool], check: bool
 ) -> list[SpectrumTable]:
-    from ..tables.ecsv import parse_ecsv
-    from ..tables.opening import check_no_page, form_of, votables
-    from ..tables.table import MemoryTable
-    from ..tables.text_table import text_of
-    from .fits_files import fits_tables
-    from .text import table_of_text
+    from mauvecl.host.spectra.fits_files import fits_tables
+    from mauvecl.host.spectra.text import table_of_text
+    from mauvecl.host.tables.ecsv import parse_ecsv
+    from mauvecl.host.tables.opening import check_no_page, form_of, votables
+    from mauvecl.host.tables.table import MemoryTable
+    from mauvecl.host.tables.text_table import text_of
 
     form = form_of(content[:4096])
     if form == "FITS":
@@ -115,8 +114,8 @@ def _tables(
 
 def _in_memory(file: MemoryTable, name: str, origin: str, label: str = "") -> SpectrumTable:
     """Return the table of an ECSV file or a VOTable."""
-    from ..tables.medium import medium_of
-    from .spectrum_table import SpectrumTable
+    from mauvecl.host.spectra.spectrum_table import SpectrumTable
+    from mauvecl.host.tables.medium import medium_of
 
     columns = [file.find(one) for one in file.names]
     said = [f"{one.ucd} {one.description}" for one in columns]

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 
+from mauvecl.host.tables.units import balanced, is_spectral, unit_of
 from mauvecl.schema.errors import InputError
-
-from ..tables.units import balanced, is_spectral, unit_of
 
 #: Length of the longest header that is searched.
 MAX_HEADER = 20_000

@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.spectra.column_choice import Choice, as_typed, choose, listed, numbered, plain
+from mauvecl.host.spectra.column_roles import Role
+from mauvecl.host.spectra.spectrum_table import SpectrumTable
+from mauvecl.host.tables.table import Values
 from mauvecl.schema.errors import InputError
-
-from ..tables.table import Values
-from .column_choice import Choice, as_typed, choose, listed, numbered, plain
-from .column_roles import Role
-from .spectrum_table import SpectrumTable
 
 Float = NDArray[np.float64]
 

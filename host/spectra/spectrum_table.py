@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from ..tables.medium import Medium
-from ..tables.table import Values
-from .column_roles import Role, role_of
+from mauvecl.host.spectra.column_roles import Role, role_of
+from mauvecl.host.tables.medium import Medium
+from mauvecl.host.tables.table import Values
 
 
 @dataclass(frozen=True)

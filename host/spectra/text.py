@@ -13,17 +13,16 @@ from functools import partial
 
 import numpy as np
 
+from mauvecl.host.spectra.column_choice import AXES, listed
+from mauvecl.host.spectra.column_roles import Role, divided, is_unit, role_of, words_of
+from mauvecl.host.spectra.header_units import stated_units
+from mauvecl.host.spectra.spectrum_table import SpectrumTable
+from mauvecl.host.tables.medium import medium_of
+from mauvecl.host.tables.table import Values
+from mauvecl.host.tables.text_lines import NumberLines
+from mauvecl.host.tables.text_table import keywords_of
+from mauvecl.host.tables.units import is_stated
 from mauvecl.schema.errors import InputError
-
-from ..tables.medium import medium_of
-from ..tables.table import Values
-from ..tables.text_lines import NumberLines
-from ..tables.text_table import keywords_of
-from ..tables.units import is_stated
-from .column_choice import AXES, listed
-from .column_roles import Role, divided, is_unit, role_of, words_of
-from .header_units import stated_units
-from .spectrum_table import SpectrumTable
 
 #: Units of a text file without stated units (the paper's rule).
 IMPLIED_UNITS = ("nm", "erg / (s cm2 Angstrom)")

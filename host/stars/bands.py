@@ -17,12 +17,12 @@ import numpy as np
 from astropy.constants import c, h
 from numpy.typing import NDArray
 
+from mauvecl.host.array_cache import array_cache
+from mauvecl.host.stars.band_names import known_band
+from mauvecl.host.stars.blackbody import ANGSTROM
+from mauvecl.host.stars.library import band_table, embedded, spectrum_table
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
-
-from ..array_cache import array_cache
-from .band_names import known_band
-from .catalogue import band_table, embedded, spectrum_table
 
 Float = NDArray[np.float64]
 
@@ -31,8 +31,7 @@ System = Literal["catalogue", "vega", "ab"]
 SYSTEMS: tuple[System, ...] = get_args(System)
 #: Fraction of a band's throughput that a spectrum must cover.
 COVERAGE = 0.99
-#: Angstrom per nanometre, and h c in erg Angstrom, with astropy's rounding.
-ANGSTROM = float(u.nm.to(u.AA))
+#: h c in erg Angstrom, with astropy's rounding.
 HC = float(h.cgs.value * c.to_value(u.AA / u.s))
 #: Distance up to which two wavelengths count as one, Angstrom (synphot).
 SAME_WAVELENGTH_A = 1e-12

@@ -7,8 +7,10 @@ import numpy as np
 from astropy.constants import c, h, k_B
 from numpy.typing import NDArray
 
-from ..array_cache import array_cache
-from .bands import ANGSTROM
+from mauvecl.host.array_cache import array_cache
+
+#: Angstrom per nanometre, with astropy's rounding.
+ANGSTROM = float(u.nm.to(u.AA))
 
 
 @array_cache(32)

@@ -15,17 +15,16 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mauvecl.host.content_equality import ContentEquality
+from mauvecl.host.spectra.coverage import check_points
+from mauvecl.host.spectra.formats import read_spectrum
+from mauvecl.host.spectra.wavelength_range import NEEDED_NM
+from mauvecl.host.stars.blackbody import blackbody
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Unit
 from mauvecl.schema.physical import AreaRatio, BalmerJump, LineFraction, Temperature
 from mauvecl.schema.quantities import number
-
-from ..content_equality import ContentEquality
-from ..spectra.coverage import check_points
-from ..spectra.formats import read_spectrum
-from ..spectra.wavelength_range import NEEDED_NM
-from .blackbody import blackbody
 
 Float = NDArray[np.float64]
 Wavelengths = Annotated[Float, Unit("nm")]

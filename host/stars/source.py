@@ -12,14 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.schema.calls import validated
-from mauvecl.schema.drawable import Drawable
-from mauvecl.schema.errors import InputError
-from mauvecl.schema.fields import AnyUnit, Unit
-from mauvecl.schema.physical import Amplitude, BinWidth, Magnitude, Reddening, Temperature
-
-from ..content_equality import ContentEquality
-from ..spectra.coverage import (
+from mauvecl.host.content_equality import ContentEquality
+from mauvecl.host.spectra.coverage import (
     check_flux,
     check_measured,
     check_points,
@@ -30,12 +24,19 @@ from ..spectra.coverage import (
     remarks,
     without_undefined_ends,
 )
-from ..spectra.formats import read_spectrum
-from ..spectra.wavelength_range import SPAN_NM
-from . import bands, catalogue, own_stars
-from .flare import Geometry, with_flare
-from .flare_spectra import Blackbody, FlareSpectrum
-from .model_stars import ModelStar
+from mauvecl.host.spectra.formats import read_spectrum
+from mauvecl.host.spectra.wavelength_range import SPAN_NM
+from mauvecl.host.stars import bands
+from mauvecl.host.stars import library as catalogue
+from mauvecl.host.stars import library as own_stars
+from mauvecl.host.stars.flare import Geometry, with_flare
+from mauvecl.host.stars.flare_spectra import Blackbody, FlareSpectrum
+from mauvecl.host.stars.library import ModelStar
+from mauvecl.schema.calls import validated
+from mauvecl.schema.drawable import Drawable
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import AnyUnit, Unit
+from mauvecl.schema.physical import Amplitude, BinWidth, Magnitude, Reddening, Temperature
 
 if TYPE_CHECKING:
     import astropy.units as u
@@ -124,7 +125,7 @@ class Source(Drawable, ContentEquality):
         `catalogue.library_table` lists the names. For an unknown name the error suggests the nearest ones, and for a
         well-known star without a spectrum that of its type.
         """
-        from .star_names import spectrum_name
+        from mauvecl.host.stars.library import spectrum_name
 
         name = spectrum_name(name, "name")
         model = ModelStar.named(name)

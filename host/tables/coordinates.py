@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from mauvecl.host.tables.names import divided_unit
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
-
-from .names import divided_unit
 
 #: Signs, quotes and blanks of typeset text, which are read as those of a keyboard.
 _TYPESET = str.maketrans("−–—‐‑‒﹣－＋º˚′’ʹ″”ʺ，；：", "--------+°°'''\"\"\",;:", "\u200b\u200e\u200f\ufeff")

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mauvecl.host.files.parsing import as_text, parsing
+from mauvecl.host.files.size_limits import LONGEST_LINE, limit_bytes, read_bytes, unpacked
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
-
-from ..files.parsing import as_text, parsing
-from ..files.size_limits import LONGEST_LINE, limit_bytes, read_bytes, unpacked
 
 if TYPE_CHECKING:
     import numpy as np
@@ -45,7 +44,7 @@ def parse_ecsv(text: str, what: str, expected: str = "an ECSV table") -> Table:
     # These imports are slow and only needed here.
     from astropy.table import Table
 
-    from .times import with_mission_formats
+    from mauvecl.host.tables.times import with_mission_formats
 
     lines = text.splitlines()
     check_header(lines, what)

@@ -12,9 +12,8 @@ from typing import IO, TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.files.parsing import parsing
 from mauvecl.schema.errors import InputError
-
-from ..files.parsing import parsing
 
 if TYPE_CHECKING:
     from astropy.io import fits

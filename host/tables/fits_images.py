@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from mauvecl.host.tables.fits import text_at
 from mauvecl.schema.errors import InputError
-
-from .fits import text_at
 
 #: Names of extensions with images that are not fluxes.
 _NO_FLUX = re.compile(r"err|sig|var|ivar|qual|mask|dq|snr|cont|sky|back|wave|lambda|lam$", re.IGNORECASE)

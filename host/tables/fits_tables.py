@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.host.tables.fits import BLOCK, column_values, reading, text_at
+from mauvecl.host.tables.fits_images import axis_of
+from mauvecl.host.tables.names import matched
+from mauvecl.host.tables.table import PIECE_BYTES, TableFile, Values
 from mauvecl.schema.errors import InputError
-
-from .fits import BLOCK, column_values, reading, text_at
-from .fits_images import axis_of
-from .names import matched
-from .table import PIECE_BYTES, TableFile, Values
 
 if TYPE_CHECKING:
     from astropy.io import fits

@@ -11,13 +11,12 @@ from typing import IO, Any
 
 import numpy as np
 
+from mauvecl.host.files.size_limits import lines_in
+from mauvecl.host.tables.ecsv import MOST_HEADER
+from mauvecl.host.tables.names import matched
+from mauvecl.host.tables.table import MemoryTable, TableFile, Values
+from mauvecl.host.tables.text_table import keywords_of, text_table
 from mauvecl.schema.errors import InputError
-
-from ..files.size_limits import lines_in
-from .ecsv import MOST_HEADER
-from .names import matched
-from .table import MemoryTable, TableFile, Values
-from .text_table import keywords_of, text_table
 
 #: Size of a text from which it is read in pieces, and of a piece, bytes.
 LARGE, PIECE = 16 * 2**20, 2**20

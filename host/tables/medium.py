@@ -9,9 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.tables.fits import text_at
 from mauvecl.schema.errors import InputError
-
-from .fits import text_at
 
 Float = NDArray[np.float64]
 Medium = Literal["air", "vacuum"]

@@ -10,17 +10,16 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Literal
 
+from mauvecl.host.files.parsing import parsing
+from mauvecl.host.files.size_limits import check_size, limit_bytes, open_regular, packed, read_bytes, unpacked
+from mauvecl.host.tables.fits import open_fits, reading
+from mauvecl.host.tables.fits_tables import FitsTables
+from mauvecl.host.tables.large_tables import LARGE, open_large
+from mauvecl.host.tables.names import STARS
+from mauvecl.host.tables.table import MemoryTable, TableFile
+from mauvecl.host.tables.text_table import is_csv, keywords_of, text_of, text_table
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
-
-from ..files.parsing import parsing
-from ..files.size_limits import check_size, limit_bytes, open_regular, packed, read_bytes, unpacked
-from .fits import open_fits, reading
-from .fits_tables import FitsTables
-from .large_tables import LARGE, open_large
-from .names import STARS
-from .table import MemoryTable, TableFile
-from .text_table import is_csv, keywords_of, text_of, text_table
 
 if TYPE_CHECKING:
     from astropy.io.votable.tree import VOTableFile

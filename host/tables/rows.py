@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.host.tables.coordinates import angle, angle_unit, unit_in_name
+from mauvecl.host.tables.missing import is_missing
+from mauvecl.host.tables.names import divided_unit, first_of
+from mauvecl.host.tables.times import time_unit
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import printable, shortened
-
-from .coordinates import angle, angle_unit, unit_in_name
-from .missing import is_missing
-from .names import divided_unit, first_of
-from .times import time_unit
 
 if TYPE_CHECKING:
     from astropy.table import Table

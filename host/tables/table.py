@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.tables.names import divided_unit, matched
+from mauvecl.host.tables.text_table import number_in
+from mauvecl.host.tables.times import time_unit
+from mauvecl.host.tables.units import unit_of
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
-
-from .names import divided_unit, matched
-from .text_table import number_in
-from .times import time_unit
-from .units import unit_of
 
 Float = NDArray[np.float64]
 

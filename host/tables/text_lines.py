@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.files.parsing import parsing, read_text
+from mauvecl.host.tables.missing import is_missing
+from mauvecl.host.tables.table import Values
+from mauvecl.host.tables.text_table import cells_of, number_in
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
-
-from ..files.parsing import parsing, read_text
-from .missing import is_missing
-from .table import Values
-from .text_table import cells_of, number_in
 
 #: Lines above the rows without their marks, and whether each is a comment.
 Header = list[tuple[str, bool]]

@@ -7,12 +7,11 @@ import warnings
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
+from mauvecl.host.files.parsing import parsing
+from mauvecl.host.tables.ecsv import check_cells, parse_ecsv
+from mauvecl.host.tables.missing import SPELT, is_missing
+from mauvecl.host.tables.times import is_dated, time_unit
 from mauvecl.schema.errors import InputError
-
-from ..files.parsing import parsing
-from .ecsv import check_cells, parse_ecsv
-from .missing import SPELT, is_missing
-from .times import is_dated, time_unit
 
 if TYPE_CHECKING:
     from astropy.table import Table

@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.tables.missing import is_missing
+from mauvecl.host.tables.names import divided_unit
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
 from mauvecl.schema.text import shortened
-
-from .missing import is_missing
-from .names import divided_unit
 
 Float = NDArray[np.float64]
 

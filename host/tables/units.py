@@ -7,9 +7,8 @@ import warnings
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
+from mauvecl.host.tables.missing import MISSING_WORDS
 from mauvecl.schema.errors import InputError
-
-from .missing import MISSING_WORDS
 
 if TYPE_CHECKING:
     import astropy.units as u

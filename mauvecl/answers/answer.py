@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from astropy.table import QTable, Table
 
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.assumptions import Use
     from mauvecl.study.cases import Case
     from mauvecl.study.study import Study

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
     from mauvecl.device.device import Device
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.pool import Pool
 
 

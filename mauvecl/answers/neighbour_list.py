@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from mauvecl.host.neighbours import Neighbour, rate_of
+from mauvecl.host.exposure.star import Neighbour, rate_of
 from mauvecl.schema.tables import Column, percent, table_of
 
 if TYPE_CHECKING:

@@ -33,11 +33,11 @@ def question_values(study: Study, *, detects: bool) -> None:
     detects : bool
         Whether the verb needs flares and thresholds.
     """
+    from mauvecl.detection.fap_checks import check_fap
+    from mauvecl.detection.names import check_statistic
     from mauvecl.host.instrument.paths import instrument_path
     from mauvecl.host.stars.band_names import known_band
-    from mauvecl.host.stars.star_names import spectrum_name
-    from mauvecl.results.requests.fap_checks import check_fap
-    from mauvecl.statistics.names import check_statistic
+    from mauvecl.host.stars.library import spectrum_name
 
     for star in study.star:
         if star.library is not None:

@@ -44,7 +44,7 @@ def study_of(
 
 def is_star(given: Path) -> bool:
     """Return whether the argument of the study is a star: a name of the library or a spectrum file."""
-    from mauvecl.host.stars.star_names import resolve
+    from mauvecl.host.stars.library import resolve
 
     text = str(given)
     if given.suffix.lower() == ".toml" or given.is_dir():
@@ -173,7 +173,7 @@ def _is_there(name: str) -> bool:
 def _is_file(name: str) -> bool:
     if _is_there(name):
         return True
-    from mauvecl.host.stars.model_stars import ModelStar
+    from mauvecl.host.stars.library import ModelStar
 
     # "K2.5V" and "power law -1.5" look like file names but are stars.
     if ModelStar.named(name) is not None:

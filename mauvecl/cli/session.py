@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.answer import Answer
     from mauvecl.cli.console import Meter
     from mauvecl.device.device import Device
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.checkpoint import Checkpoint
     from mauvecl.runs.pool import Pool, Workers
     from mauvecl.schema.errors import InputError

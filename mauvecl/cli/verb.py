@@ -9,16 +9,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, get_type_hints
 
 from mauvecl.answers.verbs import OBSERVATION, VERBS
-from mauvecl.cli.flags import (
-    PICTURES,
-    RESUMING,
-    TELLING,
-    WORKERS,
-    SetFlag,
-    StudyFile,
-    output_flag,
-    study_flags,
-)
+from mauvecl.cli.flags import PICTURES, RESUMING, TELLING, WORKERS, SetFlag, StudyFile, output_flag, study_flags
 from mauvecl.cli.question import holds_study, is_star, study_of
 from mauvecl.cli.values import as_text
 

@@ -8,7 +8,7 @@ from typing import Any
 from mauvecl.device import program
 from mauvecl.device.errors import DeviceError
 from mauvecl.device.program import Variant
-from mauvecl.noise.pixel_tables import PIXEL_BLOCK
+from mauvecl.noise.scene import PIXEL_BLOCK
 
 #: Largest number of vectors of realisations per work-item of the detection kernels on a CPU.
 VECTORS = 4

@@ -8,41 +8,50 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.detection.counts import TailSamples, Tally
+from mauvecl.detection.detection import Detection
+from mauvecl.detection.fap_checks import Tails
+from mauvecl.detection.names import DEFAULT_STATISTICS
+from mauvecl.detection.nuisances import Nuisances, as_nuisances
+from mauvecl.detection.requests import (
+    Countable,
+    DetectRequest,
+    Hypotheses,
+    RealiseRequest,
+    Shard,
+    SnrRequest,
+    check_last,
+    plan_channels,
+)
+from mauvecl.detection.snr import (
+    Arrays,
+    Counts,
+    DetectionSums,
+    SnrResult,
+    SnrSums,
+    elements,
+    observers,
+    pack_detection,
+    pack_snr,
+)
+from mauvecl.detection.statistics import Linear
 from mauvecl.device.device import Device
 from mauvecl.device.errors import DeviceError
 from mauvecl.device.program import DeviceRecord, devices
 from mauvecl.device.stare_engine import Stares
 from mauvecl.device.tiles import Progress, Tile, Tiles
 from mauvecl.device.variants import ELEMENT_CHUNK, detection_launches, scene_launches
-from mauvecl.lightcurve.stares.stare_requests import StaresRequest
+from mauvecl.flares.stare_scene import StaresRequest
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.drawing import Drawing, DrawingOptions
 from mauvecl.noise.scene import BATCH, prepare
-from mauvecl.results.counts.tally import TailSamples, Tally
-from mauvecl.results.detection.detection import Detection
-from mauvecl.results.requests.channels import plan_channels
-from mauvecl.results.requests.fap_checks import Tails
-from mauvecl.results.requests.hypotheses import Hypotheses
-from mauvecl.results.requests.requests import (
-    Countable,
-    DetectRequest,
-    RealiseRequest,
-    Shard,
-    SnrRequest,
-    check_last,
-)
-from mauvecl.results.shard_sums import Arrays, DetectionSums, SnrSums, pack_detection, pack_snr
-from mauvecl.results.snr import Counts, SnrResult, elements, observers
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import OneOrMore
 from mauvecl.schema.physical import FirstRealisation, Realisations, Seed
-from mauvecl.statistics.linear import Linear
-from mauvecl.statistics.names import DEFAULT_STATISTICS
-from mauvecl.statistics.nuisances import Nuisances, as_nuisances
 
 if TYPE_CHECKING:
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
 
 __all__ = ["DeviceError", "DeviceRecord", "Engine", "devices"]
 

@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.detection.counts import Grid, Tally
+from mauvecl.detection.snr import Counts
 from mauvecl.device.device import Device
 from mauvecl.device.errors import DeviceError
 from mauvecl.device.program import out_of_memory
 from mauvecl.device.tiles import Tile
 from mauvecl.noise import layout
-from mauvecl.noise.pixel_tables import PIXEL_BLOCK
-from mauvecl.noise.scene import Scene
-from mauvecl.results.counts.tally import Grid, Tally
-from mauvecl.results.snr import Counts
+from mauvecl.noise.scene import PIXEL_BLOCK, Scene
 
 if TYPE_CHECKING:
     from mauvecl.device.program import Variant

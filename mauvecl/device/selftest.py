@@ -10,24 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.detection import reference as numpy_kernels
+from mauvecl.detection.counts import Tally
+from mauvecl.detection.nuisances import as_nuisances
+from mauvecl.detection.requests import STATISTICS, ChannelPlan, Hypotheses, plan_channels
+from mauvecl.detection.snr import Counts, elements, observers
 from mauvecl.device.engine import Engine
 from mauvecl.device.probes import Probes
 from mauvecl.device.program import SAME_BITS
 from mauvecl.device.selftest_outcome import Check
 from mauvecl.device.selftest_stares import stares
 from mauvecl.device.toy_exposure import toy
-from mauvecl.host.expectation import Expectation
+from mauvecl.host.exposure.expectation import Expectation
 from mauvecl.noise import layout, reference
 from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.processes import CosmicRays, Processes, Uniform
 from mauvecl.noise.scene import Scene, prepare
-from mauvecl.results import numpy_kernels
-from mauvecl.results.counts.tally import Tally
-from mauvecl.results.requests.channels import ChannelPlan, plan_channels
-from mauvecl.results.requests.hypotheses import Hypotheses
-from mauvecl.results.snr import Counts, elements, observers
-from mauvecl.statistics.nuisances import as_nuisances
-from mauvecl.statistics.registry import STATISTICS
 
 if TYPE_CHECKING:
     pass

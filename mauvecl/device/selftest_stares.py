@@ -14,11 +14,10 @@ from mauvecl.device.program import SAME_BITS
 from mauvecl.device.selftest_outcome import Check
 from mauvecl.device.stare_engine import Stares
 from mauvecl.device.toy_exposure import toy
-from mauvecl.lightcurve.stares import stare_reference
-from mauvecl.lightcurve.stares.frame_components import Components
-from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.lightcurve.stares.stare_requests import Arrays, StaresRequest
-from mauvecl.lightcurve.stares.stare_scene import Flares, StareScene
+from mauvecl.flares import reference as stare_reference
+from mauvecl.flares.frames import Components
+from mauvecl.flares.stare import Stare
+from mauvecl.flares.stare_scene import Arrays, Flares, StareScene, StaresRequest
 from mauvecl.noise.processes import NONE, CosmicRays, Processes
 
 #: Small stares that run every branch: options of `toy`, unknowns of the stare, number of sums.

@@ -8,16 +8,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.detection.requests import Shard
 from mauvecl.device.device import Device
 from mauvecl.device.stare_launches import StareLaunches
 from mauvecl.device.tiles import Progress, Tile, Tiles
-from mauvecl.lightcurve.stares.frame_components import Components
-from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.lightcurve.stares.stare_requests import Arrays, KeepStatistics, Method, StareNumber, StaresRequest, joined
-from mauvecl.lightcurve.stares.stare_scene import Flares, StareScene, padded_frames
-from mauvecl.lightcurve.stares.sum_cumulants import check_sums
+from mauvecl.flares.frames import Components
+from mauvecl.flares.stare import Stare
+from mauvecl.flares.stare_scene import (
+    Arrays,
+    Flares,
+    KeepStatistics,
+    Method,
+    StareNumber,
+    StareScene,
+    StaresRequest,
+    check_sums,
+    joined,
+    padded_frames,
+)
 from mauvecl.noise.processes import NONE, Processes
-from mauvecl.results.requests.requests import Shard
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import Realisations, Seed
@@ -55,8 +64,8 @@ class Stares:
     >>> import numpy as np
     >>> from mauvecl import Instrument, Source, expect
     >>> from mauvecl.device.stare_engine import Stares
-    >>> from mauvecl.lightcurve.stares.frame_components import Components
-    >>> from mauvecl.lightcurve.stares.stare import Stare
+    >>> from mauvecl.flares.frames import Components
+    >>> from mauvecl.flares.stare import Stare
     >>> star, mauve = Source.from_library("G2V").at_magnitude(7.4), Instrument.load("mauve")
     >>> quiet, flare = (expect(s, mauve, exposure=5.0) for s in (star, star.flaring(1.0)))
     >>> near_uv = (quiet.wavelength_nm < 360).astype(float)

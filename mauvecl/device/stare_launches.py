@@ -13,9 +13,7 @@ from mauvecl.device.device import Device
 from mauvecl.device.launches import Launches, padded
 from mauvecl.device.program import Variant
 from mauvecl.device.tiles import TILE_BYTES, Tile
-from mauvecl.lightcurve.stares.stare_requests import Method
-from mauvecl.lightcurve.stares.stare_scene import Flares, StareScene
-from mauvecl.lightcurve.stares.sum_cumulants import SumTable
+from mauvecl.flares.stare_scene import Flares, Method, StareScene, SumTable
 
 Floats = NDArray[np.float32]
 

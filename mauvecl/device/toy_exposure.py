@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mauvecl.host.expectation import Expectation
+from mauvecl.host.exposure.expectation import Expectation
 
 
 def toy(

@@ -6,12 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from mauvecl.detection.chi2 import Paper
+from mauvecl.detection.requests import ChannelPlan, Hypotheses
 from mauvecl.device.device import VECTORS, Device
 from mauvecl.device.launches import Launches
 from mauvecl.noise.scene import BATCH, Scene
-from mauvecl.results.requests.channels import ChannelPlan
-from mauvecl.results.requests.hypotheses import Hypotheses
-from mauvecl.statistics.paper import Paper
 
 #: Vectors of realisations per work-item with sums other than chi-squared, limited by the number of registers.
 FEW_VECTORS = 2

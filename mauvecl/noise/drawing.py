@@ -1,12 +1,246 @@
-"""User's options for the drawing of realisations."""
+"""Drawing of realisations: the user's options, cumulants of the noise, and tables of drawn factors.
+
+Cumulants of the noise of one draw, and its expansion as a polynomial of one normal deviate.
+
+Gaussian and Poisson noise of a pixel reach the ADC as a sum, whose cumulants are the sums of theirs. The Cornish-Fisher
+expansion (1938, doi 10.2307/1400905; Abramowitz & Stegun 26.2.49) turns a normal deviate into a draw with these
+cumulants. If Gaussian noise smooths the Poisson steps, no realistic number of draws reveals the difference.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypedDict, get_args
+from functools import cache, lru_cache, partial
+from typing import TYPE_CHECKING, Literal, Self, TypedDict, get_args
 
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.noise import layout
+from mauvecl.noise.disturbances import Prior
 from mauvecl.noise.processes import NONE, Processes
+from mauvecl.noise.unknowns import PROCESSES, Conditions
 from mauvecl.schema.errors import InputError
+
+if TYPE_CHECKING:
+    from mauvecl.host.exposure.expectation import Expectation
+
+Float = NDArray[np.float64]
+
+#: Gaussian noise with a standard deviation of this many Poisson steps reduces them to 2 exp(-2 pi^2 1.5^2) = 1e-19.
+SMOOTH_STEPS = 1.5
+#: Up to this skewness, the first omitted terms, which `truncation_distance` includes, dominate the expansion's error.
+MAX_SKEW = 0.04
+#: Estimated number of draws of one pixel after which Pearson's test of whole DN would detect, at five sigma, that they
+#: are not drawn frame by frame and count by count. By exact convolution, the worst allowed case needs 4e13 draws
+#: (tests/kernels/test_joint.py, tests/noise/test_stacks.py). The payload's fastest draws satisfy this at every
+#: temperature and exposure, some with only 5e13 to 1e14.
+DRAWS_TO_NOTICE = 4.2e13
+#: Largest number of harmonics of the rounding error's sawtooth; Gaussian noise of 0.02 DN suppresses all others.
+HARMONICS = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Cumulants:
+    """Cumulants of one draw of a scenario, DN; arrays have the shape (n_pixel,)."""
+
+    mean: Float  # mean, including bias
+    #: Variance of the Gaussian part: read noise, rounding of a stack's frames, and Gaussian photon noise.
+    gaussian: Float
+    photons: Float  # mean electrons of light
+    #: DN per Poisson count; the first is 0 for Gaussian photon noise.
+    photon_step: Float
+    dark_step: Float
+    #: Means of dark and light.
+    dark_dn: Float
+    light_dn: Float
+    light_variance: Float  # variance of the light, Gaussian or Poisson
+
+    @staticmethod
+    def of(x: Expectation, each: int) -> Cumulants:
+        """Compute the cumulants of a draw of `each` frames."""
+        gain = x.gain_dn_per_electron
+        photons = each * x.light_electrons
+        poisson = x.photon_noise == "poisson"
+        # A stack of n rounded frames has a rounding variance of n/12; the rounding of the draw adds the last 1/12.
+        other = each * x.read_noise_dn**2 + (each - 1) / 12
+        return Cumulants(
+            mean=each * x.mean_raw_dn,
+            gaussian=other if poisson else other + gain**2 * photons,
+            photons=photons,
+            photon_step=gain if poisson else np.zeros_like(gain),
+            dark_step=x.dark_step_dn,
+            dark_dn=each * x.dark_dn,
+            light_dn=gain * photons,
+            light_variance=gain**2 * photons,
+        )
+
+    def photon_cumulant(self, order: int) -> Float:
+        """Return a cumulant of the photons, for orders of 3 and above."""
+        return np.asarray(self.photon_step**order * self.photons)
+
+    def dark_cumulant(self, order: int) -> Float:
+        """Return a cumulant of the dark, for orders of 2 and above."""
+        return np.asarray(self.dark_step ** (order - 1) * self.dark_dn)
+
+    @property
+    def dark_variance(self) -> Float:
+        return self.dark_cumulant(2)
+
+    @property
+    def variance(self) -> Float:
+        """Total variance before the draw's own rounding."""
+        return self.gaussian + self.photon_cumulant(2) + self.dark_variance
+
+    def shape(self) -> tuple[Float, Float, Float]:
+        """Return the third, fourth and fifth cumulants divided by powers of the standard deviation."""
+        sd = np.sqrt(self.variance)
+        third, fourth, fifth = (
+            np.divide(self.photon_cumulant(r) + self.dark_cumulant(r), sd**r, out=np.zeros_like(sd), where=sd > 0)
+            for r in (3, 4, 5)
+        )
+        return third, fourth, fifth
+
+    def over_sd(self, last: int) -> list[Float]:
+        """Return standardised cumulants from the third to order `last`, by products, which are faster than powers."""
+        sd = np.sqrt(self.variance)
+        each = np.divide(1.0, sd, out=np.zeros_like(sd), where=sd > 0)
+        light, dark = self.photon_step * each, self.dark_step * each
+        of_light, of_dark = self.photons * light**2, self.dark_dn * each * dark
+        bounds = []
+        for _ in range(3, last + 1):
+            of_light, of_dark = of_light * light, of_dark * dark
+            bounds.append(of_light + of_dark)
+        return bounds
+
+    def scaled(self, light: float | Float, dark: float) -> Cumulants:
+        """Return the cumulants with light and dark multiplied by factors."""
+        gaussian_light = np.where(self.photon_step > 0, 0.0, self.light_variance)
+        return Cumulants(
+            mean=self.mean + (light - 1.0) * self.light_dn + (dark - 1.0) * self.dark_dn,
+            gaussian=self.gaussian + (light - 1.0) * gaussian_light,
+            photons=light * self.photons,
+            photon_step=self.photon_step,
+            dark_step=self.dark_step,
+            dark_dn=dark * self.dark_dn,
+            light_dn=light * self.light_dn,
+            light_variance=light * self.light_variance,
+        )
+
+
+def is_noticeable(distance: Float, variance: Float) -> NDArray[np.bool_]:
+    """Return whether Pearson's test detects the distance sum (p - q)^2 / p within `DRAWS_TO_NOTICE` draws.
+
+    The limit is five standard deviations of chi-squared, whose degrees of freedom are the whole DN within 7.65 standard
+    deviations of the mean, those with a probability above 1e-14.
+    """
+    steps = np.maximum(15.3 * np.sqrt(variance), 1.0)
+    return np.asarray(distance * DRAWS_TO_NOTICE > 5.0 * np.sqrt(2.0 * steps))
+
+
+def truncation_distance(c: Cumulants, *, fourth_power: bool, varying: bool = False) -> Float:
+    """Estimate Pearson's distance between a draw and its polynomial from the next terms, shape (n_pixel,).
+
+    A term a He_k(z) changes the density by a He_(k + 1)(z) times the normal's, and the squares of these integrate to
+    a^2 (k + 1)!. Rounding to whole DN can only reduce the distance.
+
+    Parameters
+    ----------
+    fourth_power : bool
+        Whether the polynomial includes z^4.
+    varying : bool
+        Whether to use the kernels' polynomial for factors on light and dark instead of `polynomial`. Without the fourth
+        power, it has no terms of gamma_5.
+    """
+    return expansion_error(c.over_sd(7), fourth_power=fourth_power, varying=varying)
+
+
+def expansion_error(over_sd: Sequence[Float], *, fourth_power: bool, varying: bool = False) -> Float:
+    """Compute `truncation_distance` from the standardised third to seventh cumulants."""
+    g3, g4, g5, g6, g7 = over_sd
+    g3_3 = g3 * g3 * g3
+    g3_4 = g3_3 * g3
+    # The terms of Abramowitz & Stegun 26.2.49 after those of `polynomial`; their gamma_1 is g3.
+    fifth = g6 / 720 - 3 * g4**2 / 384 - 2 * g3 * g5 / 180 + 14 * g3**2 * g4 / 288 - 252 * g3_4 / 7776
+    third = -6 * g4**2 / 384 - 3 * g3 * g5 / 180 + 37 * g3**2 * g4 / 288 - 832 * g3_4 / 7776
+    first = -2 * g4**2 / 384 + 8 * g3**2 * g4 / 288 - 227 * g3_4 / 7776
+    loss = 720 * fifth**2 + 24 * third**2 + 2 * first**2 + g7**2 / 5040
+    if not fourth_power:
+        second = 19 * g3_3 / 324 - g3 * g4 / 24
+        fourth = g5 / 120 - g3 * g4 / 24 + g3_3 / 27
+        # Without gamma_5, both Hermite terms are missing; `polynomial` lacks only z^4 = He_4 + 6 He_2 + 3.
+        loss = loss + (120 * fourth**2 + 6 * second**2 if varying else 345 * fourth**2)
+    return np.asarray(loss)
+
+
+def joint_is_exact(c: Cumulants) -> NDArray[np.bool_]:
+    """Return the pixels whose noise can be drawn from one normal, shape (n_pixel,)."""
+    step = np.maximum(np.where(c.dark_dn > 0, c.dark_step, 0.0), np.where(c.photons > 0, c.photon_step, 0.0))
+    smooth = np.sqrt(c.gaussian) >= SMOOTH_STEPS * step
+    return np.asarray(
+        smooth & (c.over_sd(3)[0] <= MAX_SKEW) & ~is_noticeable(truncation_distance(c, fourth_power=True), c.variance)
+    )
+
+
+def needs_fourth_power(c: Cumulants, *, varying: bool = False) -> bool:
+    """Return whether omitting the fourth power of the polynomial is noticeable; see `truncation_distance`."""
+    return bool(is_noticeable(truncation_distance(c, fourth_power=False, varying=varying), c.variance).any())
+
+
+def stack_is_exact(c: Cumulants, x: Expectation) -> NDArray[np.bool_]:
+    """Return the pixels whose frames can be drawn as one stack, shape (n_pixel,).
+
+    Parameters
+    ----------
+    c : Cumulants
+        Cumulants of ONE frame.
+
+    Notes
+    -----
+    A stack treats each frame's rounding error as noise of mean 0 and variance 1/12 that is Gaussian in the sum. The
+    error is a sawtooth, the sum over k of sin(2 pi k x) / (pi k), which depends on the frame's noise through its
+    characteristic function at 2 pi k (Widrow, Kollar & Liu 1996, doi 10.1109/19.492748): its modulus f_k and the slope
+    l_k of its logarithm. Given the sum of N frames of variance v, the conditional mean of a frame's sine is at most
+    f_k exp(u_k / 2) with u_k = l_k^2 / (N v), which changes the density of the sum by Pearson's distance below. Counts
+    of whole DN do not smooth the rounding. The sum of N uniform errors has the fourth cumulant -N / 120.
+
+    Poisson counts whose steps are visible in the sum are ignored: given the counts, only the remaining noise smooths
+    the rounding, and a mixture is never easier to distinguish than its components.
+    """
+    n = x.n_frames
+    blur = np.sqrt(n * (c.gaussian + 1 / 12))
+    dark = np.divide(c.dark_dn, c.dark_step, out=np.zeros_like(c.dark_dn), where=c.dark_dn > 0)
+    steps = np.stack([c.photon_step, c.dark_step])
+    counts = np.where(blur >= SMOOTH_STEPS * steps, np.stack([c.photons, dark]), 0.0)
+    frame = c.gaussian + (counts * steps**2).sum(axis=0) + 1 / 12
+    # The factors of two, here and below, account for the Poisson counts' skewness and the square of the sawtooth.
+    loss = 2 * ((n - 1) / (120 * n**2 * frame**2)) ** 2 / 24
+    quietest = float(np.sqrt(c.gaussian.min()))
+    last = HARMONICS if HARMONICS * quietest < 1.5 else int(np.ceil(1.5 / quietest))
+    for k in range(1, last + 1):
+        turned = np.abs(np.sin(np.pi * k * steps))
+        size = 2 * np.pi**2 * k**2 * c.gaussian + 2 * (counts * turned**2).sum(axis=0)
+        slope = 2 * np.pi * k * c.gaussian + 2 * (counts * steps * turned).sum(axis=0)
+        ripple = slope**2 / (n * frame)
+        loss += 2 * n / (np.pi**2 * k**2 * frame) * (1 + ripple) * np.exp(np.minimum(ripple - 2 * size, 0.0))
+    # Bound on the harmonics beyond `last`, from the Gaussian noise.
+    loss += n / frame * np.exp(-4 * np.pi**2 * last**2 * c.gaussian)
+    return ~is_noticeable(loss, n * frame)
+
+
+def polynomial(c: Cumulants) -> tuple[Float, Float, Float, Float, Float]:
+    """Return the coefficients of z^0 to z^4 of a draw minus its mean, DN, each shape (n_pixel,)."""
+    g1, g2, g3 = c.shape()
+    sd = np.sqrt(c.variance)
+    return (
+        sd * (-g1 / 6 + g3 / 40 - g1 * g2 / 12 + 17 * g1**3 / 324),
+        sd * (1 - g2 / 8 + 5 * g1**2 / 36),
+        sd * (g1 / 6 - g3 / 20 + 5 * g1 * g2 / 24 - 53 * g1**3 / 324),
+        sd * (g2 / 24 - g1**2 / 18),
+        sd * (g3 / 120 - g1 * g2 / 24 + g1**3 / 27),
+    )
+
 
 Mode = Literal["auto", "frames", "stacked"]
 Recipe = Literal["auto", "joint", "apart"]
@@ -54,3 +288,281 @@ class Drawing:
 
 #: Options that follow from the noise.
 AUTOMATIC = Drawing()
+
+
+@cache
+def nodes() -> Float:
+    """Return the probabilities of the table's nodes from an end of a prior to its median.
+
+    Returns
+    -------
+    ndarray, shape (layout.PRIOR_NODES,)
+        Octaves from 2**-56 to 1/2 with 2**PRIOR_BITS cells each; the last node is repeated for words that float32
+        rounds up.
+    """
+    cells = 2**layout.PRIOR_BITS
+    number = np.arange(layout.PRIOR_NODES - 1)
+    probability = np.ldexp(1.0 + (number % cells) / cells, number // cells - layout.PRIOR_FINEST)
+    probability = np.append(probability, probability[-1])
+    probability.flags.writeable = False
+    return probability
+
+
+@lru_cache(32)
+def _quantiles(prior: Prior) -> tuple[Float, Float]:
+    """Return a prior's values at the nodes from the low end, then from the high end, and its median."""
+    tail = nodes()
+    values = np.append(prior.quantile(tail, 1.0 - tail), prior.quantile(1.0 - tail, tail))
+    values.flags.writeable = False
+    return values, prior.quantile(np.array([0.5]))
+
+
+def table_of(prior: Prior, change: Callable[[Float], Float]) -> tuple[NDArray[np.float32], float]:
+    """Compute the quantile table of a prior.
+
+    Parameters
+    ----------
+    change : callable
+        Function that converts the prior's values to a factor minus one.
+
+    Returns
+    -------
+    table : ndarray of float32, shape (2 * PRIOR_NODES,)
+        Factors at `nodes` from the low end, then from the high end, divided by the factor at the median, minus one.
+        In this form float32 resolves priors of any width and location.
+    centre : float
+        Factor at the median, minus one.
+    """
+    at_nodes, median = _quantiles(prior)
+    values, centre = change(at_nodes), float(change(median)[0])
+    return ((values - centre) / (1.0 + centre)).astype(np.float32), centre
+
+
+@dataclass(frozen=True, eq=False)
+class Factors:
+    """Factors of priors on light, dark and sky; factors on light include the sky's light."""
+
+    #: Shape (n_modulation, 2 * layout.PRIOR_NODES); quantile tables; see `prior_tables.table_of`.
+    tables: NDArray[np.float32]
+    #: Factors at the priors' medians, to which the tables are relative.
+    light: float
+    dark: float
+    sky: float
+    #: Smallest and largest factors of all priors together.
+    light_ends: tuple[float, float]
+    dark_ends: tuple[float, float]
+    sky_ends: tuple[float, float]
+
+    @classmethod
+    def of(cls, processes: Processes, conditions: Conditions) -> Self:
+        """Compute the quantile tables of the priors' factors.
+
+        Parameters
+        ----------
+        conditions : mapping of float
+            Values of the expectation: ``temperature_c``, ``dark_slope_per_c``, ``light_loss``, ``pointing_loss``.
+        """
+        tables = np.empty((len(processes.modulations), 2 * layout.PRIOR_NODES), np.float32)
+        ends = {"light": (1.0, 1.0), "dark": (1.0, 1.0), "sky": (1.0, 1.0)}
+        centre = dict.fromkeys(ends, 1.0)
+        for row, (name, factor) in enumerate(processes.modulations):
+            prior, varied = getattr(processes, name), PROCESSES[name]
+            change = partial(varied.change, conditions)
+            first, last = prior.quantile(np.array([0.0, 1.0]))
+            if not (varied.low <= first and last <= varied.high):
+                raise InputError.of(
+                    name, [float(first), float(last)], f"a prior within {varied.low:g} to {varied.high:g}"
+                )
+            tables[row], middle = table_of(prior, change)
+            centre[factor] *= 1.0 + middle
+            least, most = sorted(1.0 + change(np.array([first, last])))
+            ends[factor] = ends[factor][0] * float(least), ends[factor][1] * float(most)
+        return cls(tables, centre["light"], centre["dark"], centre["sky"], ends["light"], ends["dark"], ends["sky"])
+
+    @staticmethod
+    def on_light(light: float, sky: float, share: Float) -> Float:
+        """Return the factor on each pixel's total light, of which the sky has this share, shape (n_pixel,)."""
+        return np.asarray(light * (1.0 + (sky - 1.0) * share))
+
+
+#: Frames are drawn one by one if a pixel's mean is within this many standard deviations of a rail.
+RAIL_SIGMA = 8.0
+#: The device does not round counts correctly beyond this distance from their base.
+REACH_DN = 2.0**22
+#: Limit of the counter's 24 bits for groups of four pixels.
+MAX_PIXELS = 65_536
+
+
+@dataclass(frozen=True, eq=False)
+class DrawMethod:
+    """Method by which scenarios are drawn; see `Scene` for the switches."""
+
+    frames: bool
+    joint: bool
+    quartic: bool
+    photons: bool
+    each: int  # frames per draw
+    cumulants: list[Cumulants]  # of one draw of each scenario
+
+
+def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: Factors) -> DrawMethod:
+    """Choose the method for scenarios. Raises InputError if they cannot be drawn as requested, or not together."""
+    quiet, processes = scenarios[0], drawing.processes
+    modulations = processes.modulations
+    if quiet.wavelength_nm.size > MAX_PIXELS:
+        raise InputError(
+            f"{quiet.wavelength_nm.size} pixels", f"at most {MAX_PIXELS}", key="pixels", value=quiet.wavelength_nm.size
+        )
+    for other in scenarios[1:]:
+        _check_same_detector(quiet, other)
+    corners = _corners(factors)
+    frames = _draw_frames(scenarios, drawing.mode, factors, processes, corners)
+    each = 1 if frames else quiet.n_frames
+    cumulants = [Cumulants.of(x, each) for x in scenarios]
+    varied = [[_scaled(x, c, corner) for corner in corners] for x, c in zip(scenarios, cumulants, strict=True)]
+    joint = _joint(scenarios, varied, drawing.recipe)
+    if modulations and not joint:
+        raise InputError(
+            f"{modulations[0][0]} varies within a run, and the noise of {quiet.name} cannot be drawn jointly",
+            "Gaussian noise of at least 1.5 Poisson counts in each pixel and more for few counts, or no such process",
+            key=modulations[0][0],
+        )
+    return DrawMethod(
+        frames=frames,
+        joint=joint,
+        quartic=joint and any(needs_fourth_power(c, varying=bool(modulations)) for row in varied for c in row),
+        photons=not joint and quiet.photon_noise == "poisson",
+        each=each,
+        cumulants=cumulants,
+    )
+
+
+def near_rail(x: Expectation, factors: Factors, processes: Processes) -> NDArray[np.bool_]:
+    """Return the pixels whose frames come within `RAIL_SIGMA` of zero or saturation, shape (n_pixel,).
+
+    The limits include all values allowed by the priors and the largest charge of additive processes per frame.
+    """
+    variance, light = x.unsaturated_variance_dn2 / x.n_frames, x.light_dn / x.n_frames
+    mean = x.mean_raw_dn
+    ends = []
+    for end_light, more_dark, sky in zip(factors.light_ends, factors.dark_ends, factors.sky_ends, strict=True):
+        more_light = factors.on_light(end_light, sky, sky_share(x))
+        there = mean + (more_light - 1.0) * light + (more_dark - 1.0) * x.dark_dn
+        more = (more_light - 1.0) * x.gain_dn_per_electron * light + (more_dark - 1.0) * x.dark_variance_dn2
+        ends.append((there, RAIL_SIGMA * np.sqrt(variance + np.maximum(more, 0.0))))
+    added = x.gain_dn_per_electron * sum(one.most_electrons(x.frame_s) for one in processes.additive.values())
+    low: NDArray[np.bool_] = ends[0][0] - ends[0][1] < 0.0
+    high: NDArray[np.bool_] = ends[1][0] + ends[1][1] + added > x.highest_dn
+    return low | high
+
+
+def _corners(factors: Factors) -> list[tuple[float, float, float]]:
+    """Return a grid of factors on light, dark and sky that spans the priors in steps of at most 2."""
+    ends = (factors.light_ends, factors.dark_ends, factors.sky_ends)
+    grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in ends]
+    return [(float(light), float(dark), float(sky)) for light in grids[0] for dark in grids[1] for sky in grids[2]]
+
+
+def _scaled(x: Expectation, c: Cumulants, corner: tuple[float, float, float]) -> Cumulants:
+    light, dark, sky = corner
+    return c.scaled(light if sky == 1.0 else Factors.on_light(light, sky, sky_share(x)), dark)
+
+
+def _joint(scenarios: Sequence[Expectation], varied: Sequence[Sequence[Cumulants]], recipe: Recipe) -> bool:
+    """Return whether each pixel's noise can be drawn from one normal for all factors on light and dark."""
+    if recipe == "apart":
+        return False
+    for x, c in ((x, c) for x, row in zip(scenarios, varied, strict=True) for c in row):
+        exact = joint_is_exact(c)
+        if not exact.all():
+            if recipe == "joint":
+                pixel = int(np.argmin(exact))
+                raise InputError(
+                    f"recipe = 'joint', and pixel {pixel} of {x.name} has {np.sqrt(c.gaussian[pixel]):.3g} DN of "
+                    "Gaussian noise next to Poisson counts",
+                    "recipe 'apart' or 'auto'",
+                    key="recipe",
+                    value="joint",
+                )
+            return False
+    return True
+
+
+def _draw_frames(
+    scenarios: Sequence[Expectation],
+    mode: Mode,
+    factors: Factors,
+    processes: Processes,
+    corners: Sequence[tuple[float, float, float]],
+) -> bool:
+    if scenarios[0].n_frames == 1 or mode == "frames":
+        # For a single frame, both modes give the same draws.
+        return mode == "frames" and scenarios[0].n_frames > 1
+    for x in scenarios:
+        near = near_rail(x, factors, processes)
+        # The approximation of rounding as noise is worst for the least light and dark.
+        coarse = ~stack_is_exact(_scaled(x, Cumulants.of(x, 1), corners[0]), x)
+        for pixels, why in (
+            (near, f"cannot clip, and a frame comes within {RAIL_SIGMA:g} sigma of zero or saturation"),
+            (coarse, "treats rounding as noise, and a frame has too little noise for that"),
+        ):
+            if pixels.any():
+                if mode == "stacked":
+                    where = float(x.wavelength_nm[pixels][0])
+                    raise InputError(
+                        f"mode = 'stacked' {why} in the pixel at {where:.1f} nm of {x.name}",
+                        "mode 'frames' or 'auto'",
+                        key="mode",
+                        value="stacked",
+                    )
+                return True
+    return False
+
+
+def check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
+    """Raise InputError if the priors allow counts beyond the range in which the device rounds correctly."""
+    share = sky_share(x)
+    least, most = (factors.on_light(*ends, share) for ends in zip(factors.light_ends, factors.sky_ends, strict=True))
+    middle = factors.on_light(factors.light, factors.sky, share)
+    light = np.maximum(most - middle, middle - least)
+    dark = max(factors.dark_ends[1] - factors.dark, factors.dark - factors.dark_ends[0])
+    variance = c.variance + most * c.light_variance + factors.dark_ends[1] * c.dark_variance
+    reach = light * c.light_dn + dark * c.dark_dn + 8.0 * np.sqrt(variance)
+    if (reach >= REACH_DN).any():
+        pixel = int(np.argmax(reach))
+        raise InputError(
+            f"the priors move pixel {pixel} of {x.name} {reach[pixel]:.3g} DN away from its mean",
+            f"less than {REACH_DN:g}: shorten the exposure or draw frame by frame",
+            key="priors",
+            value=float(reach[pixel]),
+        )
+
+
+def _check_same_detector(quiet: Expectation, other: Expectation) -> None:
+    for name in (
+        "wavelength_nm",
+        "dark_dn",
+        "bias_dn",
+        "read_noise_dn",
+        "gain_dn_per_electron",
+        "element",
+        "n_frames",
+        "frame_s",
+        "dark_unit",
+        "photon_noise",
+        "adc_max_dn",
+        "saturation_dn",
+    ):
+        if not np.array_equal(getattr(quiet, name), getattr(other, name)):
+            raise InputError(
+                f"{name} of {other.name} differs from that of {quiet.name}",
+                "scenarios of one study to share instrument and exposure",
+                key=name,
+                value=other.name,
+            )
+
+
+def sky_share(x: Expectation) -> Float:
+    """Return the sky's share of each pixel's light, shape (n_pixel,); zero without light."""
+    light = x.light_electrons
+    return np.divide(x.sky_electrons, light, out=np.zeros_like(light), where=light > 0)

@@ -9,9 +9,7 @@ from typing import Any, Self
 
 from pydantic import create_model
 
-from mauvecl.noise.additive import AdditiveProcess
-from mauvecl.noise.cosmic_rays import CosmicRays, ParticleRate
-from mauvecl.noise.priors import Normal, Prior, PriorField, Uniform
+from mauvecl.noise.disturbances import AdditiveProcess, CosmicRays, Normal, ParticleRate, Prior, PriorField, Uniform
 from mauvecl.noise.unknowns import ADDITIVE, PROCESSES, SignalPart
 from mauvecl.schema.calls import validated
 from mauvecl.schema.section import Section

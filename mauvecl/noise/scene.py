@@ -2,28 +2,298 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
-from mauvecl.noise import layout, pixel_tables
+from mauvecl.noise import layout
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
-from mauvecl.noise.cumulants import polynomial
-from mauvecl.noise.draw_method import DrawMethod, check_reach, choose_method
-from mauvecl.noise.drawing import Drawing, DrawingOptions
-from mauvecl.noise.factor_tables import Factors
-from mauvecl.noise.poisson import AliasTable, table_of
+from mauvecl.noise.drawing import (
+    Cumulants,
+    Drawing,
+    DrawingOptions,
+    DrawMethod,
+    Factors,
+    check_reach,
+    choose_method,
+    nodes,
+    polynomial,
+    sky_share,
+)
+from mauvecl.noise.layout import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, table_of, table_set
 from mauvecl.noise.unknowns import ADDITIVE, SignalPart
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.noise.processes import Processes
+
+Float = NDArray[np.float64]
+
+#: Number of nodes of the trapezoidal rule over a prior's normal score, and its range. The rule converges exponentially
+#: for functions that are smooth over a step (Trefethen & Weideman 2014, doi 10.1137/130932132).
+NODES, REACH = 281, 7.0
+SCORE = np.linspace(-REACH, REACH, NODES)
+WEIGHTS = np.exp(-(SCORE**2) / 2) / np.exp(-(SCORE**2) / 2).sum()
+#: Sums of squares use every tenth node, since they are wide; weighted sums may be much narrower than a prior.
+COARSE = 10
+#: Nodes of the Gauss-Hermite rule for factors after the first.
+FEW = 7
+#: A factor is treated as a normal amplitude of a known spectrum if one standard deviation changes no pixel's variance
+#: by more than this fraction (for weighted sums, and for sums of squares), and its values deviate from a linear
+#: function of the score by less than `STRAIGHT` standard deviations, root mean square.
+VARIANCE_FRACTION = {True: 1e-2, False: 1e-3}
+STRAIGHT = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class FactorDistribution:
+    """Distribution of a factor as quadrature nodes."""
+
+    values: Float  # shape (n,)
+    weights: Float  # shape (n,), sum one
+
+    @property
+    def mean(self) -> float:
+        return float(self.weights @ self.values)
+
+    @property
+    def sd(self) -> float:
+        return float(np.sqrt(self.weights @ (self.values - self.mean) ** 2))
+
+    @property
+    def normal(self) -> bool:
+        """Whether the factor is a linear function of a normal score."""
+        if self.values.size == 1:
+            return True
+        off = self.values - self.mean - self.sd * SCORE
+        return float(np.sqrt(self.weights @ off**2)) <= STRAIGHT * self.sd
+
+
+UNIT_FACTOR = FactorDistribution(np.ones(1), np.ones(1))
+
+
+@dataclass(frozen=True)
+class Node:
+    """Quadrature node: a set of factors on dark, light and sky."""
+
+    probability: float
+    dark: float
+    light: float
+    sky: float
+    scores: dict[str, float]  # normal score of each factor
+
+    @property
+    def amounts(self) -> tuple[float, float, float]:
+        """Amounts of the changes of `changes_of`."""
+        return self.light - 1.0, self.light * (self.sky - 1.0), self.dark - 1.0
+
+
+def changes_of(x: Expectation) -> tuple[Float, Float]:
+    """Return changes by factors of an exposure's means (DN) and variances (DN^2), each shape (3, n_pixel).
+
+    Rows are for all light, which includes the sky's, for the sky's alone, and for the dark current, each for an amount
+    of one. A pixel that saturates records a change only in those frames that are not clipped, and its variance changes
+    by the same fraction as without saturation, so that no factor makes it negative.
+    """
+    light, dark = np.array([x.light_dn, x.sky_dn]), x.n_frames * x.dark_dn
+    variances = np.array([*(x.gain_dn_per_electron * light), x.n_frames * x.dark_variance_dn2])
+    means = np.array([*light, dark]) * (1 - x.cut_share)
+    return means, variances * (x.variance_dn2 / x.unsaturated_variance_dn2)
+
+
+@dataclass(frozen=True, eq=False)
+class FactorDistributions:
+    """Distributions of the drawn factors on light, dark and sky, averaged over an exposure."""
+
+    spreads: Mapping[str, FactorDistribution]
+
+    @classmethod
+    def of(cls, scene: Scene) -> FactorDistributions | None:
+        """Return the distributions of a scene, or None if it draws no factors."""
+        return cls._of(scene.modulations, scene.priors, scene.medians, scene.n_frames)
+
+    @classmethod
+    def from_processes(cls, processes: Processes, quiet: Expectation) -> FactorDistributions | None:
+        """Return the distributions of processes for a star, or None if they draw no factors."""
+        if not processes.modulations:
+            return None
+        factors = Factors.of(processes, quiet.conditions)
+        medians = factors.light, factors.dark, factors.sky
+        return cls._of(processes.modulations, factors.tables, medians, quiet.n_frames)
+
+    @classmethod
+    def _of(
+        cls,
+        modulations: Sequence[tuple[str, SignalPart]],
+        tables: NDArray[np.float32],
+        medians: tuple[float, float, float],
+        n_frames: int,
+    ) -> FactorDistributions | None:
+        spreads: dict[str, list[FactorDistribution]] = {}
+        for (name, factor), table in zip(modulations, tables, strict=True):
+            one = _of_table(table)
+            if name == "jitter" and n_frames > 1:
+                one = _normal(one.mean, one.sd / np.sqrt(n_frames))
+            spreads.setdefault(factor, []).append(one)
+        median = dict(zip(("light", "dark", "sky"), medians, strict=True))
+        return cls({name: _product(ones, median[name]) for name, ones in spreads.items()}) if spreads else None
+
+    def nodes(self, x: Expectation, *, weighted: bool) -> tuple[list[Node], Float]:
+        """Return the nodes over which a statistic of an exposure is integrated.
+
+        Parameters
+        ----------
+        weighted : bool
+            Whether the statistic is a weighted sum instead of a sum of squares.
+
+        Returns
+        -------
+        nodes : list of Node
+        rows : ndarray, shape (k, n_pixel)
+            Spectra of factors treated as normal amplitudes, DN per standard deviation.
+        """
+        light, sky, dark = zip(*changes_of(x), strict=True)
+        moved = {"dark": dark, "light": light, "sky": sky}
+        grids, rows = [], []
+        every, few = 1 if weighted else COARSE, np.polynomial.hermite_e.hermegauss(FEW)
+        score, weight = SCORE[::every], WEIGHTS[::every] / WEIGHTS[::every].sum()
+        for name, (part, variance) in moved.items():
+            spread = self.spreads.get(name, UNIT_FACTOR)
+            if spread.normal and (spread.sd * variance <= VARIANCE_FRACTION[weighted] * x.variance_dn2).all():
+                if spread.sd:
+                    rows.append(spread.sd * part)
+                grids.append([(1.0, spread.mean, 0.0)])
+                continue
+            values = np.interp(score, SCORE, spread.values)
+            grids.append(list(zip(weight.tolist(), values.tolist(), score.tolist(), strict=True)))
+            score, weight = few[0], few[1] / few[1].sum()
+        nodes = []
+        for chosen in product(*grids):
+            weights, (dark, light, sky), scores = zip(*chosen, strict=True)
+            nodes.append(Node(math.prod(weights), dark, light, sky, dict(zip(moved, scores, strict=True))))
+        return nodes, np.array(rows).reshape(len(rows), x.variance_dn2.size)
+
+
+def _normal(mean: float, sd: float) -> FactorDistribution:
+    return FactorDistribution(mean + sd * SCORE, WEIGHTS)
+
+
+def _of_table(table: NDArray[np.float32]) -> FactorDistribution:
+    """Return the distribution given by a device's quantile table, relative to the factor at the median."""
+    return FactorDistribution(1.0 + quantile_at_score(table, SCORE), WEIGHTS)
+
+
+def quantile_at_score(table: NDArray[np.float32], score: Float) -> Float:
+    """Interpolate a device's quantile table at standard normal scores; the result has the shape of `score`."""
+    below, above = special.ndtr(score), special.ndtr(-score)
+    tail, (low, high) = nodes(), np.split(table.astype(np.float64), 2)
+    return np.asarray(np.where(below < 0.5, np.interp(below, tail, low), np.interp(above, tail, high)))
+
+
+def _product(ones: list[FactorDistribution], median: float) -> FactorDistribution:
+    """Return the distribution of a product of independent factors, which is normal if there are several."""
+    if len(ones) == 1:
+        return FactorDistribution(median * ones[0].values, ones[0].weights)
+    mean = np.prod([one.mean for one in ones])
+    square = np.prod([one.mean**2 + one.sd**2 for one in ones])
+    return _normal(float(median * mean), float(median * np.sqrt(square - mean**2)))
+
+
+#: Pixels are padded to a multiple of this with pixels that do not contribute.
+PIXEL_BLOCK = 32
+#: Variance, DN^2, that replaces zero.
+NO_VARIANCE = 1e-12
+
+
+def padded(n_pixel: int) -> int:
+    """Return the number of pixels including padding."""
+    return -(-n_pixel // PIXEL_BLOCK) * PIXEL_BLOCK
+
+
+def element_ends(x: Expectation) -> NDArray[np.bool_]:
+    """Return which pixels are the last of a resolution element, shape (n_pixel,)."""
+    return np.append(np.diff(x.element) > 0, True)
+
+
+def detector_pixels(quiet: Expectation, used: NDArray[np.bool_]) -> NDArray[np.void]:
+    """Return the properties that all scenarios share: layout.PIXEL, shape (n_padded,)."""
+    n_pixel = used.size
+    pixels = np.zeros(padded(n_pixel), layout.PIXEL)
+    pixels["used"][:n_pixel] = used
+    pixels["element_end"][:n_pixel] = element_ends(quiet)
+    # Groups of four used pixels in one element are summed without tests of single pixels.
+    uneven = (pixels["element_end"] > 0) | (pixels["used"] == 0)
+    pixels["four_uneven"] = np.repeat(uneven.reshape(-1, 4).any(axis=1), 4)
+    pixels["electron_gain"][:n_pixel] = quiet.gain_dn_per_electron
+    return pixels
+
+
+def fill_poisson_counts(out: NDArray[np.void], mean: Float, gain: Float, tables: list[AliasTable]) -> Float:
+    """Fill `out` for draws of Poisson counts; return the integers to which counts are relative, shape (n_pixel,)."""
+    centre = np.rint(mean)
+    # A pair of pixels shares two words. A table uses one and the expansion both, so a pair must use the same method.
+    expanded = _both_of_a_pair(mean >= SMALLEST_EXPANDED)
+    if (mean[~expanded] > LARGEST_MEAN).any():
+        pixel = int(np.argmax(np.where(expanded, 0.0, mean)))
+        raise InputError(
+            f"pixel {pixel} has a Poisson mean of {mean[pixel]:.3g} in one draw next to a pixel of less than "
+            f"{SMALLEST_EXPANDED:g}",
+            f"at most {LARGEST_MEAN:g} there: draw frame by frame",
+            key="mode",
+            value=float(mean[pixel]),
+        )
+    alias, starts = table_set(mean[~expanded].tolist(), tables)
+    out["table"][~expanded] = starts
+    out["bits"][~expanded] = [t.bits for t in alias]
+    out["low"][~expanded] = np.array([t.low for t in alias]) - centre[~expanded]
+    root = np.sqrt(mean[expanded])
+    out["offset"][expanded] = (mean - centre)[expanded] - 1 / 6
+    out["slope"][expanded] = root - 1 / (36 * root)
+    out["cubic"][expanded] = -1 / (72 * root)
+    out["gain"] = gain
+    return centre
+
+
+def _both_of_a_pair(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return pixels 2i and 2i + 1 if both are chosen; a last pixel without a neighbour is decided alone."""
+    pairs = np.append(chosen, chosen[-1:]) if chosen.size % 2 else chosen
+    return np.repeat(pairs.reshape(-1, 2).all(axis=1), 2)[: chosen.size]
+
+
+def fill_estimates(out: NDArray[np.void], reference: Expectation, fraction: Float, mean_sum: Float) -> None:
+    """Fill `out` for variances estimated by an observer who knows the detector; padding has a variance of 1."""
+    n_pixel, known = reference.wavelength_nm.size, reference.read_noise_dn**2 + reference.dark_variance_dn2 + 1 / 12
+    out["variance"] = 1.0
+    out["fraction"] = fraction
+    out["net_offset"][:n_pixel] = mean_sum - reference.n_frames * (reference.bias_dn + reference.dark_dn)
+    out["gain"][:n_pixel] = reference.gain_dn_per_electron
+    out["variance"][:n_pixel] = np.maximum(reference.n_frames * known, NO_VARIANCE)
+
+
+def fill_responses(out: NDArray[np.void], x: Expectation, c: Cumulants, factors: Factors) -> None:
+    """Fill `out` with a draw's response to factors on light, dark and sky, relative to the priors' medians."""
+    share, dark = sky_share(x), factors.dark
+    light = factors.on_light(factors.light, factors.sky, share)
+    # The sky's light follows both factors.
+    out["sky_share"] = factors.light * factors.sky * share / light
+    out["light"], out["dark"] = light * c.light_dn, dark * c.dark_dn
+    out["light_variance"], out["dark_variance"] = light * c.light_variance, dark * c.dark_variance
+    # A lower limit avoids 0 / 0 in pixels without noise.
+    out["other_variance"] = np.maximum(c.variance - c.light_variance - c.dark_variance, NO_VARIANCE)
+    for order, name in ((3, "third"), (4, "fourth"), (5, "fifth")):
+        out[f"light_{name}"] = light * c.photon_cumulant(order)
+        out[f"dark_{name}"] = dark * c.dark_cumulant(order)
+
 
 #: Largest number of scenarios per launch for stacks, and frame by frame (True), which needs more registers.
 BATCH = {False: 16, True: 8}
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,11 +406,11 @@ def prepare(
     used = ~np.any([scenarios[t].saturated for t in np.unique(compared)], axis=0)
     n_pixel, tables = used.size, list[AliasTable]()
 
-    darks, dark_centre = np.zeros(pixel_tables.padded(n_pixel), layout.POISSON), np.zeros(n_pixel)
+    darks, dark_centre = np.zeros(padded(n_pixel), layout.POISSON), np.zeros(n_pixel)
     if not method.joint:
         step = quiet.dark_step_dn
         dark_dn = method.each * quiet.dark_dn
-        dark_centre = pixel_tables.fill_poisson_counts(darks[:n_pixel], dark_dn / step, step, tables)
+        dark_centre = fill_poisson_counts(darks[:n_pixel], dark_dn / step, step, tables)
     arrays = _PerScenario.empty(scenarios, method, comparison, modulated=bool(drawing.processes.modulations))
     for k, x in enumerate(scenarios):
         arrays.fill_draw(k, x, method, factors, quiet.dark_step_dn * dark_centre, tables)
@@ -156,7 +426,7 @@ def prepare(
         clip=method.each == 1,
         modulations=drawing.processes.modulations,
         job=job,
-        pixels=pixel_tables.detector_pixels(quiet, used),
+        pixels=detector_pixels(quiet, used),
         dark_counts=darks,
         tables=np.concatenate([np.zeros(0, np.uint32), *(t.entries for t in tables)]).astype(np.uint32),
         priors=factors.tables,
@@ -186,7 +456,7 @@ class _PerScenario:
     ) -> _PerScenario:
         """Return arrays filled with the values of padding."""
         n_pixel = scenarios[0].wavelength_nm.size
-        shape = (len(scenarios), pixel_tables.padded(n_pixel))
+        shape = (len(scenarios), padded(n_pixel))
         arrays = cls(
             levels=np.zeros(shape, layout.LEVEL),
             edges=np.zeros(shape, layout.EDGE),
@@ -196,7 +466,7 @@ class _PerScenario:
             estimates=np.zeros(shape if comparison.estimated else 0, layout.ESTIMATE),
             base_dn=np.zeros((len(scenarios), n_pixel), np.int64),
         )
-        arrays.responses["other_variance"] = pixel_tables.NO_VARIANCE
+        arrays.responses["other_variance"] = NO_VARIANCE
         for name, array in (("shift", arrays.levels), ("low", arrays.edges), ("high", arrays.edges)):
             array[name] = layout.MAGIC
         return arrays
@@ -209,7 +479,7 @@ class _PerScenario:
         mean = self._mean(k, x, method, factors, dark_dn, tables)
         base = self.base_dn[k] = np.clip(np.rint(mean), 0, x.highest_dn if method.each == 1 else np.inf)
         if self.responses.size:
-            pixel_tables.fill_responses(self.responses[k, : dark_dn.size], x, c, factors)
+            fill_responses(self.responses[k, : dark_dn.size], x, c, factors)
             check_reach(x, c, factors)
         elif method.joint:
             for name, coefficient in zip(("c0", "c1", "c2", "c3", "c4"), polynomial(c), strict=True):
@@ -224,12 +494,12 @@ class _PerScenario:
         """Return the mean, DN, to which a draw is relative; separate Poisson counts are relative to integers."""
         c, gain = method.cumulants[k], x.gain_dn_per_electron
         if method.joint:
-            light = factors.on_light(factors.light, factors.sky, pixel_tables.sky_share(x))
+            light = factors.on_light(factors.light, factors.sky, sky_share(x))
             return np.asarray(c.mean + (light - 1.0) * c.light_dn + (factors.dark - 1.0) * c.dark_dn)
         mean = method.each * x.bias_dn + dark_dn
         if method.photons:
             out = self.photon_counts[k, : dark_dn.size]
-            return np.asarray(mean + gain * pixel_tables.fill_poisson_counts(out, c.photons, gain, tables))
+            return np.asarray(mean + gain * fill_poisson_counts(out, c.photons, gain, tables))
         return np.asarray(mean + gain * c.photons)
 
     def fill_comparison(
@@ -256,8 +526,8 @@ class _PerScenario:
         edge["low"] = layout.MAGIC - base
         edge["high"] = layout.MAGIC + (x.highest_dn - base)
         if comparison.estimated:
-            pixel_tables.fill_estimates(self.estimates[k], reference, self.fraction[k], np.rint(mean_sum))
-        ends = pixel_tables.element_ends(x)
+            fill_estimates(self.estimates[k], reference, self.fraction[k], np.rint(mean_sum))
+        ends = element_ends(x)
         element_variance = np.bincount(x.element, variance * used)
         with np.errstate(divide="ignore"):
             edge["inverse_element_variance"][ends] = np.where(element_variance > 0, 1.0 / element_variance, 0.0)
@@ -281,7 +551,7 @@ def _job(
     quiet = scenarios[0]
     job = np.zeros((), layout.JOB)
     n_pixel = quiet.wavelength_nm.size
-    job["pixel_count"], job["padded_count"] = n_pixel, pixel_tables.padded(n_pixel)
+    job["pixel_count"], job["padded_count"] = n_pixel, padded(n_pixel)
     job["scenario_count"] = len(scenarios)
     job["draw_count"], job["frame_count"] = quiet.n_frames if method.frames else 1, quiet.n_frames
     job["first_frame"], job["first_group"] = drawing.first_frame, first_group

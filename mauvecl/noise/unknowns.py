@@ -11,10 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
-from mauvecl.noise.additive import AdditiveProcess
-from mauvecl.noise.cosmic_rays import CosmicRays
-from mauvecl.noise.pointing import PointingDrifts
-from mauvecl.noise.priors import Normal, Prior, Uniform
+from mauvecl.noise.disturbances import AdditiveProcess, CosmicRays, Normal, PointingDrifts, Prior, Uniform
 from mauvecl.schema.fields import range_of
 from mauvecl.schema.physical import DetectorTemperature
 
@@ -22,7 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
 
     Float = NDArray[np.float64]

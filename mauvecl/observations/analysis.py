@@ -10,8 +10,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.defaults import RANK, Per, per_day
-from mauvecl.lightcurve.flares.shapes import shape_of
+from mauvecl.fits.spectrum import Measurement
+from mauvecl.flares.defaults import RANK, Per, per_day
+from mauvecl.flares.shapes import shape_of
 from mauvecl.observations.colour import Colour, event_colour
 from mauvecl.observations.completeness import Completeness, inject
 from mauvecl.observations.detection import detect_events, most_events
@@ -26,7 +27,6 @@ from mauvecl.observations.noise import Likeness, Scatter, binned_scatter, likene
 from mauvecl.observations.search import NO_COLOUR_K, SeriesSurvey
 from mauvecl.observations.spectra import CleanedSpectra, SpectralSeries, clean_spectra, survey_spectra
 from mauvecl.observations.steps import Steps
-from mauvecl.results.measurements.fit import Measurement
 from mauvecl.schema.physical import DAY_S
 
 Float = NDArray[np.float64]

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.orbit.orbit import Orbit
-from mauvecl.host.orbit.targets import Target
+from mauvecl.host.orbit.orbit import Orbit, Target
 from mauvecl.host.tables.times import SCALES, offline
 from mauvecl.observations.frames import Frames
 from mauvecl.schema.errors import InputError

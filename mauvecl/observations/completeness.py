@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.detection.distributions import Interval, clopper_pearson
 from mauvecl.observations.search import NO_COLOUR_K, SeriesSurvey
 from mauvecl.observations.steps import Steps
-from mauvecl.statistics.intervals import Interval, clopper_pearson
 
 Float = NDArray[np.float64]
 

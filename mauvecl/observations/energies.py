@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.flares.shapes import between, sides
+from mauvecl.flares.shapes import between, sides
 from mauvecl.observations.event_fits import Fit, Mixture, fit_event, joined, light_of
 from mauvecl.observations.event_windows import FittedFlare, Likelihood, Window
 from mauvecl.observations.families import GENERAL

@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.flares.shapes import Shape
+from mauvecl.flares.shapes import Shape
 from mauvecl.observations.event_windows import FittedFlare, Likelihood, Profile, Window
 from mauvecl.observations.families import Family, families
 

@@ -9,14 +9,14 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.search.templates import TEMPERATURES_K
+from mauvecl.detection.nuisances import Nuisances
+from mauvecl.fits.spectrum import Measurement, fit
 from mauvecl.noise.unknowns import NUISANCES, Amplitude
 from mauvecl.observations.light_changes import CLEARLY, chi2_of_one
 from mauvecl.observations.search import MIN_BASELINE, Detection, SeriesSurvey
 from mauvecl.observations.spectra import SpectralSeries
-from mauvecl.results.measurements.fit import Measurement, fit
 from mauvecl.schema.errors import InputError
-from mauvecl.statistics.nuisances import Nuisances
+from mauvecl.search.templates import TEMPERATURES_K
 
 Float = NDArray[np.float64]
 Cause = Literal["flare", "throughput", "dark current", "sky", "cosmic ray"]

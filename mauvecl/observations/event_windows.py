@@ -21,7 +21,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.flares.shapes import Integrable, Shape, consecutive_integrals
+from mauvecl.flares.shapes import Integrable, Shape, consecutive_integrals
 from mauvecl.observations.families import WeightedSum
 
 if TYPE_CHECKING:

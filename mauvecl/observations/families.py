@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.lightcurve.flares.shapes import SHAPES, Davenport2014, Integrable, Shape
+from mauvecl.flares.shapes import SHAPES, Davenport2014, Integrable, Shape
 
 Float = NDArray[np.float64]
 

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.detection.nuisances import spectrum_of
 from mauvecl.schema.errors import InputError
-from mauvecl.statistics.nuisances import spectrum_of
 
 if TYPE_CHECKING:
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.fits.flare_model import FlareModel
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.observations.frames import Frames
-    from mauvecl.results.measurements.flare_model import FlareModel
 
 Float = NDArray[np.float64]
 

@@ -28,7 +28,7 @@ from mauvecl.observations.steps import Steps
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
-    from mauvecl.lightcurve.flares.shapes import Shape
+    from mauvecl.flares.shapes import Shape
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

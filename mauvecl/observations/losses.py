@@ -9,15 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median_filter, uniform_filter1d
 
-from mauvecl.lightcurve.flares.shapes import Shape
-from mauvecl.observations.detection import (
-    END_FRAMES,
-    PROVISIONAL,
-    alternate,
-    criterion,
-    detect_events,
-    fit_quiet_light,
-)
+from mauvecl.flares.shapes import Shape
+from mauvecl.observations.detection import END_FRAMES, PROVISIONAL, alternate, criterion, detect_events, fit_quiet_light
 from mauvecl.observations.level import guess_flares
 from mauvecl.observations.process import Binned, fit_process, level_fit
 from mauvecl.observations.search import bank_of

@@ -22,11 +22,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.search.bank import LEAST_SHARE, Bank, Template
-from mauvecl.lightcurve.search.search import LargestValue
+from mauvecl.search.search import LargestValue
+from mauvecl.search.templates import LEAST_SHARE, Bank, Template
 
 if TYPE_CHECKING:
-    from mauvecl.lightcurve.stares.stare import Stare
+    from mauvecl.flares.stare import Stare
     from mauvecl.observations.process import Covariance, Process
 
 Float = NDArray[np.float64]

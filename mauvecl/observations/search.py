@@ -9,16 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.search.bank import Bank, Baseline
-from mauvecl.lightcurve.search.survey import select_frames
-from mauvecl.lightcurve.search.templates import Templates
-from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.flares.stare import Stare
 from mauvecl.observations.level import process_level
 from mauvecl.observations.process import Process
 from mauvecl.observations.process_search import ProcessSearch
+from mauvecl.search.search import select_frames
+from mauvecl.search.templates import Bank, Baseline, Templates
 
 if TYPE_CHECKING:
-    from mauvecl.lightcurve.flares.shapes import Shape
+    from mauvecl.flares.shapes import Shape
     from mauvecl.observations.frames import Frames
 
 Float = NDArray[np.float64]

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates
+from mauvecl.detection.nuisances import Nuisances
 from mauvecl.observations.detection import fit_quiet_light
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Reason
@@ -24,10 +24,10 @@ from mauvecl.observations.light_curve import check_usable, quiescent_light, sear
 from mauvecl.observations.search import WHITE, SeriesSurvey, bank_of, stare_of
 from mauvecl.observations.steps import Steps
 from mauvecl.schema.errors import InputError
-from mauvecl.statistics.nuisances import Nuisances
+from mauvecl.search.templates import TEMPERATURES_K, Templates
 
 if TYPE_CHECKING:
-    from mauvecl.lightcurve.flares.shapes import Shape
+    from mauvecl.flares.shapes import Shape
     from mauvecl.observations.frames import Frames
 
 Float = NDArray[np.float64]

@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.detection.fap_checks import NoThresholdError
+from mauvecl.detection.requests import label
+from mauvecl.detection.statistics import LinearStatistic
 from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import (
     COLOURS,
@@ -21,19 +24,15 @@ from mauvecl.pictures.style import (
     plain_numbers,
     styled_picture,
 )
-from mauvecl.results.requests.fap_checks import NoThresholdError
-from mauvecl.statistics.registry import label
-from mauvecl.statistics.statistic import LinearStatistic
 from mauvecl.study.parts import First, note_of, part_note
 
 if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.answers.detection.detect import DetectAnswer
-    from mauvecl.host.expectation import Expectation
-    from mauvecl.results.detection.detection import Detection
-    from mauvecl.results.detection.roc import Roc
-    from mauvecl.results.snr import SnrResult
+    from mauvecl.detection.detection import Detection, Roc
+    from mauvecl.detection.snr import SnrResult
+    from mauvecl.host.exposure.expectation import Expectation
 
 #: Flares of a star in one picture.
 MOST_FLARES = 16
@@ -251,7 +250,7 @@ def observation(plt: Any, title: str, table: QTable) -> Any:
 @styled_picture
 def signal_to_noise(plt: Any, stars: Sequence[tuple[str, SnrResult | Expectation]]) -> Any:
     """Plot the closed-form S/N per pixel and resolution element, and the spread of realisations if simulated."""
-    from mauvecl.results.snr import SnrResult
+    from mauvecl.detection.snr import SnrResult
 
     figure, axes = plt.subplots(len(stars), 2, figsize=(7.6, 2.6 * len(stars) + 0.4), squeeze=False, sharex=True)
     for row, (title, result) in zip(axes, stars, strict=True):

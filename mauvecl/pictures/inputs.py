@@ -12,9 +12,9 @@ from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import COLOURS, NULL, styled_picture
 
 if TYPE_CHECKING:
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.host.exposure.sky import Sky
     from mauvecl.host.instrument.instrument import Instrument
-    from mauvecl.host.sky.zodiacal import Sky
     from mauvecl.host.stars.source import Source
 
 FLUX = "flux (erg s$^{-1}$ cm$^{-2}$ Å$^{-1}$)"
@@ -89,7 +89,7 @@ def convolved(plt: Any, source: Source, instrument: Instrument) -> Any:
 
     The efficiencies of optics and detector are not applied.
     """
-    from mauvecl.host.response import electrons_per_second
+    from mauvecl.host.exposure.response import electrons_per_second
 
     w = instrument.wavelength_nm
     seen = electrons_per_second(instrument, source.wavelength_nm, source.flux_flam)

@@ -14,7 +14,7 @@ from mauvecl.pictures.style import COLOURS, NULL, headline, styled_picture
 if TYPE_CHECKING:
     from mauvecl.answers.stares.star_stare import StarStare
     from mauvecl.answers.stares.stare import StareAnswer
-    from mauvecl.lightcurve.stares.stare import Stare
+    from mauvecl.flares.stare import Stare
 
 Float = NDArray[np.float64]
 #: Largest number of points of a light curve, and of rows of a dynamic spectrum; longer stares are averaged.

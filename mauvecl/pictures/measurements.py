@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.fits.flare_model import FlareModel, usable_variance
 from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import COLOURS, NULL, headline, styled_picture
-from mauvecl.results.measurements.flare_model import FlareModel
-from mauvecl.results.measurements.reduction import usable_variance
 from mauvecl.study.parts import First, note_of
 
 if TYPE_CHECKING:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.detection.requests import label
 from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import (
     COLOURS,
@@ -19,7 +20,6 @@ from mauvecl.pictures.style import (
     plain_numbers,
     styled_picture,
 )
-from mauvecl.statistics.registry import label
 from mauvecl.study.labels import full_label
 from mauvecl.study.quantities import QUANTITIES
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.limits.limits import LimitAnswer
     from mauvecl.answers.signal.exposures import ExposureAnswer
     from mauvecl.answers.signal.snr import SnrAnswer
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
 
 
 #: Probabilities of contours, in ascending order.

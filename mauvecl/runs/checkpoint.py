@@ -33,7 +33,7 @@ from mauvecl.runs.shards import FORM, fingerprint
 from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
-    from mauvecl.results.shard_sums import Arrays
+    from mauvecl.detection.snr import Arrays
 
 FOLDER, MANIFEST = "checkpoint", "manifest.json"
 #: Names of shards: fingerprint, part, start, count.

@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
+from mauvecl.detection.requests import Countable, Shard
+from mauvecl.detection.snr import Arrays
 from mauvecl.device.errors import DeviceError
 from mauvecl.device.first_build import THREADS
 from mauvecl.device.program import DeviceRecord
 from mauvecl.host.files.parsing import is_file, json_data, read_text
 from mauvecl.host.version import VERSION
-from mauvecl.results.requests.requests import Countable, Shard
-from mauvecl.results.shard_sums import Arrays
 from mauvecl.runs.pool import Stopped
 from mauvecl.runs.shards import Task, code_identity
 from mauvecl.schema.calls import validated

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
 from numpy.typing import NDArray
 
+from mauvecl.detection.requests import DetectRequest, RealiseRequest, Shard, SnrRequest
+from mauvecl.detection.snr import Arrays, DetectionSums, SnrSums
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
 from mauvecl.device.stare_engine import Stares
 from mauvecl.device.tiles import Progress
-from mauvecl.lightcurve.stares.stare_requests import StaresRequest, StareSums
-from mauvecl.results.requests.requests import DetectRequest, RealiseRequest, Shard, SnrRequest
-from mauvecl.results.shard_sums import Arrays, DetectionSums, SnrSums
+from mauvecl.flares.stare_scene import StaresRequest, StareSums
 from mauvecl.runs.shards import Task, fingerprint, shards
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -26,9 +26,9 @@ from mauvecl.schema.fields import Range
 from mauvecl.schema.physical import Realisations
 
 if TYPE_CHECKING:
-    from mauvecl.host.expectation import Expectation
-    from mauvecl.results.detection.detection import Detection
-    from mauvecl.results.snr import SnrResult
+    from mauvecl.detection.detection import Detection
+    from mauvecl.detection.snr import SnrResult
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.checkpoint import Checkpoint
 
 #: Number of attempts at a shard before the run fails.

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from mauvecl.detection.requests import Countable, Divisible, Shard
 from mauvecl.host.version import VERSION
-from mauvecl.results.requests.requests import Countable, Divisible, Shard
 
 #: Version of the content of a shard, raised with every change, so that shards of older versions are never added.
 FORM = 2

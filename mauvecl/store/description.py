@@ -18,7 +18,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.study.messages import collect_messages as messages_of
 
 if TYPE_CHECKING:
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.store.stored_scenes import StoredScene
     from mauvecl.study.study import Study
 

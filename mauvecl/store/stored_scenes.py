@@ -12,7 +12,7 @@ from mauvecl.schema.tables import Column, percent
 from mauvecl.study.labels import full_label
 
 if TYPE_CHECKING:
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.cases import Case
 
 #: Approximate size of a chunk, bytes.

@@ -15,17 +15,17 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.detection.nuisances import Nuisances
+    from mauvecl.detection.statistics import Setting
+    from mauvecl.flares.events import Event
+    from mauvecl.flares.frames import StareExpectation
+    from mauvecl.flares.stare import Stare
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.host.exposure.sky import Sky
+    from mauvecl.host.exposure.star import Neighbours
     from mauvecl.host.instrument.instrument import Instrument
-    from mauvecl.host.neighbours import Neighbours
-    from mauvecl.host.sky.zodiacal import Sky
     from mauvecl.host.stars.source import Source
-    from mauvecl.lightcurve.flares.events import Event
-    from mauvecl.lightcurve.stares.light_curves import StareExpectation
-    from mauvecl.lightcurve.stares.stare import Stare
     from mauvecl.noise.processes import Processes
-    from mauvecl.statistics.nuisances import Nuisances
-    from mauvecl.statistics.statistic import Setting
     from mauvecl.study.sections import Observation, SkyLight, Star
     from mauvecl.study.study import Study
 
@@ -161,7 +161,7 @@ class Case:
 
     def expect(self, *sources: Source) -> list[Expectation]:
         """Compute the expectations of sources for the instrument, sky and exposure."""
-        from mauvecl.host.expectation import expect
+        from mauvecl.host.exposure.expectation import expect
 
         o = self.study.observation
         how: dict[str, Any] = {"exposure": o.exposure_s, "sky": self.sky, "order": o.order, "signal": o.signal}
@@ -183,7 +183,7 @@ class Case:
         """
         import numpy as np
 
-        from mauvecl.noise.factor_distributions import FactorDistributions
+        from mauvecl.noise.scene import FactorDistributions
 
         quiet = self.quiet if quiet is None else quiet
         unknown, given = self.unknowns(quiet), self.study.nuisances.light
@@ -212,8 +212,8 @@ class Case:
 
     def setting(self, quiet: Expectation, *flares: Expectation) -> Setting:
         """Return the input of statistics for closed forms."""
-        from mauvecl.noise.factor_distributions import FactorDistributions
-        from mauvecl.statistics.statistic import Setting
+        from mauvecl.detection.statistics import Setting
+        from mauvecl.noise.scene import FactorDistributions
 
         unknown = self.unknowns(quiet)
         drawn = FactorDistributions.from_processes(self.processes, quiet) if unknown else None

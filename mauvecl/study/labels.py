@@ -11,7 +11,7 @@ from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Star
 
 if TYPE_CHECKING:
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.questions import Sweep
 
 

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mauvecl.noise.cumulants import Cumulants, stack_is_exact
+from mauvecl.noise.drawing import Cumulants, stack_is_exact
 from mauvecl.noise.unknowns import PROCESSES
 from mauvecl.schema.messages import Message, of_kind
 
 if TYPE_CHECKING:
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.noise.processes import Processes
 
 #: Read noise, DN, above which rounding acts like independent noise at any signal: it damps the first harmonic of the

@@ -10,16 +10,16 @@ from pydantic import BeforeValidator, Field, create_model, model_validator
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, Amplitude, default_processes
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help
+from mauvecl.schema.section import Section
 from mauvecl.schema.text import shortened
-from mauvecl.study.sections import Section
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.detection.nuisances import Nuisances
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.noise.processes import Processes
-    from mauvecl.statistics.nuisances import Nuisances
 
 
 def _spread(given: Any) -> Any:
@@ -64,7 +64,7 @@ class OwnNuisance(Section):
         """Return the DN per exposure at unit amplitude, shape (n_pixel,)."""
         import numpy as np
 
-        from mauvecl.study.weights import at_pixels, read_spectrum
+        from mauvecl.detection.nuisances import at_pixels, read_spectrum
 
         if self.file is not None:
             return read_spectrum(name, self.file, wavelength_nm)
@@ -106,7 +106,7 @@ class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  #
 
     def marginalised(self, quiet: Expectation) -> Nuisances | None:
         """Return the nuisance parameters for the engine, or None if there are none."""
-        from mauvecl.statistics.nuisances import Nuisances
+        from mauvecl.detection.nuisances import Nuisances
 
         sd = usual_spreads(quiet) if self.usual else {}
         sd |= {name: float("inf") if spread == "free" else spread for name, spread in self.spreads().items()}
@@ -132,7 +132,7 @@ class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  #
 
 def usual_spreads(quiet: Expectation) -> dict[str, float]:
     """Return the standard deviations of the documented set, omitting parameters without effect, such as no sky."""
-    from mauvecl.statistics.nuisances import spectrum_of
+    from mauvecl.detection.nuisances import spectrum_of
 
     return {
         row.name: row.prior.sd

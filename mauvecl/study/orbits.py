@@ -24,18 +24,17 @@ from mauvecl.schema.physical import (
     Share,
 )
 from mauvecl.schema.records import input_error
+from mauvecl.schema.section import Section
 from mauvecl.schema.text import shortened, shown
-from mauvecl.study.sections import Section
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from mauvecl.host.orbit.orbit import Orbit
-    from mauvecl.host.orbit.targets import Target
-    from mauvecl.host.orbit.time_grid import TimeGrid
+    from mauvecl.flares.energies import Rates
+    from mauvecl.host.orbit.geometry import TimeGrid
+    from mauvecl.host.orbit.orbit import Orbit, Target
     from mauvecl.host.tables.rows import Rows
-    from mauvecl.lightcurve.flares.rates import Rates
-    from mauvecl.lightcurve.search.completeness import DurationLaw
+    from mauvecl.search.completeness import DurationLaw
 
 #: Largest number of rows of a table of targets; a plan has a page for each.
 MAX_TARGETS = 500
@@ -103,7 +102,7 @@ class OrbitQuestion(Section):
 
     def times(self) -> TimeGrid:
         """Return the time grid."""
-        from mauvecl.host.orbit.time_grid import TimeGrid
+        from mauvecl.host.orbit.geometry import TimeGrid
 
         return TimeGrid(self.start, self.days, self.step_s)
 
@@ -177,7 +176,7 @@ class PlanTarget(Section):
         """Look up the target; given coordinates replace those of its name."""
         from dataclasses import replace
 
-        from mauvecl.host.orbit.targets import Target
+        from mauvecl.host.orbit.orbit import Target
 
         if self.coordinates is None:
             return Target.of(self.name, name=self.name, simbad=simbad)
@@ -190,7 +189,7 @@ class PlanTarget(Section):
 
     def distribution(self, spectral_type: str) -> Rates:
         """Return the flare rates; raises InputError if none are given and the spectral type has no preset."""
-        from mauvecl.lightcurve.flares.rates import BOLOMETRIC, EXPONENTS, PowerLaw, RateTable, davenport2019, preset
+        from mauvecl.flares.energies import BOLOMETRIC, EXPONENTS, PowerLaw, RateTable, davenport2019, preset
 
         if self.mass_msun is not None and self.age_myr is not None:
             return davenport2019(mass_msun=self.mass_msun, age_myr=self.age_myr)
@@ -263,14 +262,14 @@ class PlanQuestion(Section):
 
     def law(self) -> DurationLaw:
         """Return the relation between energy and duration of flares."""
-        from mauvecl.lightcurve.search.completeness import DurationLaw
+        from mauvecl.search.completeness import DurationLaw
 
         return DurationLaw(self.half_width_s, self.at_erg, self.exponent, self.scatter_dex)
 
 
 def targets_of(orbit: OrbitQuestion, plan: PlanQuestion) -> list[Target]:
     """Look up the targets of `orbit`, or else those of `plan`."""
-    from mauvecl.host.orbit.targets import Target
+    from mauvecl.host.orbit.orbit import Target
 
     targets = [Target.of(text, simbad=orbit.simbad) for text in orbit.targets] or [
         target.target(orbit.simbad) for target in plan.targets
@@ -341,7 +340,7 @@ def _target(
     rows: Rows, columns: dict[str, str | None], row: int, folder: Path | None, unused: tuple[str, ...]
 ) -> dict[str, Any]:
     """Return the data of a target from the cells of its row."""
-    from mauvecl.host.stars.well_known import by_key, name_key
+    from mauvecl.host.stars.library import by_key, name_key
 
     named = f"{rows.named}: row {row + 1}"
     one: dict[str, Any] = {}

@@ -12,8 +12,8 @@ from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Slider, Widget
 from mauvecl.schema.physical import Positive, Probability, Wavelength
+from mauvecl.schema.section import Section
 from mauvecl.study.quantities import QUANTITIES
-from mauvecl.study.sections import Section
 
 #: Magnitudes and exposures of the default sweep of `gaussian`.
 MAGNITUDES, EXPOSURES_S = (4.0, 6.0, 8.0, 10.0, 12.0), (5.0, 50.0, 600.0)

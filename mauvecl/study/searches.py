@@ -6,17 +6,17 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from mauvecl.lightcurve.defaults import HALF_WIDTHS_S, RANK, WINDOW_S, Per, check_shape, per_day
+from mauvecl.flares.defaults import HALF_WIDTHS_S, RANK, WINDOW_S, Per, check_shape, per_day
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Unit, Widget
 from mauvecl.schema.physical import Duration, Positive
+from mauvecl.schema.section import Section
 from mauvecl.study.nuisances import Spread
-from mauvecl.study.sections import Section
 from mauvecl.study.stare_section import ShapeName
 
 if TYPE_CHECKING:
-    from mauvecl.lightcurve.search.bank import Bank, Baseline
-    from mauvecl.lightcurve.stares.stare import Stare
+    from mauvecl.flares.stare import Stare
+    from mauvecl.search.templates import Bank, Baseline
 
 #: Window, in orbits, of a baseline with the orbital cycle. Shorter ones cannot separate the cycle from a flare.
 CYCLE_ORBITS = 3.0
@@ -91,15 +91,15 @@ class SearchChoice(Section):
 
     def white_bank(self, frame_s: float) -> Bank:
         """Return the template bank of the closed form: one sum per frame and no cycle."""
-        from mauvecl.lightcurve.flares.shapes import shape_of
-        from mauvecl.lightcurve.search.bank import Baseline, white_bank
+        from mauvecl.flares.shapes import shape_of
+        from mauvecl.search.templates import Baseline, white_bank
 
         level = Baseline(self.offset, self.slope, False, WINDOW_S if self.window_s is None else self.window_s)
         return white_bank(self.half_widths_s, shape_of(self.shape), frame_s, level)
 
     def level(self, stare: Stare, orbit_s: float) -> Baseline:
         """Return the baseline model for a stare."""
-        from mauvecl.lightcurve.search.bank import Baseline
+        from mauvecl.search.templates import Baseline
 
         cycle = self.cycle if self.cycle is not None else any("cosine" in u.name for u in stare.unknowns)
         window = self.window_s if self.window_s is not None else CYCLE_ORBITS * orbit_s if cycle else WINDOW_S

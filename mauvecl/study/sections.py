@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, create_model, field_validator, model_validator
 
-from mauvecl.host.sky import DEFAULT_SKY
+from mauvecl.detection.names import DEFAULT_STATISTICS, STATISTIC_NAMES
+from mauvecl.host.exposure import DEFAULT_SKY
 from mauvecl.host.stars.band_names import ALIASES
-from mauvecl.noise.priors import Prior, PriorField
+from mauvecl.noise.disturbances import Prior, PriorField
 from mauvecl.noise.unknowns import INSTRUMENT_VALUES, values_of
 from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
@@ -29,14 +30,13 @@ from mauvecl.schema.physical import (
     SkyBrightness,
     Temperature,
 )
-from mauvecl.schema.section import Section as Section
-from mauvecl.statistics.names import DEFAULT_STATISTICS, STATISTIC_NAMES
+from mauvecl.schema.section import Section
 from mauvecl.study.flare_light import FlareLight
 
 if TYPE_CHECKING:
+    from mauvecl.host.exposure.sky import Sky
+    from mauvecl.host.exposure.star import Neighbours
     from mauvecl.host.instrument.instrument import Instrument
-    from mauvecl.host.neighbours import Neighbours
-    from mauvecl.host.sky.zodiacal import Sky
     from mauvecl.host.stars.flare_spectra import FlareSpectrum
     from mauvecl.host.stars.source import Source
     from mauvecl.noise.comparison import Comparison
@@ -46,7 +46,7 @@ def amplitudes_in(path: Path, _: str) -> list[float]:
     """Read the amplitudes of a table of flares, each value once, and warn of columns that are not used."""
     import warnings
 
-    from mauvecl.host.stars.flare_table import read_flares
+    from mauvecl.host.stars.flare import read_flares
 
     flares = read_flares(path)
     for remark in flares.meta["comments"]:
@@ -236,16 +236,15 @@ class Star(Section):
         """Read the star's neighbours, or return None if it has none."""
         if self.neighbours is None:
             return None
-        from mauvecl.host.neighbour_table import read_neighbours
-        from mauvecl.host.neighbours import Neighbours
+        from mauvecl.host.exposure.star import Neighbours, read_neighbours
 
         stars, notes = read_neighbours(self.neighbours, self.neighbours_of)
         return Neighbours(stars, self.neighbour_share, notes)
 
     def source(self) -> Source:
         """Load the spectrum and scale it to the magnitude, if one is given."""
+        from mauvecl.host.stars.library import spectrum_name
         from mauvecl.host.stars.source import Source
-        from mauvecl.host.stars.star_names import spectrum_name
 
         if self.library is not None:
             source = Source.from_library(spectrum_name(self.library))
@@ -481,7 +480,7 @@ class SkyLight(Section):
 
     def sky(self) -> Sky:
         """Return the sky for the host."""
-        from mauvecl.host.sky.zodiacal import Sky
+        from mauvecl.host.exposure.sky import Sky
 
         if self.none:
             return Sky.none()

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.flares.cooling import Cooling
-from mauvecl.lightcurve.flares.energies import EnergyScale, Kind, amplitude_of, amplitude_of_peak
-from mauvecl.lightcurve.flares.events import Event, check_contributions, coefficients, temperatures_of
-from mauvecl.lightcurve.stares.light_curves import StareExpectation
-from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.noise.priors import Normal, Prior
+from mauvecl.flares.cooling import Cooling
+from mauvecl.flares.energies import EnergyScale, Kind, amplitude_of, amplitude_of_peak
+from mauvecl.flares.events import Event, check_contributions, coefficients, temperatures_of
+from mauvecl.flares.frames import StareExpectation
+from mauvecl.flares.stare import Stare
+from mauvecl.noise.disturbances import Normal, Prior
 from mauvecl.noise.unknowns import CHANGING, COURSES, PROCESSES, STARE_PROCESSES, Changing, Course, default_spreads
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.messages import Message
@@ -23,7 +23,7 @@ from mauvecl.study.stare_section import EventChoice, StareQuestion
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.source import Source
     from mauvecl.study.orbits import OrbitQuestion
@@ -111,7 +111,7 @@ def stare_of(study: Study, instrument: Instrument) -> Stare:
 
 def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare:
     """Return the stare at the target of the study's ``orbit``, with gaps and temperatures along the orbit."""
-    from mauvecl.lightcurve.stares.orbit_stare import stare_along
+    from mauvecl.flares.stare import stare_along
     from mauvecl.study.orbits import targets_of
 
     q, o = study.stare, study.orbit
@@ -169,7 +169,7 @@ def unused_lines(exposure_s: float, stare: Stare, events: Sequence[Event]) -> li
 
 def orbit_lines(stare: StareQuestion, orbit: OrbitQuestion, frame_s: float) -> list[str]:
     """Return messages about the orbit of a stare with `along_orbit`."""
-    from mauvecl.host.orbit.time_grid import TimeGrid
+    from mauvecl.host.orbit.geometry import TimeGrid
     from mauvecl.schema.physical import DAY_S
 
     if not stare.along_orbit:

@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from mauvecl.lightcurve.defaults import ORBIT_S, SHAPE_NAMES, check_shape
-from mauvecl.lightcurve.flares.cooling import CoolingLaw
-from mauvecl.lightcurve.stares.curves import Curve
-from mauvecl.noise.pointing import PointingDrifts
+from mauvecl.flares.cooling import CoolingLaw
+from mauvecl.flares.curves import Curve
+from mauvecl.flares.defaults import ORBIT_S, SHAPE_NAMES, check_shape
+from mauvecl.noise.disturbances import PointingDrifts
 from mauvecl.noise.unknowns import COURSES, STARE_PROCESSES, Changing
 from mauvecl.schema import parsing
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Range, Unit
 from mauvecl.schema.physical import Amplitude, Duration, Energy, Positive, Temperature, Wavelength
-from mauvecl.study.sections import Section
+from mauvecl.schema.section import Section
 
 if TYPE_CHECKING:
-    from mauvecl.lightcurve.flares.shapes import Shape
+    from mauvecl.flares.shapes import Shape
 
 #: Orbital period rounded down to a multiple of the frame time, s.
 ORBIT_FRAMES_S = 5680.0
@@ -155,8 +155,8 @@ class EventChoice(Section):
 
     def load_shape(self, default: str) -> Shape:
         """Return the shape, or the published shape named `default` if none is given."""
+        from mauvecl.flares.shapes import TableShape, shape_of
         from mauvecl.host.tables.text_lines import read_columns
-        from mauvecl.lightcurve.flares.shapes import TableShape, shape_of
         from mauvecl.schema.text import shortened
 
         if self.shape_file is None:

@@ -16,6 +16,7 @@ from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import AnyUnit
 from mauvecl.schema.records import input_error
+from mauvecl.schema.section import Section
 from mauvecl.schema.text import shortened
 from mauvecl.study.calibrations import CalibrateQuestion
 from mauvecl.study.changes import ChangeQuestion
@@ -35,7 +36,7 @@ from mauvecl.study.questions import (
     Sweep,
 )
 from mauvecl.study.searches import InjectionQuestion, SearchChoice
-from mauvecl.study.sections import Flare, Observation, Run, Section, SkyLight, Star, Unknowns
+from mauvecl.study.sections import Flare, Observation, Run, SkyLight, Star, Unknowns
 from mauvecl.study.stare_section import EventChoice, StareQuestion
 from mauvecl.study.study_text import (
     locate_files,

@@ -8,18 +8,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.flares.shapes import shape_of
-from mauvecl.lightcurve.search.bank import Bank
-from mauvecl.lightcurve.search.flare_fit import SingleFlareFit
-from mauvecl.lightcurve.search.survey import Survey
-from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates, frame_nuisances
-from mauvecl.lightcurve.stares.frame_components import STEADY, Components
+from mauvecl.flares.frames import STEADY, Components
+from mauvecl.flares.shapes import shape_of
 from mauvecl.schema.errors import InputError
+from mauvecl.search.flare_fits import SingleFlareFit
+from mauvecl.search.search import Survey
+from mauvecl.search.templates import TEMPERATURES_K, Bank, Templates, frame_nuisances
 from mauvecl.study.flare_light import FlareLight
 from mauvecl.study.stare_expectation import energy_scale
 
 if TYPE_CHECKING:
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.cases import Case
     from mauvecl.study.searches import Size
 

@@ -17,16 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.detection.distributions import CONFIDENCE, Interval
+from mauvecl.detection.fap_checks import MIN_IN_TAIL
 from mauvecl.noise.unknowns import ThroughputMode, values_of
-from mauvecl.results.requests.fap_checks import MIN_IN_TAIL
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column
-from mauvecl.statistics.intervals import CONFIDENCE, Interval
 from mauvecl.study.parts import First
 
 if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import Instrument
-    from mauvecl.noise.priors import Prior
+    from mauvecl.noise.disturbances import Prior
     from mauvecl.study.cases import Case
     from mauvecl.study.study import Study
 

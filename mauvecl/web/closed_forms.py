@@ -12,17 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
+from mauvecl.detection.distributions import Gaussian, Mixture
+from mauvecl.detection.requests import STATISTICS
 from mauvecl.schema.errors import InputError
-from mauvecl.statistics.distributions import Gaussian, Mixture
-from mauvecl.statistics.registry import STATISTICS
 from mauvecl.study.messages import collect_messages
 from mauvecl.web.fields import UNKNOWN, star_words
 from mauvecl.web.interpolated_form import InterpolatedForm
 
 if TYPE_CHECKING:
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.detection.statistics import DetectionForms
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.source import Source
-    from mauvecl.statistics.statistic import DetectionForms
     from mauvecl.study.cases import Case
     from mauvecl.study.study import Study
     from mauvecl.web.question import Question

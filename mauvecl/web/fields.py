@@ -11,14 +11,12 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
-from mauvecl.host.stars.catalogue import embedded
-from mauvecl.host.stars.model_stars import ModelStar
-from mauvecl.host.stars.star_names import near_names, spectrum_name
+from mauvecl.detection.requests import STATISTICS
+from mauvecl.host.stars.library import ModelStar, embedded, near_names, spectrum_name
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Range, Slider, Unit, Widget, first, found, range_of, unit_of
 from mauvecl.schema.physical import LineFraction
 from mauvecl.schema.text import shortened
-from mauvecl.statistics.registry import STATISTICS
 from mauvecl.study.keys import study_keys
 from mauvecl.web.simulations import SIMULATIONS
 
@@ -159,7 +157,7 @@ def star_name(text: str) -> str:
 
 def day(text: str) -> str:
     """Parse a day such as 2027-01-31."""
-    from mauvecl.host.sky.helioecliptic import YEARS
+    from mauvecl.host.exposure.sky import YEARS
 
     expected = f"a day such as 2027-01-31, from {YEARS[0]} to {YEARS[1] - 1}"
     try:
@@ -216,7 +214,7 @@ def targets(text: str, *, check: bool = True) -> tuple[dict[str, Any], ...]:
 
 def neighbours(text: str) -> str | None:
     """Check that a text is a CSV table of neighbours without names of files, and return it; None for nothing."""
-    from mauvecl.host.neighbour_table import FILES
+    from mauvecl.host.exposure.star import FILES
     from mauvecl.host.tables.text_table import text_table
 
     if not text.strip():

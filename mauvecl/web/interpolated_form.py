@@ -8,12 +8,12 @@ import numpy as np
 from scipy import special
 from scipy.interpolate import PchipInterpolator
 
-from mauvecl.statistics.distributions import Gaussian
+from mauvecl.detection.distributions import Gaussian
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mauvecl.statistics.distributions import Form
+    from mauvecl.detection.distributions import Form
 
 
 class InterpolatedForm:

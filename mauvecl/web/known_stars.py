@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mauvecl.host.stars.star_names import resolve
+from mauvecl.host.stars.library import resolve
 from mauvecl.schema.errors import InputError
 from mauvecl.study.orbits import PlanTarget
 from mauvecl.web.fields import UPLOADED, targets

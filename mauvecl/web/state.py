@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
-from mauvecl.results.requests.fap_checks import check_fap
+from mauvecl.detection.fap_checks import check_fap
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 from mauvecl.web.fields import FIELDS, Choice, Field, several
@@ -102,7 +102,7 @@ class State:
 
     def _check_target(self) -> None:
         """Raise InputError if the sky depends on a target without a position."""
-        from mauvecl.host.sky.helioecliptic import parse_position
+        from mauvecl.host.exposure.sky import parse_position
         from mauvecl.host.tables.times import offline
 
         if self.entered["sky"] == "target and time":
@@ -111,7 +111,7 @@ class State:
 
     def _check_time(self) -> None:
         """Raise InputError if the sky depends on an invalid time."""
-        from mauvecl.host.sky.helioecliptic import parse_time
+        from mauvecl.host.exposure.sky import parse_time
         from mauvecl.host.tables.times import offline
 
         if self.entered["sky"] == "target and time":

@@ -74,9 +74,10 @@ def front() -> bytes:
     """Return the page."""
     from mako.lookup import TemplateLookup
 
-    from mauvecl.host.neighbour_table import KNOWN
-    from mauvecl.host.stars import catalogue, well_known
-    from mauvecl.host.stars.star_names import all_names
+    from mauvecl.host.exposure.star import KNOWN
+    from mauvecl.host.stars import library as catalogue
+    from mauvecl.host.stars import library as well_known
+    from mauvecl.host.stars.library import all_names
     from mauvecl.web import fields
     from mauvecl.web.figures import DASHES, INKS
     from mauvecl.web.headline import TITLES

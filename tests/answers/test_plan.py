@@ -14,7 +14,7 @@ from scipy import stats
 
 from mauvecl import Study, plan, stare
 from mauvecl.answers.campaigns.planned_injections import found_by_energy
-from mauvecl.lightcurve.search.completeness import Completeness
+from mauvecl.search.completeness import Completeness
 
 #: Injections take ten seconds a target.
 QUICK = {"completeness": "closed form"}

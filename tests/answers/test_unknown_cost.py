@@ -15,18 +15,7 @@ from commands import run
 from scenes import instrument
 from scipy import stats
 
-from mauvecl import (
-    Engine,
-    Nuisances,
-    Processes,
-    Sky,
-    Source,
-    Study,
-    detect,
-    detection_map,
-    expect,
-    limiting_magnitude,
-)
+from mauvecl import Engine, Nuisances, Processes, Sky, Source, Study, detect, detection_map, expect, limiting_magnitude
 from mauvecl.answers.detection.unknown_table import unknown_table
 from mauvecl.noise.scene import prepare
 from mauvecl.study.cases import Case

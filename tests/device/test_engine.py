@@ -17,14 +17,12 @@ from scenes import instrument, star
 from scipy import stats
 
 from mauvecl import Comparison, CosmicRays, Engine, Linear, Normal, PixelMap, Processes, Uniform
+from mauvecl.detection import reference as numpy_kernels
+from mauvecl.detection.counts import Tally
+from mauvecl.detection.requests import STATISTICS, DetectRequest, plan_channels
 from mauvecl.device.toy_exposure import toy
 from mauvecl.noise import reference
 from mauvecl.noise.scene import prepare
-from mauvecl.results import numpy_kernels
-from mauvecl.results.counts.tally import Tally
-from mauvecl.results.requests.channels import plan_channels
-from mauvecl.results.requests.requests import DetectRequest
-from mauvecl.statistics.registry import STATISTICS
 
 RAYS = CosmicRays(rate_per_cm2_s=200.0)
 PRIORS = Processes(

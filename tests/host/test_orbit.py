@@ -21,7 +21,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 import mauvecl
 from mauvecl import InputError, Sky, Study, visible
-from mauvecl.host.orbit.conditions import Particles, Thermal
+from mauvecl.host.orbit.visibility import Particles, Thermal
 
 VECTORS = Path(sgp4.__file__).parent
 PROTONS = Path(mauvecl.__file__).parent / "host" / "orbit" / "protons.ecsv"
@@ -412,7 +412,7 @@ def test_network_failure_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         done = threading.Event()
         _simbad(patch, lambda _: done.wait(60))
-        patch.setattr("mauvecl.host.orbit.targets.TIMEOUT_S", 0.1)
+        patch.setattr("mauvecl.host.orbit.orbit.TIMEOUT_S", 0.1)
         with refused("target", "0.1"):
             looked_up("HD 1")
         done.set()

@@ -20,7 +20,7 @@ from commands import ended, run
 from refusals import refused
 
 from mauvecl import Expectation, Source, Study, simulate
-from mauvecl.host.stars import hst_collections
+from mauvecl.host.stars import additions as hst_collections
 
 
 @pytest.fixture(autouse=True)

@@ -12,7 +12,7 @@ from scipy import stats
 from mauvecl.device.probes import Probes
 from mauvecl.device.toy_exposure import toy
 from mauvecl.noise import random_numbers, reference
-from mauvecl.noise.poisson import alias_table
+from mauvecl.noise.layout import alias_table
 from mauvecl.noise.scene import prepare
 
 #: From this mean on, counts are drawn by an expansion.

@@ -8,10 +8,9 @@ import numpy as np
 from scenes import instrument
 
 from mauvecl import SHAPES, Sky, Source, expect
-from mauvecl.lightcurve.search.bank import Bank, Baseline
-from mauvecl.lightcurve.search.survey import Survey
-from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates, frame_nuisances
-from mauvecl.lightcurve.stares.frame_components import Components
+from mauvecl.flares.frames import Components
+from mauvecl.search.search import Survey
+from mauvecl.search.templates import TEMPERATURES_K, Bank, Baseline, Templates, frame_nuisances
 
 DAVENPORT = SHAPES["davenport2014"]
 ONE = np.ones((1, 1))

@@ -12,7 +12,7 @@ from scenes import NEAR, instrument, star
 from scipy import special
 
 from mauvecl import Engine, Stare, Stares
-from mauvecl.lightcurve.stares.frame_components import Components
+from mauvecl.flares.frames import Components
 
 METHODS = ["pixels", "cumulants"]
 

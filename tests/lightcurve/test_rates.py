@@ -14,8 +14,7 @@ from scenes import through
 from scipy import stats
 
 from mauvecl import SHAPES, EnergyScale, Source, Study, plan
-from mauvecl.lightcurve.search.completeness import Completeness
-from mauvecl.lightcurve.search.yields import fit_power_law
+from mauvecl.search.completeness import Completeness, fit_power_law
 
 QUICK = {"completeness": "closed form"}
 

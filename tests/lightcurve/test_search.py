@@ -8,10 +8,10 @@ from refusals import refused
 from scipy import special
 
 from mauvecl import SHAPES, Stare, Study
-from mauvecl.lightcurve.search.bank import Bank, Baseline
-from mauvecl.lightcurve.search.completeness import search_threshold
-from mauvecl.lightcurve.search.importance_sampling import sample_rate
-from mauvecl.lightcurve.search.search import Search
+from mauvecl.search.completeness import search_threshold
+from mauvecl.search.false_alarms import sample_rate
+from mauvecl.search.search import Search
+from mauvecl.search.templates import Bank, Baseline
 
 DAVENPORT = SHAPES["davenport2014"]
 ONE = np.ones((1, 1))

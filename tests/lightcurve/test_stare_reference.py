@@ -12,11 +12,10 @@ from refusals import refused
 from scenes import NEAR, instrument, star
 
 from mauvecl import CosmicRays, Engine, Processes, Stare, Stares, Study
-from mauvecl.lightcurve.stares import stare_reference
-from mauvecl.lightcurve.stares.frame_components import Components
-from mauvecl.lightcurve.stares.stare_requests import StaresRequest
-from mauvecl.lightcurve.stares.stare_scene import Flares, StareScene
-from mauvecl.results.requests.requests import Shard
+from mauvecl.detection.requests import Shard
+from mauvecl.flares import reference as stare_reference
+from mauvecl.flares.frames import Components
+from mauvecl.flares.stare_scene import Flares, StareScene, StaresRequest
 
 SEED = 2**63 + 12345
 #: Around the boundary of the counter's first word.

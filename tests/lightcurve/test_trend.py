@@ -8,11 +8,10 @@ from refusals import refused
 from searches import DAVENPORT, survey
 
 from mauvecl import Sinusoid, Stare
-from mauvecl.lightcurve.defaults import per_day
-from mauvecl.lightcurve.search.bank import Baseline
-from mauvecl.lightcurve.search.flare_fit import SingleFlareFit
-from mauvecl.lightcurve.search.importance_sampling import sample_rate
-from mauvecl.lightcurve.search.sampled_rate import sampled_rate
+from mauvecl.flares.defaults import per_day
+from mauvecl.search.false_alarms import sample_rate, sampled_rate
+from mauvecl.search.flare_fits import SingleFlareFit
+from mauvecl.search.templates import Baseline
 
 
 def drawn(one, rng, count, farther=1.0):

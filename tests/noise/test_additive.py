@@ -51,8 +51,8 @@ TOY = """
 import json, sys
 from typing import ClassVar
 import numpy as np
-import mauvecl.noise.additive as additive
-import mauvecl.noise.cosmic_rays
+import mauvecl.noise.disturbances as additive
+import mauvecl.noise.disturbances
 
 class Bursts(additive.AdditiveProcess):
     "Bursts of the dark current: a Poisson number of bursts with exponentially distributed electrons."
@@ -73,9 +73,9 @@ from mauvecl.noise import unknowns
 unknowns.ADDITIVE["bursts"] = Bursts
 from mauvecl import Engine, Processes, Stare, Stares, Study, simulate
 from mauvecl.device.toy_exposure import toy
-from mauvecl.lightcurve.stares.frame_components import Components
-from mauvecl.lightcurve.stares.stare_scene import Flares, StareScene
-from mauvecl.lightcurve.stares import stare_reference as twin
+from mauvecl.flares.frames import Components
+from mauvecl.flares.stare_scene import Flares, StareScene
+from mauvecl.flares import reference as twin
 from mauvecl.noise import reference
 from mauvecl.noise.scene import prepare
 sections = {"bursts": {"per_s": 0.02}, "cosmic_rays": {"rate_per_cm2_s": 300.0}}

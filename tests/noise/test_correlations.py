@@ -10,7 +10,7 @@ from scenes import instrument, star
 
 from mauvecl import CosmicRays, Engine, Expectation, Normal, PixelMap, Processes
 from mauvecl.device.toy_exposure import toy
-from mauvecl.noise.poisson import alias_table
+from mauvecl.noise.layout import alias_table
 from mauvecl.noise.scene import prepare
 
 #: Sixteen groups of four; pixel i of group g has a mean for the expansion where bit i of g is set, else for a table.

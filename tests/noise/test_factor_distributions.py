@@ -9,8 +9,7 @@ import pytest
 from scenes import instrument, star
 
 from mauvecl import Normal, Processes, Uniform
-from mauvecl.noise.factor_distributions import FactorDistributions, changes_of
-from mauvecl.noise.scene import prepare
+from mauvecl.noise.scene import FactorDistributions, changes_of, prepare
 
 
 def drawn(**priors: Normal | Uniform) -> tuple[FactorDistributions, float]:

@@ -13,9 +13,8 @@ from astropy.table import Table
 from astropy.time import Time
 
 from mauvecl import Frames, Study, analyse, read_frames
-from mauvecl.host.orbit.orbit import Orbit
-from mauvecl.host.orbit.targets import Target
-from mauvecl.host.orbit.time_grid import TimeGrid
+from mauvecl.host.orbit.geometry import TimeGrid
+from mauvecl.host.orbit.orbit import Orbit, Target
 from mauvecl.observations.barycentre import barycentric
 
 RNG = np.random.default_rng(29)

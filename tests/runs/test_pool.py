@@ -40,8 +40,8 @@ from mauvecl import (
     limiting_magnitude,
     snr,
 )
+from mauvecl.detection.requests import DetectRequest
 from mauvecl.device.errors import DeviceError
-from mauvecl.results.requests.requests import DetectRequest
 from mauvecl.runs import shards
 from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.runs.pool import Stopped, map_in_order

@@ -7,10 +7,9 @@ import pytest
 from scenes import star
 
 from mauvecl import Normal, Nuisances, Processes, Uniform
-from mauvecl.noise.factor_distributions import FactorDistributions, changes_of
-from mauvecl.noise.scene import prepare
-from mauvecl.statistics.registry import STATISTICS
-from mauvecl.statistics.statistic import Differences, Setting
+from mauvecl.detection.requests import STATISTICS
+from mauvecl.detection.statistics import Differences, Setting
+from mauvecl.noise.scene import FactorDistributions, changes_of, prepare
 
 
 @pytest.mark.parametrize("name", ["matched", "uv_excess"])

@@ -9,7 +9,7 @@ from scenes import instrument, star
 from scipy import optimize, stats
 
 from mauvecl import Engine
-from mauvecl.statistics.detection_interval import detection_interval
+from mauvecl.detection.distributions import detection_interval
 
 #: Of the chi-squared statistic here.
 DOF = 48

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from mauvecl import Expectation, Instrument, Linear, Nuisances, Sky, Source, expect
-from mauvecl.statistics.distributions import QuadraticForm
-from mauvecl.statistics.registry import STATISTICS
-from mauvecl.statistics.statistic import Setting
+from mauvecl.detection.distributions import QuadraticForm
+from mauvecl.detection.requests import STATISTICS
+from mauvecl.detection.statistics import Setting
 
 FREE = float("inf")
 

@@ -9,8 +9,8 @@ from scipy import stats
 from scipy.ndimage import gaussian_filter1d
 
 from mauvecl import Comparison, Expectation, Instrument, Sky, Source, expect
-from mauvecl.statistics.distributions import QuadraticForm
-from mauvecl.statistics.smoothing import Smoothing
+from mauvecl.detection.chi2 import Smoothing
+from mauvecl.detection.distributions import QuadraticForm
 
 
 def whole(quiet: Expectation, flare: Expectation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from mauvecl.statistics.distributions import Gaussian, Mixture, QuadraticForm
+from mauvecl.detection.distributions import Gaussian, Mixture, QuadraticForm
 
 
 @pytest.mark.parametrize("n", [10, 48, 1643])

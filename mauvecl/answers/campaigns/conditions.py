@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.orbit.conditions import Particles, Thermal
-from mauvecl.host.orbit.constraints import sunlight
+from mauvecl.host.orbit.geometry import sunlight
 from mauvecl.host.orbit.orbit import Track
-from mauvecl.host.orbit.visibility import Visibility
+from mauvecl.host.orbit.visibility import Particles, Thermal, Visibility
 
 Float = NDArray[np.float64]
 

@@ -27,8 +27,7 @@ from mauvecl.answers.campaigns.visible import VisibleAnswer, assumption_columns,
 from mauvecl.answers.neighbour_list import share_columns
 from mauvecl.answers.progress import reported
 from mauvecl.device.stare_engine import Stares
-from mauvecl.host.orbit.conditions import PARTICLES_SOURCE, THERMAL_SOURCE
-from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
+from mauvecl.host.orbit.visibility import PARTICLES_SOURCE, THERMAL_SOURCE
 from mauvecl.runs.pool import map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
@@ -36,6 +35,7 @@ from mauvecl.schema.messages import Message, of_kind
 from mauvecl.schema.physical import DAY_S
 from mauvecl.schema.tables import Column, View, number, percent, table_of
 from mauvecl.schema.text import printable
+from mauvecl.search.completeness import Yield, recovered_per_day
 from mauvecl.study.cases import Case
 from mauvecl.study.messages import SATURATED, collect_messages
 from mauvecl.study.study import Study
@@ -43,7 +43,7 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use
     from mauvecl.study.orbits import PlanQuestion

@@ -10,13 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.answers.campaigns.conditions import Conditions, OrbitConditions
-from mauvecl.host.orbit.targets import Target
-from mauvecl.host.stars.spectral_types import nearest_spectrum
-from mauvecl.lightcurve.flares.energies import EnergyScale, quiescent_luminosity
-from mauvecl.lightcurve.flares.rates import BOLOMETRIC, Rates
-from mauvecl.lightcurve.search.completeness import Completeness, frame_signal
-from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
+from mauvecl.flares.energies import BOLOMETRIC, EnergyScale, Rates, quiescent_luminosity
+from mauvecl.host.orbit.orbit import Target
+from mauvecl.host.stars.library import nearest_spectrum
 from mauvecl.schema.errors import InputError
+from mauvecl.search.completeness import Completeness, Yield, frame_signal, recovered_per_day
 from mauvecl.study.cases import Case
 from mauvecl.study.orbits import PlanTarget
 from mauvecl.study.sections import SkyLight, Star
@@ -25,7 +23,7 @@ from mauvecl.study.unknowns import throughput_cases
 
 if TYPE_CHECKING:
     from mauvecl.answers.campaigns.visible import VisibleAnswer
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
 
 #: Amplitude of the flare from which the signal per amplitude follows; its own photon noise is neglected.
 SMALL = 0.01

@@ -9,17 +9,17 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.campaigns.planned import TargetObservation
 from mauvecl.answers.stares.inject import inject
-from mauvecl.lightcurve.flares.rates import BOLOMETRIC
-from mauvecl.lightcurve.search.completeness import PER_DECADE, Completeness, DurationLaw
-from mauvecl.lightcurve.stares.curves import Curve
+from mauvecl.flares.curves import Curve
+from mauvecl.flares.energies import BOLOMETRIC
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool
+from mauvecl.search.completeness import PER_DECADE, Completeness, DurationLaw
 from mauvecl.study.cases import Case
 from mauvecl.study.searches import InjectionQuestion
 
 if TYPE_CHECKING:
+    from mauvecl.detection.snr import Arrays
     from mauvecl.device.stare_engine import Stares
-    from mauvecl.results.shard_sums import Arrays
 
 Float = NDArray[np.float64]
 

@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.campaigns.calendars import Entry, calendar_bytes
-from mauvecl.host.orbit.season import elongation_deg, zodiacal_light
-from mauvecl.host.orbit.sun_and_moon import Bodies
-from mauvecl.host.orbit.targets import Target
-from mauvecl.host.orbit.time_grid import TimeGrid
-from mauvecl.host.orbit.visibility import Visibility, Windows
+from mauvecl.host.orbit.geometry import Bodies, TimeGrid
+from mauvecl.host.orbit.orbit import Target
+from mauvecl.host.orbit.visibility import Visibility, Windows, elongation_deg, zodiacal_light
 from mauvecl.schema.calls import validated
 from mauvecl.schema.physical import DAY_S
 from mauvecl.schema.tables import Column, View, percent, table_of
@@ -28,7 +26,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.device.engine import Engine
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use
 

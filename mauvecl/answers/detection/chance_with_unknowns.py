@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from mauvecl.answers.detection.unknown_cost import spoken
+from mauvecl.detection.statistics import Matched
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.messages import Message
-from mauvecl.statistics.linear import Matched
 from mauvecl.study.cases import Case
 from mauvecl.study.nuisances import NuisanceChoice
 

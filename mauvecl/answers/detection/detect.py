@@ -16,32 +16,36 @@ from mauvecl.answers.detection.chance_with_unknowns import chance_with_unknowns
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
 from mauvecl.answers.neighbour_list import share_columns
 from mauvecl.answers.progress import reported
+from mauvecl.detection import detection as departures
+from mauvecl.detection.detection import (
+    AREA_COLUMNS,
+    COLUMNS,
+    PAPER_G2V,
+    ROC_COLUMNS,
+    ROC_ROWS,
+    WHY,
+    Detection,
+    departure_table,
+    reconstruct,
+)
+from mauvecl.detection.distributions import QuadraticForm
+from mauvecl.detection.fap_checks import check_fap, countable
+from mauvecl.detection.statistics import Linear, Matched, Setting, read_weights
+from mauvecl.detection.tails import campaign, per_test
 from mauvecl.device.engine import Engine
-from mauvecl.results.detection import departures
-from mauvecl.results.detection.campaign import campaign, per_test
-from mauvecl.results.detection.departures import departure_table
-from mauvecl.results.detection.detection import COLUMNS, Detection
-from mauvecl.results.detection.paper_chi2 import PAPER_G2V, WHY, reconstruct
-from mauvecl.results.detection.roc import AREA_COLUMNS, ROC_ROWS
-from mauvecl.results.detection.roc import COLUMNS as ROC_COLUMNS
-from mauvecl.results.requests.fap_checks import check_fap, countable
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column, View, stacked, table_of
-from mauvecl.statistics.distributions import QuadraticForm
-from mauvecl.statistics.linear import Linear, Matched
-from mauvecl.statistics.statistic import Setting
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import amplitude_column, place_columns
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import PAPER_STARS, Study
-from mauvecl.study.weights import read_weights
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.assumptions import Use
     from mauvecl.study.questions import CampaignQuestion
 

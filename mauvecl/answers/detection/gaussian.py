@@ -18,9 +18,9 @@ from scipy import special
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.detect import DetectAnswer, detect
 from mauvecl.answers.signal.snr import SnrAnswer, snr
+from mauvecl.detection.snr import steps_of
 from mauvecl.device.engine import Engine
-from mauvecl.noise.cumulants import Cumulants
-from mauvecl.results.snr import steps_of
+from mauvecl.noise.drawing import Cumulants
 from mauvecl.schema.calls import validated
 from mauvecl.schema.tables import Column, View, number, table_of
 from mauvecl.study.labels import place_columns
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
     from astropy.table import QTable, Table
 
-    from mauvecl.host.expectation import Expectation
-    from mauvecl.results.snr import SnrResult
+    from mauvecl.detection.snr import SnrResult
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use
 

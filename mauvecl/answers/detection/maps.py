@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
-from mauvecl.results.requests.fap_checks import check_fap
+from mauvecl.detection.distributions import Interval
+from mauvecl.detection.fap_checks import check_fap
 from mauvecl.schema.calls import validated
 from mauvecl.schema.messages import Message, of_kind
 from mauvecl.schema.tables import Column, View, table_of
-from mauvecl.statistics.intervals import Interval
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import label, quantity_column
 from mauvecl.study.messages import SATURATED, collect_messages, worst_first
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.device.engine import Engine
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use
     from mauvecl.study.questions import MapQuestion

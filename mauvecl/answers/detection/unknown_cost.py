@@ -9,16 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.detection.nuisances import Nuisances, join_names
+from mauvecl.detection.statistics import Matched, Setting
 from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, Amplitude
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.messages import Message
-from mauvecl.statistics.linear import Matched
-from mauvecl.statistics.nuisances import Nuisances, join_names
-from mauvecl.statistics.statistic import Setting
 from mauvecl.study.nuisances import NuisanceChoice
 
 if TYPE_CHECKING:
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.noise.comparison import Comparison
 
 

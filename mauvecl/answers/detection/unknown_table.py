@@ -21,7 +21,7 @@ from mauvecl.study.nuisances import NuisanceChoice
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.assumptions import Use
     from mauvecl.study.study import Study
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.limits.search import LimitSearch, single_flares
-from mauvecl.noise.priors import Uniform
+from mauvecl.noise.disturbances import Uniform
 from mauvecl.noise.unknowns import values_of
 from mauvecl.schema.calls import validated
 from mauvecl.schema.tables import Column, table_of

@@ -14,12 +14,12 @@ from mauvecl.answers.detection.unknown_cost import Cost, cost_lines, marginal_li
 from mauvecl.answers.limits.assumptions import assumption_columns
 from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle, single_flares
 from mauvecl.answers.neighbour_list import share_columns
-from mauvecl.results.requests.fap_checks import check_fap
+from mauvecl.detection.distributions import Interval
+from mauvecl.detection.fap_checks import check_fap
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.messages import Message, of_kind
 from mauvecl.schema.tables import INTERVAL, Column, View, interval, records, table_of
-from mauvecl.statistics.intervals import Interval
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import amplitude_column, label, place_columns
 from mauvecl.study.messages import SATURATED, collect_messages, worst_first
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.device.engine import Engine
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use
 

@@ -10,20 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.results.requests.hypotheses import check_shape, fall_between
+from mauvecl.detection.distributions import Interval, smallest_integer
+from mauvecl.detection.requests import STATISTICS, check_shape, fall_between
+from mauvecl.detection.statistics import LinearStatistic
 from mauvecl.schema.errors import InputError, reworded
 from mauvecl.schema.physical import DAY_S
-from mauvecl.statistics.bisection import smallest_integer
-from mauvecl.statistics.intervals import Interval
-from mauvecl.statistics.registry import STATISTICS
-from mauvecl.statistics.statistic import LinearStatistic
 from mauvecl.study.cases import Case
 from mauvecl.study.messages import off_centre
 from mauvecl.study.unknowns import DrawnStudies, average, drawn, shares
 
 if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.pool import Pool
 
 #: Steps of the search for the root of the closed form, from where a flare is hardest to see.

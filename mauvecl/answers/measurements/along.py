@@ -10,22 +10,28 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import InCell
 from mauvecl.answers.measurements.expected import last_of_one_temperature, model_of, models_of
-from mauvecl.lightcurve.flares.cooling import Cooling
-from mauvecl.lightcurve.stares.cooling_fit import CoolingCourse, cooling_course, cooling_event, fit_cooling
-from mauvecl.lightcurve.stares.measured_bins import MeasuredBins, fit_bins, measure_along
-from mauvecl.lightcurve.stares.stare_requests import Arrays, StaresRequest
+from mauvecl.fits.time_course import (
+    CoolingCourse,
+    MeasuredBins,
+    cooling_course,
+    cooling_event,
+    fit_bins,
+    fit_cooling,
+    measure_along,
+)
+from mauvecl.flares.cooling import Cooling
+from mauvecl.flares.stare_scene import Arrays, StaresRequest
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column, number
 
 if TYPE_CHECKING:
+    from mauvecl.detection.nuisances import Nuisances
     from mauvecl.device.engine import Engine
-    from mauvecl.lightcurve.flares.events import Event
-    from mauvecl.lightcurve.stares.frame_components import Components
-    from mauvecl.lightcurve.stares.light_curves import StareExpectation
-    from mauvecl.results.measurements.fit import Measurement
-    from mauvecl.statistics.nuisances import Nuisances
+    from mauvecl.fits.spectrum import Measurement
+    from mauvecl.flares.events import Event
+    from mauvecl.flares.frames import Components, StareExpectation
     from mauvecl.study.cases import Case
 
 Float = NDArray[np.float64]

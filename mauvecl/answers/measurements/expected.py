@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import InCell
 from mauvecl.answers.measurements.truth import Truth
-from mauvecl.results.measurements.fit import Forecast, Measurement, fit, forecast
-from mauvecl.results.measurements.flare_model import FlareModel
-from mauvecl.results.measurements.light_factor import Ratio
-from mauvecl.results.measurements.profile import Profile, ratio_at
-from mauvecl.results.measurements.reduction import Ranges, Reduction, usable_variance, variance_of
-from mauvecl.results.measurements.two_temperatures import (
+from mauvecl.fits.flare_model import FlareModel, Ranges, Ratio, Reduction, usable_variance, variance_of
+from mauvecl.fits.profile import Profile, ratio_at
+from mauvecl.fits.spectrum import (
+    Forecast,
+    Measurement,
     TwoTemperatures,
+    fit,
     fit_two_temperatures,
+    forecast,
     forecast_two_temperatures,
 )
 from mauvecl.schema.errors import InputError
@@ -26,8 +27,8 @@ from mauvecl.study.measurements import fitted_models
 from mauvecl.study.unknowns import throughput_cases
 
 if TYPE_CHECKING:
-    from mauvecl.host.expectation import Expectation
-    from mauvecl.statistics.nuisances import Nuisances
+    from mauvecl.detection.nuisances import Nuisances
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.cases import Case
 
 Float = NDArray[np.float64]

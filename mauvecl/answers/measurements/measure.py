@@ -18,18 +18,18 @@ from mauvecl.answers.answer import Answer
 from mauvecl.answers.measurements.along import JOINT_COLUMNS, MeasuredStare, measured_stare
 from mauvecl.answers.measurements.expected import ExpectedMeasurement, expected_measurements, fit_model, matched_filter
 from mauvecl.answers.progress import reported
+from mauvecl.detection.distributions import Interval, clopper_pearson
+from mauvecl.detection.nuisances import join_names
 from mauvecl.device.engine import Engine
-from mauvecl.lightcurve.stares.measured_bins import MeasuredBins
-from mauvecl.noise.factor_distributions import FactorDistributions
-from mauvecl.results.measurements.fit import LEVELS, Measurement
-from mauvecl.results.measurements.reduction import usable_variance
+from mauvecl.fits.flare_model import usable_variance
+from mauvecl.fits.spectrum import LEVELS, Measurement
+from mauvecl.fits.time_course import MeasuredBins
+from mauvecl.noise.scene import FactorDistributions
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import Column, View, number, percent, records, stacked, table_of
-from mauvecl.statistics.intervals import Interval, clopper_pearson
-from mauvecl.statistics.nuisances import join_names
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import amplitude_column, place_columns
 from mauvecl.study.messages import collect_messages
@@ -39,8 +39,8 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from mauvecl.host.expectation import Expectation
-    from mauvecl.results.shard_sums import Arrays
+    from mauvecl.detection.snr import Arrays
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.assumptions import Use
 
 Float = NDArray[np.float64]

@@ -11,8 +11,9 @@ import numpy as np
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.observations.neighbour_flares import COLUMNS as BLENDS
 from mauvecl.answers.observations.neighbour_flares import NeighbourFlare, blended_stars
-from mauvecl.host.orbit.orbit import Orbit
-from mauvecl.host.orbit.targets import Target
+from mauvecl.fits.flare_model import FlareModel
+from mauvecl.fits.spectrum import Measurement
+from mauvecl.host.orbit.orbit import Orbit, Target
 from mauvecl.host.stars.source import Source
 from mauvecl.observations.analysis import Analysis, analyse_frames
 from mauvecl.observations.barycentre import barycentric
@@ -22,8 +23,6 @@ from mauvecl.observations.events import ObservedEvent
 from mauvecl.observations.frame_model import FrameModel
 from mauvecl.observations.frames import Frames, Reason
 from mauvecl.observations.reading import read_frames
-from mauvecl.results.measurements.fit import Measurement
-from mauvecl.results.measurements.flare_model import FlareModel
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.physical import DAY_S
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.device.engine import Engine
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use
     from mauvecl.study.study import Study

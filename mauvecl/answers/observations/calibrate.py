@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.files import ecsv_text
-from mauvecl.host.expectation import expect
+from mauvecl.host.exposure.expectation import expect
+from mauvecl.host.instrument.curves import CALIBRATED, MODE, ThroughputErrors
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.instrument.paths import shipped_names
-from mauvecl.host.instrument.throughput_errors import CALIBRATED, MODE, ThroughputErrors
 from mauvecl.observations.calibration.dark import DarkFit, assumed_dark, fit_dark
 from mauvecl.observations.calibration.exposures import CalibrationFrames
 from mauvecl.observations.calibration.photon_transfer import (
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.device.engine import Engine
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.source import Source
     from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use

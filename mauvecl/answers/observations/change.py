@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.device.engine import Engine
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.stars.source import Source
     from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use

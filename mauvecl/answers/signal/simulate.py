@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.progress import reported
-from mauvecl.noise.components import components
+from mauvecl.noise.reference import components
 from mauvecl.schema.calls import validated
 from mauvecl.schema.physical import FirstRealisation
 from mauvecl.schema.tables import Column, View, table_of
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.device.engine import Engine
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use
 

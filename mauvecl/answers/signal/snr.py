@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, ClassVar
 from mauvecl.answers.answer import Answer, InCell
 from mauvecl.answers.progress import reported
 from mauvecl.answers.signal.exposures import Per, place_of
+from mauvecl.detection.snr import COLUMNS
 from mauvecl.device.engine import Engine
-from mauvecl.host.expectation import BUDGET_COLUMNS
-from mauvecl.results.snr import COLUMNS
+from mauvecl.host.exposure.expectation import BUDGET_COLUMNS
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.tables import View, stacked
@@ -24,8 +24,8 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
-    from mauvecl.host.expectation import Expectation
-    from mauvecl.results.snr import SnrResult
+    from mauvecl.detection.snr import SnrResult
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.assumptions import Use
 
 

@@ -13,20 +13,18 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, InCell
 from mauvecl.answers.neighbour_list import share_columns
+from mauvecl.detection.distributions import Interval
 from mauvecl.device.stare_engine import Stares
-from mauvecl.lightcurve.search.counted_rate import CountedRate, consecutive_alarm_rate
-from mauvecl.lightcurve.search.fit_accuracy import FitAccuracy, Refit
-from mauvecl.lightcurve.search.injected_completeness import InjectedCompleteness
-from mauvecl.lightcurve.search.injections import Injections
-from mauvecl.lightcurve.search.sampled_rate import sampled_rate
-from mauvecl.lightcurve.stares.stare_requests import Arrays
+from mauvecl.flares.stare_scene import Arrays
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.messages import Message
 from mauvecl.schema.physical import DAY_S
 from mauvecl.schema.tables import INTERVAL, Column, View, interval, number, percent, stacked, table_of
-from mauvecl.statistics.intervals import Interval
+from mauvecl.search.completeness import InjectedCompleteness
+from mauvecl.search.false_alarms import CountedRate, consecutive_alarm_rate, sampled_rate
+from mauvecl.search.injections import FitAccuracy, Injections, Refit
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import place_columns
 from mauvecl.study.messages import collect_messages
@@ -37,8 +35,8 @@ from mauvecl.study.surveys import Sizes, StarSurvey, injected_sizes, survey_star
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
-    from mauvecl.host.expectation import Expectation
-    from mauvecl.lightcurve.stares.stare_requests import StaresRequest
+    from mauvecl.flares.stare_scene import StaresRequest
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.study.assumptions import Use
 
 Float = NDArray[np.float64]

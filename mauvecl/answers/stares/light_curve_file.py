@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.host.sky.helioecliptic import parse_position, parse_time
+from mauvecl.host.exposure.sky import parse_position, parse_time
 from mauvecl.host.tables.times import offline
 from mauvecl.host.version import VERSION
 from mauvecl.schema.physical import DAY_S

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import InCell
-from mauvecl.lightcurve.flares.events import Event
-from mauvecl.lightcurve.search.alarms import Alarm
-from mauvecl.lightcurve.stares.light_curves import LightCurves, StareExpectation
+from mauvecl.flares.events import Event
+from mauvecl.flares.frames import LightCurves, StareExpectation
+from mauvecl.search.alarms import Alarm
 
 Float = NDArray[np.float64]
 

@@ -18,16 +18,16 @@ from mauvecl.answers.answer import Answer
 from mauvecl.answers.progress import reported
 from mauvecl.answers.stares.light_curve_file import light_curve_file
 from mauvecl.answers.stares.star_stare import SearchResult, StareFlare, StarStare
-from mauvecl.lightcurve.flares.energies import Kind
-from mauvecl.lightcurve.flares.events import Event, coefficients, temperatures_of
-from mauvecl.lightcurve.search.alarms import alarms
-from mauvecl.lightcurve.search.sampled_rate import sampled_rate
-from mauvecl.lightcurve.stares.light_curves import Draw, draw_light_curves
+from mauvecl.flares.energies import Kind
+from mauvecl.flares.events import Event, coefficients, temperatures_of
+from mauvecl.flares.frames import Draw, draw_light_curves
 from mauvecl.runs.checkpoint import kept
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.messages import Message
 from mauvecl.schema.tables import Column, View, number, percent, records, table_of
+from mauvecl.search.alarms import alarms
+from mauvecl.search.false_alarms import sampled_rate
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import place_columns
 from mauvecl.study.messages import collect_messages
@@ -39,12 +39,11 @@ from mauvecl.study.surveys import survey_star
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
+    from mauvecl.detection.snr import Arrays
     from mauvecl.device.stare_engine import Stares
-    from mauvecl.host.expectation import Expectation
-    from mauvecl.lightcurve.search.blends import Factor
-    from mauvecl.lightcurve.search.flare_fit import FittedFlares
-    from mauvecl.results.shard_sums import Arrays
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.runs.checkpoint import Checkpoint
+    from mauvecl.search.flare_fits import Factor, FittedFlares
     from mauvecl.study.assumptions import Use
 
 Float = NDArray[np.float64]

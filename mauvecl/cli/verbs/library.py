@@ -11,7 +11,7 @@ import typer
 from mauvecl.cli.flags import JsonFlag, QuietFlag, option_of
 
 if TYPE_CHECKING:
-    from mauvecl.host.stars.own_stars import OwnStar
+    from mauvecl.host.stars.library import OwnStar
 
 app = typer.Typer(invoke_without_command=True, rich_markup_mode=None, add_completion=False)
 ReplaceFlag = Annotated[bool, typer.Option("--replace", help="Replace what already has that name.")]
@@ -33,7 +33,7 @@ def library(context: typer.Context, as_json: JsonFlag = False) -> None:
     """
     if context.invoked_subcommand is not None:
         return
-    from mauvecl.host.stars.catalogue import COLUMNS, OWN_COLUMNS, library_table
+    from mauvecl.host.stars.library import COLUMNS, OWN_COLUMNS, library_table
     from mauvecl.schema.tables import View, records
 
     table = library_table()
@@ -65,7 +65,7 @@ def add(
 
     Example: mauvecl library add my-star.txt --name "HD 1234"
     """
-    from mauvecl.host.stars.add_star import add
+    from mauvecl.host.stars.additions import add
     from mauvecl.schema.errors import InputError
 
     if name is not None and len(files) > 1:
@@ -94,7 +94,7 @@ def fetch(
     """
     import sys
 
-    from mauvecl.host.stars.hst_collections import fetch
+    from mauvecl.host.stars.additions import fetch
 
     for name in names:
         shown = not quiet and sys.stderr.isatty()
@@ -108,7 +108,7 @@ def remove(names: Annotated[list[str], typer.Argument(help="Names of kept stars.
     Example: mauvecl library remove "HD 1234"
     """
     from mauvecl.cli.console import show
-    from mauvecl.host.stars.own_stars import remove
+    from mauvecl.host.stars.library import remove
 
     for name in names:
         remove(name)

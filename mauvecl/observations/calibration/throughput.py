@@ -23,10 +23,10 @@ from scipy.interpolate import BSpline
 from scipy.optimize import minimize_scalar
 from scipy.sparse import csr_array
 
-from mauvecl.host.expectation import continued_to_reach, expect
+from mauvecl.host.exposure.expectation import continued_to_reach, expect
+from mauvecl.host.exposure.response import Order, response_matrix
+from mauvecl.host.exposure.sky import Sky
 from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.host.response import Order, response_matrix
-from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.host.stars.source import Source
 from mauvecl.observations.calibration.dark import DarkFit
 from mauvecl.observations.calibration.exposures import CalibrationFrames

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.response import W_PER_NM_IN_FLAM, Order, electrons_per_second
+from mauvecl.host.exposure.response import W_PER_NM_IN_FLAM, Order, electrons_per_second
 from mauvecl.host.stars.bands import photons
 from mauvecl.host.stars.flare_spectra import BALMER_EDGE_NM, EmissionLine
 from mauvecl.observations.line_index import line_index
@@ -17,7 +17,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
 if TYPE_CHECKING:
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.exposure.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.source import Source
 

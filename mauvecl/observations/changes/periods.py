@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.detection.distributions import Interval, clopper_pearson
 from mauvecl.schema.calls import validated
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, Unit
 from mauvecl.schema.physical import Positive, Probability, Seed
-from mauvecl.statistics.intervals import Interval, clopper_pearson
 
 if TYPE_CHECKING:
     from mauvecl.host.orbit.visibility import Windows

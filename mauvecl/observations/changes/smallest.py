@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.results.measurements.reduction import variance_of
+from mauvecl.fits.flare_model import variance_of
 from mauvecl.schema.calls import validated
 from mauvecl.schema.fields import Range
 from mauvecl.schema.physical import Positive, Probability
@@ -21,8 +21,8 @@ from mauvecl.schema.physical import Positive, Probability
 if TYPE_CHECKING:
     from typing import Annotated
 
-    from mauvecl.host.expectation import Expectation
-    from mauvecl.statistics.nuisances import Nuisances
+    from mauvecl.detection.nuisances import Nuisances
+    from mauvecl.host.exposure.expectation import Expectation
 
 Float = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.statistics.registry import label
+from mauvecl.detection.requests import label
 from mauvecl.web.closed_forms import percent
 from mauvecl.web.figures import Canvas, strips
 from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab

@@ -15,7 +15,7 @@ from mauvecl.web.headline import LIMITS
 from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
 if TYPE_CHECKING:
-    from mauvecl.statistics.statistic import DetectionForms
+    from mauvecl.detection.statistics import DetectionForms
     from mauvecl.web.closed_forms import ClosedForms
 
 Float = NDArray[np.float64]

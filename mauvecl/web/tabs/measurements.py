@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.measurements.expected import expected_measurements, models_of
 from mauvecl.answers.measurements.measure import COLUMNS
-from mauvecl.results.measurements.flare_model import FlareModel
+from mauvecl.fits.flare_model import FlareModel
 from mauvecl.schema.tables import View, records
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.web.closed_forms import short
@@ -21,7 +21,7 @@ from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 if TYPE_CHECKING:
     from mauvecl.answers.measurements.expected import ExpectedMeasurement
     from mauvecl.answers.measurements.measure import MeasuredFlare
-    from mauvecl.results.measurements.fit import Forecast
+    from mauvecl.fits.spectrum import Forecast
     from mauvecl.web.closed_forms import ClosedForms
 
 Float = NDArray[np.float64]

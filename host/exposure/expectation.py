@@ -1,0 +1,643 @@
+"""Means and noise of the pixels of an exposure, before anything is drawn."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+
+import astropy.units as u
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from mauvecl.host.content_equality import ContentEquality
+from mauvecl.host.exposure import DEFAULT_SKY
+from mauvecl.host.exposure.response import Order, electrons_per_second, negative_means_message
+from mauvecl.host.exposure.sky import Sky
+from mauvecl.host.instrument.instrument import Instrument, LineSpread
+from mauvecl.host.spectra.coverage import check_covers, continued
+from mauvecl.host.spectra.wavelength_range import SPAN_NM
+from mauvecl.schema.calls import validated
+from mauvecl.schema.drawable import Drawable
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Unit
+from mauvecl.schema.messages import Message
+from mauvecl.schema.physical import Duration, Exposure, SkyBrightness
+from mauvecl.schema.tables import Column, table_of
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.host.exposure.star import Neighbours
+    from mauvecl.host.stars.source import Source
+
+Float = NDArray[np.float64]
+
+#: Distance of a mean below saturation, in standard deviations of a frame, beyond which saturation is neglected.
+CUT_SIGMA = 8.0
+#: Largest number of frames of an exposure: a day of 5 ms each, a thousandth of the payload's.
+MAX_FRAMES = 2**24
+#: Definition of the signal: the star alone ("net"), or the star and the zodiacal light, as in the MauveSim paper.
+Signal = Literal["net", "paper"]
+SIGNALS: tuple[Signal, ...] = get_args(Signal)
+
+#: Columns of the table of noise by origin.
+BUDGET_COLUMNS = (
+    Column("wavelength", unit="nm", description="vacuum wavelength, the middle of the pixel or element", heading="nm",
+           format=".1f"),
+    Column("source_photon", unit="DN", description="photon noise of the star, rms", heading="source photons",
+           format=".2f"),
+    Column("zodiacal_photon", unit="DN", description="photon noise of the zodiacal light, rms",
+           heading="zodiacal photons", format=".2f"),
+    Column("neighbour_photon", unit="DN", description="photon noise of neighbours in the fibre, rms",
+           heading="neighbours' photons", format=".2f"),
+    Column("dark", unit="DN", description="noise of the dark current, rms", heading="dark", format=".2f"),
+    Column("read", unit="DN", description="read noise, rms", heading="read", format=".2f"),
+    Column("total", unit="DN", description="all of them in quadrature, without the ADC's rounding", heading="total",
+           format=".2f"),
+)  # fmt: skip
+
+
+@validated
+@dataclass(frozen=True, eq=False)
+class Expectation(Drawable, ContentEquality):
+    """Means and noise per pixel of an exposure; the arrays are read-only and refer to a single frame.
+
+    Attributes
+    ----------
+    wavelength_nm : ndarray, shape (n_pixel,)
+        Pixel centres.
+    source_electrons, sky_electrons : ndarray, shape (n_pixel,)
+        Mean electrons per frame.
+    dark_dn : ndarray, shape (n_pixel,)
+        Mean dark counts per frame, DN, independent of `dark_unit`.
+    dark_unit : {"DN", "electrons"}
+        Unit in which the dark counts follow a Poisson distribution; their mean in electrons is dark_dn / gain.
+    bias_dn, read_noise_dn, gain_dn_per_electron : ndarray, shape (n_pixel,)
+        Bias (DN), read noise (DN rms per frame) and gain.
+    photon_noise : {"gaussian", "poisson"}
+        Distribution of the photons about their mean; the variance is the same.
+    n_frames : int
+    frame_s : float
+        Length of a frame; the exposure is n_frames * frame_s.
+    element : ndarray of int32, shape (n_pixel,)
+        Index of each pixel's resolution element, ascending from 0: half-open bins from the start of the output range.
+    element_wavelength_nm : ndarray, shape (n_element,)
+        Centres of these bins; the last may hold fewer pixels.
+    adc_max_dn : int
+    saturation_dn : float
+        Raw level at which the detector saturates, DN.
+    name, instrument : str
+    provenance : mapping of str
+        Origin of all inputs: digests, order, sky, history of the source, requested exposure.
+    conditions : mapping of float
+        The instrument's values of the quantities that priors may vary: ``temperature_c``, ``dark_slope_per_c``,
+        ``light_loss``, ``pointing_loss``.
+    messages : tuple of str
+        Remarks for the user, saturation first.
+    signal : {"net", "paper"}
+        Definition of the signal. With ``net`` it is the star alone: the sky is subtracted like bias and dark, and only
+        its noise remains. With ``paper`` it includes the zodiacal light, as in the MauveSim paper. The noise is the
+        same.
+    neighbour_electrons : ndarray, shape (n_pixel,)
+        Mean electrons per frame of other stars in the fibre, zero by default. They are no signal: their mean is
+        subtracted like that of the sky.
+    """
+
+    wavelength_nm: Annotated[Float, Unit("nm")]
+    source_electrons: Float
+    sky_electrons: Float
+    dark_dn: Annotated[Float, Unit("DN")]
+    dark_unit: Literal["DN", "electrons"]
+    bias_dn: Annotated[Float, Unit("DN")]
+    read_noise_dn: Annotated[Float, Unit("DN")]
+    gain_dn_per_electron: Float
+    n_frames: int
+    frame_s: Duration
+    element: NDArray[np.int32]
+    element_wavelength_nm: Annotated[Float, Unit("nm")]
+    adc_max_dn: int
+    saturation_dn: Annotated[float, Unit("DN")]
+    name: str
+    instrument: str
+    provenance: Mapping[str, str]
+    photon_noise: Literal["gaussian", "poisson"] = "gaussian"
+    conditions: Mapping[str, float] = field(default_factory=dict)
+    messages: tuple[str, ...] = ()
+    signal: Signal = "net"
+    neighbour_electrons: Float = field(default_factory=lambda: np.zeros(0))
+
+    def to_specutils(self) -> Any:
+        """Convert the mean signal of the exposure, DN, and its standard deviation to a specutils Spectrum.
+
+        This needs the extra ``spectra``.
+        """
+        import astropy.units as u
+
+        try:
+            from astropy.nddata import StdDevUncertainty
+            from specutils import Spectrum
+        except ImportError as error:
+            raise InputError("specutils is missing", "`pip install 'mauvecl[spectra]'`", key="specutils") from error
+        return Spectrum(
+            spectral_axis=self.wavelength_nm * u.nm,
+            flux=self.signal_dn * u.adu,
+            uncertainty=StdDevUncertainty(np.sqrt(self.variance_dn2)),
+            mask=self.saturated,
+            meta=dict(self.provenance),
+        )
+
+    def _line(self) -> str:
+        exposure = f"{self.exposure_s:g} s in {self.n_frames} frames of {self.wavelength_nm.size} pixels"
+        return f"{self.name!r} on {self.instrument}, {exposure}"
+
+    def _repr_html_(self) -> str:
+        remarks = "".join(f"<br><small>{html.escape(text)}</small>" for text in self.messages)
+        name, where = html.escape(self.name), html.escape(self.instrument)
+        return (
+            f"<b>{name}</b> on {where}, {self.exposure_s:g} s in {self.n_frames} frames: best "
+            f"S/N {self.snr().max():.3g} per pixel, {self.snr_per_element().max():.3g} an element{remarks}"
+        )
+
+    def __post_init__(self) -> None:
+        if self.signal not in SIGNALS:
+            raise InputError.of("signal", self.signal, "'net' or 'paper'")
+        if not self.neighbour_electrons.size:
+            object.__setattr__(self, "neighbour_electrons", np.zeros(self.wavelength_nm.shape))
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if isinstance(value, np.ndarray):
+                kept = np.array(value, np.int32 if each.name == "element" else np.float64)
+                kept.setflags(write=False)
+                object.__setattr__(self, each.name, kept)
+        n_pixel = self.wavelength_nm.shape
+        for name in PER_PIXEL:
+            values = getattr(self, name)
+            if values.shape != n_pixel:
+                raise ValueError(f"{name} has the shape {values.shape}, expected {n_pixel}")
+            bad = ~((values >= 0) & (values <= MAX_PER_FRAME))
+            if bad.any():
+                pixel = int(np.argmax(bad))
+                raise InputError.of(name, values[pixel], f"0 to {MAX_PER_FRAME:g}", where=f"pixel {pixel}")
+        object.__setattr__(self, "provenance", dict(self.provenance))
+
+    @property
+    def table(self) -> QTable:
+        """Wavelength, signal, noise (rms) and S/N of the exposure, one row per pixel, with units."""
+        return self._table(self.wavelength_nm, self.signal_dn, self._noise_dn2, self.snr())
+
+    @property
+    def element_table(self) -> QTable:
+        """The columns of `table`, one row per resolution element."""
+        signal, variance = self.per_element(self.signal_dn), self.per_element(self._noise_dn2)
+        return self._table(self.element_wavelength_nm, signal, variance, self.snr_per_element())
+
+    def _table(self, wavelength_nm: Float, signal: Float, variance: Float, snr: Float) -> QTable:
+        from astropy.table import QTable
+
+        table = QTable({"wavelength": wavelength_nm * u.nm, "signal": signal * u.DN, "noise": np.sqrt(variance) * u.DN})
+        table["snr"] = snr
+        table["signal"].info.description = "mean signal: the star's" + (" and the sky's" * (self.signal == "paper"))
+        table["noise"].info.description = "standard deviation, without the ADC's rounding"
+        table.meta |= {"name": self.name, "instrument": self.instrument, "exposure_s": self.exposure_s}
+        return table
+
+    @property
+    def exposure_s(self) -> float:
+        """Length of the exposure, s."""
+        return self.n_frames * self.frame_s
+
+    @cached_property
+    def net_source_dn(self) -> Float:
+        """Mean signal of the source alone in the exposure, DN, shape (n_pixel,)."""
+        return self.n_frames * self.gain_dn_per_electron * self.source_electrons
+
+    @property
+    def light_electrons(self) -> Float:
+        """Mean electrons per frame of all light: source, neighbours and sky, shape (n_pixel,)."""
+        return self.source_electrons + self.sky_electrons + self.neighbour_electrons
+
+    @property
+    def target_share(self) -> float:
+        """Share of the source in the electrons of all stars in the fibre, 1 without neighbours."""
+        source, neighbours = float(self.source_electrons.sum()), float(self.neighbour_electrons.sum())
+        return source / (source + neighbours) if neighbours else 1.0
+
+    @cached_property
+    def light_dn(self) -> Float:
+        """Mean signal of the exposure before saturation, source, neighbours and sky, DN, shape (n_pixel,)."""
+        return self.n_frames * self.gain_dn_per_electron * self.light_electrons
+
+    @cached_property
+    def neighbour_dn(self) -> Float:
+        """Mean signal of neighbours in the exposure, DN, shape (n_pixel,)."""
+        return self.n_frames * self.gain_dn_per_electron * self.neighbour_electrons
+
+    @cached_property
+    def sky_dn(self) -> Float:
+        """Mean signal of the sky in the exposure, DN, shape (n_pixel,)."""
+        return self.n_frames * self.gain_dn_per_electron * self.sky_electrons
+
+    @cached_property
+    def recorded_light_dn(self) -> Float:
+        """Mean recorded light of the exposure, DN: `light_dn` minus the loss by saturation."""
+        return self.light_dn - self._cut[0]
+
+    @cached_property
+    def subtracted_dn(self) -> Float:
+        """Mean that an observer subtracts in addition to bias and dark, DN, shape (n_pixel,).
+
+        This is the mean of neighbours and, unless it counts as signal, of the sky.
+        """
+        return self.neighbour_dn + self.sky_dn if self.signal == "net" else self.neighbour_dn
+
+    @cached_property
+    def signal_dn(self) -> Float:
+        """Mean recorded signal of the exposure, DN, shape (n_pixel,): `recorded_light_dn` minus `subtracted_dn`."""
+        return self.recorded_light_dn - self.subtracted_dn
+
+    @cached_property
+    def mean_raw_dn(self) -> Float:
+        """Mean raw level of a frame before saturation and ADC: light, dark and bias, DN, shape (n_pixel,)."""
+        return self.light_dn / self.n_frames + self.dark_dn + self.bias_dn
+
+    @cached_property
+    def recorded_dn(self) -> Float:
+        """Mean raw value of the exposure, DN, shape (n_pixel,)."""
+        return self.n_frames * self.mean_raw_dn - self._cut[0]
+
+    @cached_property
+    def dark_step_dn(self) -> Float:
+        """DN per dark count, shape (n_pixel,): one, or the gain if the dark counts are electrons."""
+        return self.gain_dn_per_electron if self.dark_unit == "electrons" else np.ones_like(self.dark_dn)
+
+    @cached_property
+    def dark_variance_dn2(self) -> Float:
+        """Variance of the dark counts of a frame, DN^2, shape (n_pixel,)."""
+        return np.asarray(self.dark_dn * self.dark_step_dn)
+
+    @cached_property
+    def variance_dn2(self) -> Float:
+        """Variance of the recorded exposure, DN^2, including the rounding of each frame (1/12), shape (n_pixel,).
+
+        Saturation reduces the variance, but not below that of rounding. Rounding acts as noise of mean 0 and variance
+        1/12 only if the noise of a frame is at least about 1 DN. For a nearly noiseless detector this assumption, and
+        every closed form based on it, fails, and draws differ.
+        """
+        return self._cut[1]
+
+    @cached_property
+    def unsaturated_variance_dn2(self) -> Float:
+        """Variance of the exposure without saturation, DN^2, shape (n_pixel,)."""
+        return self._noise_of(self.light_dn) + self.n_frames / 12
+
+    @cached_property
+    def _noise_dn2(self) -> Float:
+        return self._noise_of(self.recorded_light_dn)
+
+    def _noise_of(self, light_dn: Float) -> Float:
+        photon = self.gain_dn_per_electron * light_dn
+        return photon + self.n_frames * (self.read_noise_dn**2 + self.dark_variance_dn2)
+
+    @cached_property
+    def _cut(self) -> tuple[Float, Float]:
+        """Mean lost to saturation and remaining variance, for normally distributed frames that are clipped above."""
+        lost, variance = np.zeros_like(self.light_dn), self.unsaturated_variance_dn2.copy()
+        sd = np.sqrt(variance / self.n_frames)
+        near = self.mean_raw_dn + CUT_SIGMA * sd > self.highest_dn
+        if near.any():
+            mean, sd = self.mean_raw_dn[near], sd[near]
+            a = (self.highest_dn - mean) / sd
+            below, density = special.ndtr(a), np.exp(-(a**2) / 2) / np.sqrt(2 * np.pi)
+            # First and second moment of min(z, a) - a.
+            first = -(a * below + density)
+            second = (a**2 + 1) * below + a * density
+            lost[near] = self.n_frames * (mean - self.highest_dn - sd * first)
+            variance[near] = self.n_frames * np.maximum(sd**2 * (second - first**2), 1 / 12)
+        return lost, variance
+
+    @cached_property
+    def cut_share(self) -> Float:
+        """Probability that saturation clips a frame of a pixel, shape (n_pixel,)."""
+        sd = np.sqrt(self.unsaturated_variance_dn2 / self.n_frames)
+        return np.asarray(special.ndtr((self.mean_raw_dn - self.highest_dn - 0.5) / sd))
+
+    @property
+    def saturation_clause(self) -> str:
+        """End of an error message, ``; N of M pixels of NAME saturate ...``; empty if none does."""
+        many = int(self.saturated.sum())
+        if not many:
+            return ""
+        return f"; {many} of {self.saturated.size} pixels of {self.name} saturate in a frame of {self.frame_s:g} s"
+
+    def snr(self) -> Float:
+        """Return the signal-to-noise ratio per pixel, shape (n_pixel,).
+
+        The ratio is S / sqrt(sigma_L^2 + sigma_R^2 + sigma_D^2), all in DN, where S is `signal_dn` and sigma_L is the
+        gain times the root of all electrons of light, of neighbours and sky as well. The ADC's rounding is not
+        included.
+        """
+        return _ratio(self.signal_dn, self._noise_dn2)
+
+    def snr_per_element(self) -> Float:
+        """Return the signal-to-noise ratio per resolution element, shape (n_element,), with noise in quadrature."""
+        return _ratio(self.per_element(self.signal_dn), self.per_element(self._noise_dn2))
+
+    def per_element(self, values: Float) -> Float:
+        """Sum the values of pixels over resolution elements, from shape (n_pixel,) to (n_element,)."""
+        if np.shape(values) != self.element.shape:
+            raise InputError(
+                f"values of the shape {np.shape(values)}",
+                f"{self.element.shape}: one for each pixel",
+                key="values",
+                value=np.shape(values),
+            )
+        return np.asarray(np.bincount(self.element, values, minlength=self.element_wavelength_nm.size), np.float64)
+
+    def noise_budget(self) -> QTable:
+        """Return the noise of the exposure by origin, DN rms per pixel.
+
+        Returns
+        -------
+        QTable
+            Columns `wavelength`, `source_photon`, `zodiacal_photon`, with neighbours `neighbour_photon`, `dark`, `read`
+            and `total`. The total is their quadratic sum, so `snr` is signal_dn / total. The ADC's rounding, 0.29 DN
+            per frame, is not included.
+        """
+        n, gain = self.n_frames, self.gain_dn_per_electron
+        # Fraction of the light that saturation leaves.
+        kept = np.divide(self.recorded_light_dn, self.light_dn, out=np.ones_like(gain), where=self.light_dn > 0)
+        variances = {
+            "source_photon": n * gain**2 * self.source_electrons * kept,
+            "zodiacal_photon": n * gain**2 * self.sky_electrons * kept,
+            "neighbour_photon": n * gain**2 * self.neighbour_electrons * kept,
+            "dark": n * self.dark_variance_dn2,
+            "read": n * self.read_noise_dn**2,
+            "total": self._noise_dn2,
+        }
+        noise = {name: np.sqrt(variance) for name, variance in variances.items()}
+        about = {"exposure_s": self.exposure_s, "name": self.name}
+        columns = [one for one in BUDGET_COLUMNS if one.name != "neighbour_photon" or self.neighbour_electrons.any()]
+        return table_of(columns, [{"wavelength": self.wavelength_nm} | noise], **about)
+
+    @property
+    def ceiling_dn(self) -> float:
+        """Raw level at which a pixel saturates, DN: the lower of the detector's and the ADC's."""
+        return min(self.saturation_dn, float(self.adc_max_dn))
+
+    @property
+    def highest_dn(self) -> int:
+        """Largest recorded value of a frame: the last whole DN up to `ceiling_dn`."""
+        return int(np.floor(self.ceiling_dn))
+
+    @cached_property
+    def saturated(self) -> NDArray[np.bool_]:
+        """True for pixels whose mean raw level in a frame reaches `ceiling_dn`, shape (n_pixel,)."""
+        return np.asarray(self.mean_raw_dn >= self.ceiling_dn)
+
+    @property
+    def longest_safe_frame_s(self) -> float:
+        """Longest frame in which no pixel's mean raw level reaches saturation, s; infinite without light and dark."""
+        rise = (self.mean_raw_dn - self.bias_dn) / self.frame_s
+        with np.errstate(divide="ignore"):
+            return float(np.min(np.where(rise > 0, (self.ceiling_dn - self.bias_dn) / rise, np.inf)))
+
+
+#: Largest electrons or DN per pixel and frame, far beyond any detector.
+MAX_PER_FRAME = 1e12
+#: Arrays with one value per pixel, from 0 to `MAX_PER_FRAME`.
+PER_PIXEL = (
+    "source_electrons",
+    "sky_electrons",
+    "neighbour_electrons",
+    "dark_dn",
+    "bias_dn",
+    "read_noise_dn",
+    "gain_dn_per_electron",
+)
+
+
+def _ratio(signal: Float, variance: Float) -> Float:
+    # A noiseless detector without light has a ratio of 0 by definition.
+    return np.divide(signal, np.sqrt(variance), out=np.zeros_like(signal), where=variance > 0)
+
+
+@validated
+def expect(
+    source: Source | str,
+    instrument: Instrument | str | Path,
+    *,
+    exposure: Exposure,
+    sky: Sky | SkyBrightness | None = None,
+    order: Order = "paper",
+    signal: Signal = "net",
+    neighbours: Neighbours | None = None,
+) -> Expectation:
+    """Compute the expectation of an exposure: means and noise per pixel, without drawing anything.
+
+    Parameters
+    ----------
+    source : Source or str
+        A source, which emits no light beyond its wavelengths, or a name of the library.
+    instrument : Instrument, str or Path
+        An instrument, or a name or file for `Instrument.load`.
+    exposure : Quantity or float
+        Exposure time, up to one day; plain numbers are seconds. It is rounded up to whole frames, with a message.
+    sky : Sky, Quantity or float, optional
+        Plain numbers are mag arcsec^-2. The default is zodiacal light of V = 22.1 mag arcsec^-2, as on the command
+        line; `Sky.none()` means no sky.
+    order : {"paper", "physical"}
+        Whether efficiencies act after or before the line spread function; see `response_matrix`.
+    signal : {"net", "paper"}
+        Whether the signal in an S/N is the star alone, or includes the zodiacal light as in the MauveSim paper.
+    neighbours : Neighbours, optional
+        Other stars in the fibre; none by default.
+
+    Raises
+    ------
+    InputError
+        If the source does not cover the output range, or its flux has no absolute scale.
+
+    Examples
+    --------
+    >>> from mauvecl import Instrument, Sky, Source, expect
+    >>> star = Source.from_library("G2V").at_magnitude(7.4)
+    >>> quiet = expect(star, Instrument.load("mauve"), exposure=48, sky=Sky.of_brightness(22.1))
+    >>> quiet.n_frames, quiet.exposure_s
+    (10, 50.0)
+    >>> float(round(quiet.snr().max(), 2)), float(round(quiet.snr_per_element().max(), 1))
+    (8.21, 48.5)
+    """
+    from mauvecl.host.stars.source import Source
+
+    source = Source.from_library(source) if isinstance(source, str) else source
+    instrument = instrument if isinstance(instrument, Instrument) else Instrument.load(instrument)
+    sky = sky if isinstance(sky, Sky) else Sky.of_brightness(DEFAULT_SKY if sky is None else sky)
+    # The margin makes 0.1 + 0.2 s three frames of 0.1 s despite rounding.
+    n_frames = max(1, int(np.ceil(exposure / instrument.frame_s * (1 - 1e-12))))
+    if n_frames > MAX_FRAMES:
+        raise InputError.of("exposure", exposure, f"at most {MAX_FRAMES} frames of {instrument.frame_s:g} s", unit="s")
+    low, high = instrument.output_min_nm, instrument.output_max_nm
+    first, last = source.measured_nm or (float(source.wavelength_nm[0]), float(source.wavelength_nm[-1]))
+    check_covers(source.name, (first, last), (low, high), f"{instrument.name}'s output range ")
+    source = continued_to_reach(source, instrument)
+    if source.unscaled:
+        raise InputError(
+            f"the spectrum of {source.name} is not as bright as the star is seen: {source.unscaled}",
+            "a magnitude as well",
+            key="magnitude",
+        )
+
+    def per_frame(light: Source) -> Float:
+        rate = electrons_per_second(instrument, light.wavelength_nm, light.flux_flam, order)
+        return rate * instrument.frame_s * instrument.per_pixel("response", 1.0)
+
+    zodiacal = sky.spectrum(instrument.field_of_view_arcsec2)
+    n_pixel = instrument.wavelength_nm.size
+    element, element_wavelength = _elements(instrument)
+    electrons = per_frame(source)
+    near = np.zeros(n_pixel)
+    if neighbours is not None:
+        near = _faint_enough(instrument.frame_s * neighbours.electrons_per_second(instrument, order), "a neighbour")
+    plain = Expectation(
+        wavelength_nm=instrument.wavelength_nm,
+        source_electrons=_faint_enough(np.maximum(electrons, 0.0), source.name),
+        sky_electrons=np.zeros(n_pixel) if zodiacal is None else np.maximum(per_frame(zodiacal), 0.0),
+        dark_dn=instrument.per_pixel("dark", instrument.dark_dn_per_s * instrument.frame_s),
+        dark_unit=instrument.dark_unit,
+        bias_dn=instrument.per_pixel("bias_dn", instrument.bias_dn),
+        read_noise_dn=instrument.per_pixel("read_noise_dn", instrument.read_noise_dn),
+        gain_dn_per_electron=instrument.per_pixel("gain", instrument.gain_dn_per_electron),
+        n_frames=n_frames,
+        frame_s=instrument.frame_s,
+        element=element,
+        element_wavelength_nm=element_wavelength,
+        photon_noise=instrument.photon_noise,
+        signal=signal,
+        adc_max_dn=instrument.adc_max_dn,
+        saturation_dn=instrument.saturation_dn,
+        neighbour_electrons=near,
+        conditions={
+            name: getattr(instrument, name)
+            for name in ("temperature_c", "dark_slope_per_c", "light_loss", "pointing_loss")
+        },
+        name=source.name,
+        instrument=instrument.name,
+        provenance={
+            "source": source.name,
+            "source origin": source.origin,
+            "source notes": "; ".join(source.notes),
+            "source history": "; ".join(source.history),
+            "source remarks": "; ".join(source.messages),
+            "source digest": source.digest,
+            "sky": sky.description,
+            "sky digest": "" if zodiacal is None else zodiacal.digest,
+            "instrument": instrument.name,
+            "instrument digest": instrument.digest,
+            "detector temperature": f"{instrument.temperature_c:g} C",
+            "order": order,
+            "signal": signal,
+            "requested exposure": f"{exposure:g} s",
+            "exposure": f"{n_frames} x {instrument.frame_s:g} s",
+        }
+        | ({} if neighbours is None else neighbours.provenance(instrument)),
+    )
+    messages = [*_saturation(plain), *(f"{source.name}: {text}." for text in source.messages)]
+    if neighbours is not None:
+        messages += neighbours.messages(source.name, instrument)
+    drawn = np.sqrt(plain.variance_dn2) / (n_frames * plain.gain_dn_per_electron)
+    messages += negative_means_message(source, instrument, electrons, drawn, order)
+    if signal == "paper" and plain.sky_electrons.any():
+        messages.append(Message("S/N counts the zodiacal light as signal, as the MauveSim paper does.", "paper signal"))
+    if n_frames * instrument.frame_s > exposure * (1 + 1e-9):
+        text = (
+            f"The exposure of {exposure:g} s is rounded up to {plain.exposure_s:g} s, "
+            f"{n_frames} frame{'s' if n_frames > 1 else ''} of {instrument.frame_s:g} s."
+        )
+        messages.append(Message(text, "rounded up"))
+    if any(note.startswith("dereddened") for note in source.notes) and not any("redden" in h for h in source.history):
+        messages.append(
+            f"{source.name} was dereddened by its archive: it is brighter in the ultraviolet than as observed, unless "
+            "it is reddened again (ebv)."
+        )
+    if instrument.notice:
+        messages.append(instrument.notice)
+    if source.scale:
+        messages.append(source.scale)
+    return replace(plain, messages=tuple(messages))
+
+
+def continued_to_reach(source: Source, instrument: Instrument) -> Source:
+    """Continue the dark ends of a source as far as the instrument's line spread function reaches."""
+    nm = source.wavelength_nm
+    if nm[0] <= SPAN_NM[0] and nm[-1] >= SPAN_NM[1]:
+        return source
+    range_nm = (instrument.output_min_nm, instrument.output_max_nm)
+    nm, flux, messages = continued(source.name, nm, source.flux_flam, range_nm, LineSpread.of(instrument))
+    return (
+        replace(source, wavelength_nm=nm, flux_flam=flux, messages=(*source.messages, *messages))
+        if messages
+        else source
+    )
+
+
+def _elements(instrument: Instrument) -> tuple[NDArray[np.int32], Float]:
+    """Return each pixel's resolution element, and the centres of those that hold a pixel."""
+    width = instrument.resolution_element_nm
+    bins = np.floor((instrument.wavelength_nm - instrument.output_min_nm) / width)
+    # An array that starts above the output range leaves the first bins empty.
+    held, element = np.unique(bins, return_inverse=True)
+    return element.astype(np.int32), instrument.output_min_nm + (held + 0.5) * width
+
+
+#: Fraction of exposures with a clipped frame from which a message reports it.
+REPORTED_CLIPPING = 1e-4
+
+
+def _saturation(x: Expectation) -> tuple[str, ...]:
+    """Return the message on saturation, if any."""
+    cut = x.cut_share
+    touched = float(-np.expm1(x.n_frames * np.sum(np.log1p(-np.minimum(cut, 1 - 1e-16)))))
+    if not x.saturated.any() and touched < REPORTED_CLIPPING:
+        return ()
+    brightest = int(np.argmax(x.mean_raw_dn))
+    safe = x.longest_safe_frame_s
+    # Rounded down, so that the reported length is safe.
+    safe_s = np.floor(safe * 1000) / 1000
+    flares = [text for text in x.provenance.get("source history", "").split("; ") if text.startswith("flare")]
+    name = f"{x.name} with a {flares[-1].removesuffix(', added')}" if flares else x.name
+    advice = (
+        f"the longest safe frame is {safe_s:g} s (brightest pixel at {x.wavelength_nm[brightest]:.1f} nm, dark and "
+        "bias included)"
+    )
+    often = (
+        f"frames are cut off there: {cut.sum():.3g} pixels of a frame on average, at least one in "
+        f"{100 * touched:.3g} % of exposures (closed form)"
+    )
+    if not x.saturated.any():
+        text = f"SATURATED at times: pixels of {name} come near {x.ceiling_dn:.0f} DN, and {often}."
+        return (Message(text, "saturated"),)
+    # First and last wavelength of each run of saturated pixels.
+    steps = np.flatnonzero(np.diff(np.concatenate([[0], x.saturated.astype(np.int8), [0]])))
+    runs = [f"{x.wavelength_nm[a]:.1f}-{x.wavelength_nm[b - 1]:.1f}" for a, b in steps.reshape(-1, 2)]
+    text = (
+        f"SATURATED: {int(x.saturated.sum())} of {x.saturated.size} pixels at {', '.join(runs)} nm reach "
+        f"{x.ceiling_dn:.0f} DN in a {x.frame_s:g} s frame of {name}; {advice}; {often}."
+    )
+    return (Message(text, "saturated"),)
+
+
+def _faint_enough(electrons: Float, name: str) -> Float:
+    """Return the mean electrons of a frame; raise InputError if a star is too bright for any pixel."""
+    if (electrons > MAX_PER_FRAME).any():
+        why = "; at 1 au it has V = -26.76 (Willmer 2018)" if name == "Sun" else ""
+        raise InputError(
+            f"{name} is too bright: it makes {float(electrons.max()):.3g} electrons in one frame of a pixel{why}",
+            f"at most {MAX_PER_FRAME:g}: `magnitude` makes it a star at a distance, as in `magnitude=7.4`",
+            key="magnitude",
+        )
+    return electrons

@@ -1,0 +1,280 @@
+"""Light of the sky, which the fibre collects over its whole field of view: zodiacal light by position and time."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import resources
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.stars.library import by_key, name_key, near_names
+from mauvecl.host.tables.coordinates import EXPECTED
+from mauvecl.host.tables.coordinates import position as coordinates
+from mauvecl.host.tables.times import offline
+from mauvecl.schema.calls import validated
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import SkyBrightness, SolidAngle
+
+if TYPE_CHECKING:
+    from astropy.coordinates import SkyCoord
+    from astropy.time import Time
+
+    from mauvecl.host.stars.source import Source
+
+#: Calendar years in which errors of UTC and ephemeris are far smaller than a cell of the zodiacal table.
+YEARS = (1990, 2100)
+
+
+@dataclass(frozen=True)
+class HelioEcliptic:
+    """Ecliptic position relative to the Sun."""
+
+    longitude_deg: float  # absolute difference of the target's and the Sun's ecliptic longitudes, 0-180
+    latitude_deg: float  # absolute ecliptic latitude, 0-90
+    separation_deg: float  # angle between target and Sun
+
+
+def helioecliptic(target: SkyCoord | str, time: Time | str) -> HelioEcliptic:
+    """Return the helio-ecliptic coordinates of a target, in the true geocentric ecliptic of date.
+
+    Parameters
+    ----------
+    target : SkyCoord or str
+        Single position; a string is a well-known star, or ICRS in degrees ("290.0 -11.2") or sexagesimal hours and
+        degrees.
+    time : Time or str
+        Single time within 1990-2100; a string is ISO 8601, UTC.
+    """
+    with offline():
+        from astropy.coordinates import GeocentricTrueEcliptic, get_sun
+
+        moment = parse_time(time)
+        position = parse_position(target)
+        frame = GeocentricTrueEcliptic(equinox=moment, obstime=moment)
+        sun = get_sun(moment).transform_to(frame)
+        try:
+            star = position.transform_to(frame)
+        except Exception:  # frames that cannot be transformed (AltAz without a location) raise many kinds
+            raise InputError(
+                f"target in the frame {position.frame.name!r} cannot be turned to the ecliptic",
+                "ICRS",
+                key="target",
+                value=position.frame.name,
+            ) from None
+        difference = float((star.lon - sun.lon).wrap_at("180d").deg)
+        longitude, latitude = abs(difference), float(star.lat.deg)
+        sun_latitude = float(sun.lat.rad)
+    cosine = np.sin(np.radians(latitude)) * np.sin(sun_latitude) + np.cos(np.radians(latitude)) * np.cos(
+        sun_latitude
+    ) * np.cos(np.radians(longitude))
+    return HelioEcliptic(longitude, abs(latitude), float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))))
+
+
+def parse_time(time: Time | str) -> Time:
+    """Return a single finite time between 1990 and 2100; text is ISO 8601, UTC. Call inside `offline`."""
+    from astropy.time import Time
+
+    expected = "a UTC time such as '2026-03-01T12:00:00'"
+    if isinstance(time, str):
+        try:
+            moment = Time(time.strip().removesuffix("Z"), scale="utc")
+        except ValueError:
+            raise InputError.of("time", time, expected) from None
+    elif isinstance(time, Time):
+        moment = time
+    else:
+        raise InputError.of("time", time, expected)
+    if not moment.isscalar:
+        raise InputError(f"time holds {moment.size} times", "one", key="time", value=time)
+    if np.ma.is_masked(moment.jd) or not np.isfinite(moment.jd):
+        raise InputError.of("time", time, expected)
+    year = float(moment.decimalyear)
+    if not YEARS[0] <= year < YEARS[1]:
+        raise InputError.of("time", moment.utc.isot, f"between {YEARS[0]} and {YEARS[1]}")
+    return moment
+
+
+def parse_position(target: SkyCoord | str) -> SkyCoord:
+    """Return a single finite position; text is a name, or ICRS in degrees or sexagesimal hours and degrees."""
+    import astropy.units as u
+    from astropy.coordinates import SkyCoord
+    from astropy.coordinates.baseframe import BaseCoordinateFrame
+
+    expected = EXPECTED
+    if isinstance(target, str):
+        star = by_key().get(name_key(target))
+        if star is not None:
+            return SkyCoord(star.ra_deg, star.dec_deg, unit=u.deg)
+        try:
+            return SkyCoord(*coordinates(target), unit=u.deg)
+        except InputError as error:
+            if not re.match(r"\s*[^\W\d]", target):
+                raise
+            expected = f"a name such as {', '.join(near_names(target, stars_only=True))}, or {expected}"
+            raise InputError.of("target", target, expected) from error
+    if isinstance(target, SkyCoord | BaseCoordinateFrame):
+        position = SkyCoord(target)
+    else:
+        raise InputError.of("target", target, expected)
+    if not position.isscalar:
+        raise InputError(f"target holds {position.size} positions", "one", key="target", value=target)
+    angles = position.spherical
+    if not np.isfinite([angles.lon.deg, angles.lat.deg]).all():
+        raise InputError.of("target", target, expected)
+    return position
+
+
+Lookup = Literal["bilinear", "nearest"]
+
+
+@validated
+@dataclass(frozen=True)
+class Sky:
+    """Zodiacal light of uniform surface brightness.
+
+    Attributes
+    ----------
+    surface_brightness : float or None
+        V mag arcsec^-2 (Vega); None means no sky.
+    description : str
+        Origin of the value, for reports.
+
+    Examples
+    --------
+    >>> from mauvecl import Sky
+    >>> round(Sky.at("290.68 +11.12", "2026-09-01T12:00").surface_brightness, 2)
+    22.96
+    """
+
+    surface_brightness: SkyBrightness | None
+    description: str
+
+    @classmethod
+    def none(cls) -> Sky:
+        """Return a sky without light."""
+        return cls(None, "no sky")
+
+    @classmethod
+    def of_brightness(cls, brightness: SkyBrightness) -> Sky:
+        """Return a sky of fixed surface brightness.
+
+        Parameters
+        ----------
+        brightness : Quantity or float
+            V mag arcsec^-2, 5 to 35.
+        """
+        return cls(brightness, f"fixed V = {brightness:.2f} mag/arcsec2")
+
+    @classmethod
+    def at(cls, target: SkyCoord | str, time: Time | str, lookup: Lookup = "bilinear") -> Sky:
+        """Return the zodiacal light towards a target, from the table of the MauveSim paper (COS Instrument Handbook).
+
+        The table has a cell every 15 deg. Magnitudes are interpolated bilinearly, or taken from the nearest cell as in
+        the paper. Cells in the solar avoidance zone have no value: the other corners share their weight, which makes
+        the sky next to the zone up to 0.4 mag too faint (0.1 DN/s per pixel).
+
+        Parameters
+        ----------
+        target : SkyCoord or str
+            Single position; a string is a well-known star ("AU Mic"), or ICRS in degrees ("290.0 -11.2") or sexagesimal
+            ("19h22m00s -11d12m00s").
+        time : Time or str
+            Single time in 1990-2100; a string is ISO 8601, UTC.
+        lookup : {"bilinear", "nearest"}
+
+        Raises
+        ------
+        InputError
+            If the nearest cell is in the solar avoidance zone.
+        """
+        place = helioecliptic(target, time)
+        brightness = zodiacal_brightness(place, lookup)
+        return cls(
+            brightness,
+            f"zodiacal light V = {brightness:.2f} mag/arcsec2 at helio-ecliptic longitude "
+            f"{place.longitude_deg:.1f} deg, latitude {place.latitude_deg:.1f} deg, "
+            f"{place.separation_deg:.1f} deg from the Sun ({lookup})",
+        )
+
+    def total_magnitude(self, field_of_view_arcsec2: SolidAngle) -> float | None:
+        """Return the V magnitude of the whole field of view, or None without a sky."""
+        if self.surface_brightness is None:
+            return None
+        return float(self.surface_brightness - 2.5 * np.log10(field_of_view_arcsec2))
+
+    def spectrum(self, field_of_view_arcsec2: SolidAngle) -> Source | None:
+        """Return the spectrum of the whole field of view, or None without a sky.
+
+        Zodiacal light is scattered sunlight with little reddening, so the spectrum is that of the Sun (CALSPEC) at the
+        total magnitude. The paper uses HD 87646, a G2V star.
+
+        Parameters
+        ----------
+        field_of_view_arcsec2 : Quantity or float
+            Solid angle, arcsec^2.
+        """
+        total = self.total_magnitude(field_of_view_arcsec2)
+        return None if total is None else _sunlight(total)
+
+
+@lru_cache(maxsize=16)
+def _sunlight(magnitude: float) -> Source:
+    # A sky without light does not need the library.
+    from mauvecl.host.stars.source import Source
+
+    return Source.from_library("Sun").at_magnitude(magnitude)
+
+
+@dataclass(frozen=True)
+class ZodiacalTable:
+    """Surface brightness of the zodiacal light on a grid of helio-ecliptic coordinates."""
+
+    longitude_deg: NDArray[np.float64]  # 0 to 180 in equal steps, shape (13,)
+    latitude_deg: NDArray[np.float64]  # 0 to 90 in the same steps, shape (7,)
+    brightness: NDArray[np.float64]  # V mag arcsec^-2, shape (13, 7); NaN in the solar avoidance zone
+
+
+@lru_cache(maxsize=1)
+def zodiacal_table() -> ZodiacalTable:
+    """Return the table of the MauveSim paper."""
+    from astropy.table import Table
+
+    path = resources.files(__package__).joinpath("zodiacal.ecsv")
+    table = Table.read(path.read_text(encoding="utf-8"), format="ascii.ecsv")
+    names = [name for name in table.colnames if name.startswith("latitude_")]
+    cells = np.stack([np.ma.filled(np.ma.asarray(table[name]), np.nan) for name in names], axis=1)
+    latitude = np.array([float(name.removeprefix("latitude_")) for name in names])
+    return ZodiacalTable(np.asarray(table["longitude"], np.float64), latitude, cells.astype(np.float64))
+
+
+def zodiacal_brightness(place: HelioEcliptic, lookup: Lookup = "bilinear") -> float:
+    """Return the surface brightness of the zodiacal light, V mag arcsec^-2 (see `Sky.at`).
+
+    Raises InputError if the nearest cell (of two equally near, the one farther from the Sun) is in the solar avoidance
+    zone.
+    """
+    table = zodiacal_table()
+    step = table.longitude_deg[1] - table.longitude_deg[0]
+    row, column = place.longitude_deg / step, place.latitude_deg / step
+    nearest = float(table.brightness[int(np.floor(row + 0.5)), int(np.floor(column + 0.5))])
+    if np.isnan(nearest):
+        raise InputError(
+            f"the Sun is {place.separation_deg:.1f} deg from the target (helio-ecliptic longitude "
+            f"{place.longitude_deg:.1f} deg, latitude {place.latitude_deg:.1f} deg)",
+            "it outside the zone of solar avoidance, some 50 deg",
+            key="target",
+            value=place.separation_deg,
+        )
+    if lookup == "nearest":
+        return nearest
+    i = min(int(row), table.longitude_deg.size - 2)
+    j = min(int(column), table.latitude_deg.size - 2)
+    along, across = row - i, column - j
+    weights = np.outer([1 - along, along], [1 - across, across])
+    corners = table.brightness[i : i + 2, j : j + 2]
+    weights[np.isnan(corners)] = 0.0
+    return float(np.sum(weights * np.nan_to_num(corners)) / weights.sum())

@@ -1,0 +1,354 @@
+"""Neighbouring stars, whose light enters the fibre together with the target's, and tables of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.exposure.response import Order, electrons_per_second
+from mauvecl.host.stars.band_names import known_band
+from mauvecl.host.stars.library import embedded, library_table, nearest_spectrum
+from mauvecl.host.stars.source import Source
+from mauvecl.host.tables.names import DECLINATIONS, RIGHT_ASCENSIONS, SPECTRAL_TYPES, STARS, divided_unit, key_of
+from mauvecl.host.tables.opening import read_table
+from mauvecl.host.tables.rows import Rows
+from mauvecl.schema.calls import validated
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import Share
+from mauvecl.schema.text import shortened, shown
+
+if TYPE_CHECKING:
+    from mauvecl.host.instrument.instrument import Instrument
+
+Float = NDArray[np.float64]
+
+#: Distance up to which a row of a table may be the target itself, which a message then says, arcsec.
+SAME_STAR_ARCSEC = 2.0
+#: Largest number of neighbours that a message names.
+MOST_NAMED = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbour:
+    """A star near the target; its spectrum is chosen only if its light enters the fibre."""
+
+    name: str
+    separation_arcsec: float  # from the target
+    magnitude: float | None = None  # in `band`; None if unknown
+    band: str = "V"
+    spectral_type: str = ""  # empty if unknown; the nearest spectrum of the library is used
+    file: Path | None = None  # spectrum file, in place of a type
+    temperature_k: float | None = None  # effective temperature, which chooses the spectrum if the type is unknown
+    bp_rp: float | None = None  # Gaia colour, which chooses the spectrum if type and temperature are unknown
+
+    @cached_property
+    def spectrum(self) -> tuple[str, str]:
+        """Name of the spectrum, and the statement on its choice, empty if it is the star's own.
+
+        Raises InputError if nothing tells the spectrum.
+        """
+        if self.file is not None:
+            return self.file.name, ""
+        if self.spectral_type:
+            entry = embedded(self.spectral_type)
+            if entry is not None:
+                return entry["name"], ""
+            nearest = nearest_spectrum(self.spectral_type)
+            return nearest, f"of type {self.spectral_type}: {nearest}, the nearest type of the library"
+        if self.temperature_k is not None:
+            nearest, kelvin = _nearest(_temperatures(), np.log(self.temperature_k))
+            text = f"of {self.temperature_k:.0f} K: {nearest} ({np.exp(kelvin):.0f} K), the nearest of the library"
+            return nearest, text
+        if self.bp_rp is not None:
+            nearest, colour = _nearest(_colours(), self.bp_rp)
+            text = f"of BP - RP = {self.bp_rp:.2f}: {nearest} ({colour:.2f}), the nearest colour of the library"
+            return nearest, text
+        raise InputError(
+            f"neighbour {self.name}, {self.separation_arcsec:.3g} arcsec away, has no spectral type, spectrum file, "
+            "temperature or colour",
+            "one of them, since its light enters the fibre",
+            key="neighbours",
+            value=self.name,
+        )
+
+    @cached_property
+    def source(self) -> Source:
+        """Spectrum at the telescope. Raises InputError if spectrum or magnitude is unknown."""
+        name, _ = self.spectrum
+        if self.magnitude is None and self.file is None:
+            raise InputError(
+                f"neighbour {self.name}, {self.separation_arcsec:.3g} arcsec away, has no magnitude",
+                "one, since its light enters the fibre",
+                key="neighbours",
+                value=self.name,
+            )
+        star = Source.from_library(name) if self.file is None else Source.read(self.file)
+        if self.magnitude is not None:
+            star = star.at_magnitude(self.magnitude, self.band)
+        if star.unscaled:
+            raise InputError(
+                f"the spectrum of neighbour {self.name} is not as bright as the star is seen: {star.unscaled}",
+                "a magnitude as well",
+                key="neighbours",
+                value=self.name,
+            )
+        return star
+
+
+@validated
+@dataclass(frozen=True, eq=False)
+class Neighbours:
+    """Neighbours of one target."""
+
+    stars: tuple[Neighbour, ...]
+    share: Share = 1.0  # share of the light that enters the fibre, of stars within its radius; an assumption
+    notes: tuple[str, ...] = ()  # statements on how the table was read
+
+    def within(self, instrument: Instrument) -> list[Neighbour]:
+        """Return the neighbours within the radius of the fibre."""
+        return [one for one in self.stars if one.separation_arcsec <= instrument.field_of_view_radius_arcsec]
+
+    def electrons_per_second(self, instrument: Instrument, order: Order = "paper") -> Float:
+        """Return the mean electrons per second of all neighbours in the fibre, shape (n_pixel,)."""
+        total = np.zeros(instrument.wavelength_nm.size)
+        for one in self.within(instrument):
+            total += self.share * rate_of(one, instrument, order)
+        return total
+
+    def provenance(self, instrument: Instrument) -> dict[str, str]:
+        """Return the neighbours in the fibre with their spectra, for the record of an expectation."""
+        inside = [
+            f"{one.name} ({one.separation_arcsec:.6g} arcsec, {one.spectrum[0]}, {one.source.digest})"
+            for one in self.within(instrument)
+        ]
+        return {"neighbours": "; ".join(inside), "share of neighbours": f"{self.share:g} (assumption)"}
+
+    def messages(self, target: str, instrument: Instrument) -> list[str]:
+        """Return the messages on the neighbours of a target."""
+        radius, inside = instrument.field_of_view_radius_arcsec, self.within(instrument)
+        outside = len(self.stars) - len(inside)
+        beyond = f"{_stars(outside)} beyond {'does' if outside == 1 else 'do'} not enter"
+        if not inside:
+            return [f"NEIGHBOURS of {target}: none within {radius:g} arcsec; {beyond}.", *self.notes]
+        names = ", ".join(f"{one.name} at {one.separation_arcsec:.3g} arcsec" for one in inside[:MOST_NAMED])
+        more = len(inside) - MOST_NAMED
+        text = (
+            f"NEIGHBOURS of {target}: the light of {_stars(len(inside))} within {radius:g} arcsec is in the fibre "
+            f"({names}{f' and {more} more' if more > 0 else ''}); assumption: {100 * self.share:g} % of it enters"
+        )
+        chosen = [f"Light of {one.name}, {one.spectrum[1]}." for one in inside if one.spectrum[1]]
+        if len(chosen) > MOST_NAMED:
+            chosen = [*chosen[:MOST_NAMED], f"Spectra of {len(chosen) - MOST_NAMED} more neighbours are chosen alike."]
+        same = [
+            f"{one.name} is {one.separation_arcsec:.2g} arcsec from {target} and counts as a neighbour: if it is the "
+            "star itself, name its row in star.neighbours_of."
+            for one in inside
+            if one.separation_arcsec < SAME_STAR_ARCSEC
+        ]
+        return [f"{text}; {beyond}." if outside else f"{text}.", *same, *chosen, *self.notes]
+
+
+#: Cached since flares and sweep values of a star have the same neighbours.
+@lru_cache(maxsize=4096)
+def rate_of(neighbour: Neighbour, instrument: Instrument, order: Order) -> Float:
+    """Return the mean electrons per second of a neighbour if all of its light enters, shape (n_pixel,)."""
+    source = neighbour.source
+    rate = electrons_per_second(instrument, source.wavelength_nm, source.flux_flam, order)
+    rate = np.maximum(rate * instrument.per_pixel("response", 1.0), 0.0)
+    rate.setflags(write=False)
+    return rate
+
+
+def _stars(n: int) -> str:
+    return "1 star" if n == 1 else f"{n} stars"
+
+
+def _nearest(values: Sequence[tuple[str, float]], wanted: float) -> tuple[str, float]:
+    return min(values, key=lambda one: abs(one[1] - wanted))
+
+
+def _typed() -> list[str]:
+    """Return the names of the embedded spectra that represent a spectral type."""
+    table = library_table()
+    return [str(row["name"]) for row in table if row["kept"] == "embedded" and row["name"] == row["spectral_type"]]
+
+
+@cache
+def _temperatures() -> tuple[tuple[str, float], ...]:
+    """Return the logarithms of the temperatures of typical spectra."""
+    named = ((name, Source.from_library(name).temperature_k) for name in _typed())
+    return tuple((name, float(np.log(kelvin))) for name, kelvin in named if kelvin is not None)
+
+
+@cache
+def _colours() -> tuple[tuple[str, float], ...]:
+    """Return the Gaia colours BP - RP of typical spectra, by synthetic photometry."""
+    stars = ((name, Source.from_library(name)) for name in _typed())
+    return tuple((name, star.magnitude("Gaia BP") - star.magnitude("Gaia RP")) for name, star in stars)
+
+
+#: Names of columns: those of the Gaia archive, astroquery, VizieR and CDS X-Match, and plain ones.
+SEPARATIONS = (
+    "separation",
+    "separation_arcsec",
+    "sep",
+    "sep_arcsec",
+    "angdist",
+    "target_separation (deg)",
+    "dist",
+    "_r",
+)
+#: Columns of magnitudes, with their bands; the first that a row has counts. Gmag is Gaia's in VizieR.
+MAGNITUDES = {"magnitude": "", "mag": "", "v": "V", "vmag": "V", "phot_g_mean_mag": "Gaia G", "gmag": "Gaia G"}
+TYPES = (*SPECTRAL_TYPES, "type")
+FILES = ("file", "spectrum", "spectrum_file")
+TEMPERATURES = ("teff_gspphot", "teff", "teff_val", "temperature", "temperature_k")
+COLOURS = ("bp_rp", "bp-rp", "bprp")
+#: All names of columns that are read, with that of a magnitude's band.
+KNOWN = (*STARS, *SEPARATIONS, *RIGHT_ASCENSIONS, *DECLINATIONS, *MAGNITUDES, "band", *TYPES, *FILES, *TEMPERATURES,
+         *COLOURS)  # fmt: skip
+_KEYS = {key_of(name) for name in KNOWN} | {key_of("target_separation")}
+#: Units of separations without a stated unit: ADQL's DISTANCE is in degrees.
+UNSTATED = {"dist": "deg"}
+#: Largest number of rows; a fibre holds far fewer stars.
+MOST_ROWS = 100_000
+
+
+def read_neighbours(path: str | Path, target: str | None = None) -> tuple[tuple[Neighbour, ...], tuple[str, ...]]:
+    """Read neighbours, nearest first, and return them with statements on how the table was read.
+
+    Raises InputError if the table has no separations and no positions, or a cell is invalid.
+
+    Parameters
+    ----------
+    path : str or Path
+        CSV, ECSV, FITS or VOTable with a row per star. A separation, or right ascension and declination, and for stars
+        within the fibre a magnitude and a spectral type, spectrum file, temperature or Gaia colour, in columns of any
+        of the names in this module, in any case. Files of spectra are relative to the table.
+    target : str, optional
+        Name of the row that is the target itself, which is left out, or coordinates such as "290.68 +11.12". Positions
+        are measured from it; it is needed if there are no separations.
+    """
+    path = Path(path)
+    named = f"table of neighbours {shortened(path.name)}"
+    table = _Neighbours(read_table(path, "table of neighbours"), named, "neighbours")
+    if not 1 <= table.n <= MOST_ROWS:
+        raise InputError(f"{named} holds {table.n} stars", f"1 to {MOST_ROWS}", key="neighbours", value=table.n)
+    name = table.first(STARS)
+    names = [table.text(name, row) or f"row {row + 1}" for row in range(table.n)]
+    own = None if target is None else next((k for k, name in enumerate(names) if name == target.strip()), None)
+    separations, notes = table.separations(own, target)
+    kind, file, temperature, colour = map(table.first, (TYPES, FILES, TEMPERATURES, COLOURS))
+    stars = []
+    for k, name in enumerate(names):
+        if k != own:
+            spectrum = table.text(file, k)
+            stars.append(Neighbour(
+                name, float(separations[k]), *table.magnitude(k), table.text(kind, k),
+                path.parent / spectrum if spectrum else None, table.number(temperature, k, "K", above=0.0),
+                table.number(colour, k, "mag"),
+            ))  # fmt: skip
+    notes += table.unused([one for one in table.names if not {key_of(one), key_of(divided_unit(one)[0])} & _KEYS])
+    return tuple(sorted(stars, key=lambda star: star.separation_arcsec)), notes
+
+
+class _Neighbours(Rows):
+    """Rows of a table of neighbours."""
+
+    @cached_property
+    def magnitudes(self) -> list[tuple[str, str]]:
+        """Columns of magnitudes, and their bands."""
+        held = [(self.first((name,)), name, band) for name, band in MAGNITUDES.items()]
+        # Gmag is Gaia's in VizieR, gmag that of other surveys.
+        return [(one, band) for one, name, band in held if one is not None and not (name == "gmag" and one != "Gmag")]
+
+    @cached_property
+    def band(self) -> str | None:
+        """Column of bands."""
+        return self.first(("band",))
+
+    def magnitude(self, row: int) -> tuple[float | None, str]:
+        """Return magnitude and band of a star; None if it has none."""
+        for name, band in self.magnitudes:
+            value = self.number(name, row, "mag")
+            if value is not None:
+                return value, band or known_band(self.text(self.band, row) or "V")
+        return None, "V"
+
+    def separations(self, own: int | None, target: str | None) -> tuple[Float, tuple[str, ...]]:
+        """Return the separations from the target, arcsec, shape (n_row,), and statements on how they were found."""
+        ra, dec = self.first(RIGHT_ASCENSIONS), self.first(DECLINATIONS)
+        if ra is not None and dec is not None and target is not None:
+            return self._from_positions(ra, dec, own, target), ()
+        name = self.first(SEPARATIONS)
+        if name is None:
+            raise InputError(
+                f"{self.named} has the columns {shown(', '.join(self.names), 300)}"
+                + ("" if ra is None else " and no position of the star itself"),
+                "separation (arcsec)" + (", or ra and dec" if ra is None else "")
+                + ("" if ra is None else ", or star.neighbours_of: the star's own row by name, or its coordinates"),
+                key="neighbours" if ra is None else "neighbours_of",
+                value=target,
+            )  # fmt: skip
+        if target is not None and own is None:
+            raise InputError(
+                f"{self.named} has no row named {shortened(target)}, and no positions",
+                "the name of a row, which is then left out",
+                key="neighbours_of",
+                value=target,
+            )
+        return self._stated(name)
+
+    def _stated(self, name: str) -> tuple[Float, tuple[str, ...]]:
+        stated, known = getattr(self.table[name], "unit", None) is not None, key_of(name)
+        if not stated and known == "_r":
+            raise self.error(
+                f"the column {name} states no unit",
+                "a table with units (ECSV, FITS, VOTable), or the column separation, arcsec", name,
+            )  # fmt: skip
+        factor = 1.0 if stated else {"deg": 3600.0}.get(UNSTATED.get(known, ""), 1.0)
+        values = np.array([self._given(name, row, self.number(name, row, "arcsec")) for row in range(self.n)]) * factor
+        negative = ~(values >= 0)
+        if negative.any():
+            row = int(np.argmax(negative))
+            text = self.text(name, row)
+            raise self.error(f"row {row + 1} has {name} = {text}", "an angle of 0 and above", name, float(text))
+        note = f"Separations are the column {name} of {self.named}, read as degrees since it states no unit."
+        return values, (note,) if not stated and known == "dist" else ()
+
+    def _from_positions(self, ra: str, dec: str, own: int | None, target: str) -> Float:
+        from astropy.coordinates import angular_separation
+
+        east, north = (
+            np.radians([self._given(name, row, self.degrees(name, row, right_ascension=name == ra))
+                        for row in range(self.n)]) for name in (ra, dec)
+        )  # fmt: skip
+        place = _coordinates(target, self.named) if own is None else (float(east[own]), float(north[own]))
+        return np.asarray(np.degrees(angular_separation(*place, east, north)) * 3600.0)
+
+    def _given(self, name: str, row: int, value: float | None) -> float:
+        if value is None:
+            raise self.error(f"row {row + 1} has no {name}", "one", name, row + 1)
+        return value
+
+
+def _coordinates(text: str, named: str) -> tuple[float, float]:
+    """Return right ascension and declination in radians. Raises InputError unless the text is coordinates."""
+    from mauvecl.host.exposure.sky import parse_position
+
+    try:
+        place = parse_position(text)
+    except InputError as error:
+        raise InputError(
+            f"{named} has no row named {shortened(text)}, and it is not a position",
+            "the name of the star's own row, or coordinates such as '290.68 +11.12'",
+            key="neighbours_of",
+            value=text,
+        ) from error
+    return float(place.ra.rad), float(place.dec.rad)

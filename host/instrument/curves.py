@@ -1,0 +1,421 @@
+"""Curves of an instrument against wavelength, maps of its pixels, and the uncertainty of its calibration."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import astropy.units as u
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mauvecl.host.content_equality import ContentEquality
+from mauvecl.host.tables.ecsv import read_numbers
+from mauvecl.host.tables.units import unit_of
+from mauvecl.schema.calls import validated
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Range, Unit
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A quantity against wavelength, linear between knots."""
+
+    wavelength_nm: tuple[float, ...]  # knots, strictly increasing; a single knot makes the curve flat
+    value: tuple[float, ...]  # at each knot, >= 0: a fraction, or A/W for a quantum efficiency
+    source: str = "A: assumed, no source given"  # "tag: source" of the values
+
+    def __post_init__(self) -> None:
+        wavelength = np.asarray(self.wavelength_nm, dtype=np.float64)
+        value = np.asarray(self.value, dtype=np.float64)
+        if wavelength.ndim != 1 or wavelength.size == 0 or wavelength.shape != value.shape:
+            raise InputError(
+                f"a curve has {wavelength.size} wavelengths and {value.size} values",
+                "as many, one or more",
+                key="value",
+                value=value.size,
+            )
+        if not (np.isfinite(wavelength).all() and (np.diff(wavelength) > 0).all()):
+            raise InputError(
+                "a curve's wavelengths are not finite and strictly increasing",
+                "nm in order",
+                key="wavelength_nm",
+                value=wavelength,
+            )
+        bad = ~(np.isfinite(value) & (value >= 0))
+        if bad.any():
+            knot = int(np.argmax(bad))
+            raise InputError.of("value", value[knot], "finite and >= 0", where=f"curve at {wavelength[knot]:g} nm")
+
+    @classmethod
+    def flat(cls, value: float, source: str = "A: assumed, no source given") -> Curve:
+        """Return a curve with the same value at every wavelength."""
+        return cls((0.0,), (value,), source)
+
+    @classmethod
+    def read(cls, path: str | Path) -> Curve:
+        """Read an ECSV table of two columns with units: wavelength, and the value (A/W, per cent or dimensionless).
+
+        The table's metadata give the values' origin: `tag` (P, D, C or A) and `source`. Raises InputError if the file
+        is missing or is not such a table.
+        """
+        table = read_numbers(path, "curve file")
+        if "wavelength" not in table.columns or len(table.columns) != 2:
+            raise InputError(
+                f"curve file {path} has the columns {', '.join(table.columns)}",
+                "'wavelength' and one value",
+                key="columns",
+                value=table.columns,
+            )
+        name = next(column for column in table.columns if column != "wavelength")
+        meta = table.meta
+        try:
+            length = unit_of(table.units["wavelength"]) if table.units["wavelength"] else None
+            wavelength = _converted(table["wavelength"], "wavelength", length, [u.nm])
+            # Here A is ampere, not Angstrom.
+            unit = u.Unit(table.units[name].replace("percent", "%"), parse_strict="silent")
+            value = _converted(table[name], name, unit, [u.A / u.W, u.dimensionless_unscaled])
+            return cls(
+                tuple(wavelength.tolist()),
+                tuple(value.tolist()),
+                f"{meta.get('tag', 'A')}: {meta.get('source', f'assumed, no source in {Path(path).name}')}",
+            )
+        except InputError as error:
+            raise error.within(f"curve file {path}") from None
+
+    def at(self, wavelength_nm: ArrayLike) -> NDArray[np.float64]:
+        """Return the values at wavelengths in nm, shape of `wavelength_nm`; the end values hold beyond the knots."""
+        return np.asarray(np.interp(np.asarray(wavelength_nm, np.float64), self.wavelength_nm, self.value))
+
+    def covers(self, low_nm: float, high_nm: float) -> bool:
+        """Return whether the knots reach from one wavelength to the other; a flat curve always does."""
+        return len(self.value) == 1 or (self.wavelength_nm[0] <= low_nm and self.wavelength_nm[-1] >= high_nm)
+
+
+def _converted(values: NDArray[np.float64], name: str, unit: u.UnitBase | None, units: list[u.UnitBase]) -> Any:
+    """Return a column's numbers in the first of `units` that its unit converts to."""
+    for wanted in units:
+        if unit is not None and unit.is_equivalent(wanted):
+            return (values * unit).to_value(wanted)
+    raise InputError(f"column {name!r} has the unit {str(unit or '') or 'none'!r}", str(units[0]), key=name, value=unit)
+
+
+Float = NDArray[np.float64]
+
+#: Largest number of pixels of an array.
+MAX_PIXELS = 65_536
+#: Columns of a map and their units. Dimensionless ones are factors on the instrument's value, others replace it.
+COLUMNS = {
+    "response": u.dimensionless_unscaled,
+    "dark": u.dimensionless_unscaled,
+    "gain": u.dimensionless_unscaled,
+    "bias_dn": u.DN,
+    "read_noise_dn": u.DN,
+}
+
+
+@validated
+@dataclass(frozen=True, eq=False)
+class PixelMap(ContentEquality):
+    """Properties of each pixel of the whole array; None keeps the instrument's value.
+
+    Attributes
+    ----------
+    response, dark, gain : ndarray, shape (n_pixel,), optional
+        Factors on the electrons per photon, the dark current and the DN per electron. A hot pixel has a large factor
+        on its dark current.
+    bias_dn, read_noise_dn : ndarray, shape (n_pixel,), optional
+        DN and DN rms per frame, which replace the instrument's values.
+    source : str
+        "tag: source" of the values.
+    """
+
+    response: Float | None = None
+    dark: Float | None = None
+    gain: Float | None = None
+    bias_dn: Annotated[Float, Unit("DN")] | None = None
+    read_noise_dn: Annotated[Float, Unit("DN")] | None = None
+    source: str = "A: assumed, no source given"
+
+    def __post_init__(self) -> None:
+        sizes = set()
+        for name in COLUMNS:
+            if getattr(self, name) is None:
+                continue
+            values = np.array(getattr(self, name), np.float64)
+            if values.ndim != 1:
+                raise InputError(
+                    f"{name} of the pixel map has the shape {values.shape}",
+                    "one value per pixel",
+                    key=name,
+                    value=values.shape,
+                )
+            bad = ~(np.isfinite(values) & (values >= 0))
+            if name == "gain":
+                bad |= values == 0
+            if bad.any():
+                pixel = int(np.argmax(bad))
+                above = "above 0" if name == "gain" else "0 or more"
+                raise InputError.of(name, values[pixel], f"finite and {above}", where=f"pixel map, pixel {pixel}")
+            values.setflags(write=False)
+            object.__setattr__(self, name, values)
+            sizes.add(values.size)
+        if len(sizes) != 1:
+            raise InputError(
+                f"the pixel map has columns of {sorted(sizes) or 'no'} pixels",
+                "one length",
+                key="pixel_map",
+                value=sizes,
+            )
+
+    @property
+    def size(self) -> int:
+        """Number of pixels."""
+        return next(int(v.size) for name in COLUMNS if (v := getattr(self, name)) is not None)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the values."""
+        hashed = hashlib.sha256()
+        for name in COLUMNS:
+            if (values := getattr(self, name)) is not None:
+                hashed.update(name.encode() + values.tobytes())
+        return hashed.hexdigest()
+
+    def __repr__(self) -> str:
+        # The instrument's digest is computed from representations.
+        return f"PixelMap({self.digest})"
+
+    @classmethod
+    def read(cls, path: str | Path) -> PixelMap:
+        """Read an ECSV table with one row per pixel of the array, in order, and any of the columns of `COLUMNS`."""
+        table = read_numbers(path, "pixel map")
+        unknown = [name for name in table.columns if name not in COLUMNS and name != "pixel"]
+        if unknown or list(table.columns) in ([], ["pixel"]):
+            what = f"the column {unknown[0]!r}" if unknown else "no column of values"
+            raise InputError(f"pixel map {path} has {what}", f"some of {', '.join(COLUMNS)}", key="pixel_map")
+        if "pixel" in table.columns and not np.array_equal(table["pixel"], np.arange(table["pixel"].size)):
+            raise InputError(
+                f"pixel map {path}: the column 'pixel' is not 0, 1, 2, ...", "every pixel in order", key="pixel"
+            )
+        values = {}
+        for name in table.columns:
+            if name == "pixel":
+                continue
+            unit = u.Unit(table.units[name], parse_strict="silent")
+            if not unit.is_equivalent(COLUMNS[name]):
+                wanted = str(COLUMNS[name]) or "none"
+                raise InputError(
+                    f"pixel map {path}: {name} has the unit {str(unit) or 'none'!r}", wanted, key=name, value=unit
+                )
+            values[name] = table[name]
+        source = f"{table.meta.get('tag', 'A')}: {table.meta.get('source', f'assumed, no source in {Path(path).name}')}"
+        try:
+            return cls(**values, source=source)
+        except InputError as error:
+            raise error.within(f"pixel map {path}") from None
+
+    @classmethod
+    def made_up(
+        cls,
+        pixels: Annotated[int, Range(1, MAX_PIXELS)],
+        *,
+        seed: Annotated[int, Range(0)],
+        response_rms: Annotated[float, Range(0)] = 0.03,
+        dark_rms: Annotated[float, Range(0)] = 0.1,
+        hot_share: Annotated[float, Range(0, 1)] = 0.001,
+        hot_dark: Annotated[float, Range(0)] = 10.0,
+    ) -> PixelMap:
+        """Draw a map with assumed scatter, to test pipelines; it describes no real detector.
+
+        Parameters
+        ----------
+        pixels, seed : int
+        response_rms, dark_rms : float
+            Relative scatter, log-normal.
+        hot_share, hot_dark : float
+            Fraction of hot pixels, and the factor on their dark current.
+        """
+        generator = np.random.default_rng(seed)
+        response = np.exp(generator.normal(0.0, response_rms, pixels) - response_rms**2 / 2)
+        dark = np.exp(generator.normal(0.0, dark_rms, pixels) - dark_rms**2 / 2)
+        dark[generator.random(pixels) < hot_share] *= hot_dark
+        return cls(response=response, dark=dark, source=f"A: made up, seed {seed}")
+
+    def write(self, path: str | Path) -> None:
+        """Write an ECSV table for `read`."""
+        from astropy.table import Table
+
+        tag, source = self.source.split(": ", 1)
+        table = Table({"pixel": np.arange(self.size)}, meta={"tag": tag, "source": source})
+        for name, unit in COLUMNS.items():
+            if (values := getattr(self, name)) is not None:
+                table[name] = values
+                table[name].unit = None if unit == u.dimensionless_unscaled else unit
+        table.write(path, format="ascii.ecsv", overwrite=True)
+
+    def _line(self) -> str:
+        return f"of {self.size} pixels, {self.source}"
+
+    def over(self, name: str, chosen: slice, nominal: float) -> Float:
+        """Return a column over a range of pixels: factors times `nominal`, or the values that replace it."""
+        values = getattr(self, name)
+        size = len(range(*chosen.indices(self.size)))
+        if values is None:
+            return np.full(size, nominal)
+        part = values[chosen]
+        return np.asarray(part if COLUMNS[name] == u.DN else nominal * part)
+
+
+#: Start of the names of columns with modes.
+MODE = "mode_"
+#: Values of an instrument that modes may change in addition to the throughput, in words.
+CALIBRATED = {
+    "conversion_uv_per_electron": "gain",
+    "read_noise_dn": "read noise",
+    "dark_scale_dn_per_s": "dark current",
+    "dark_slope_per_c": "dark slope",
+    "pixel_zero_nm": "wavelength zero point",
+    "dispersion_nm_per_pixel": "dispersion",
+    "gaussian_fwhm_nm": "line width",
+}
+
+
+@validated
+@dataclass(frozen=True, eq=False)
+class ThroughputErrors(ContentEquality):
+    """Covariance of the logarithm of the throughput: the sum of the outer products of modes.
+
+    Attributes
+    ----------
+    wavelength_nm : ndarray, shape (n,)
+        Ascending; modes are linear between these wavelengths and constant beyond them.
+    modes : ndarray, shape (n_mode, n)
+        Changes of the natural logarithm of the throughput for amplitudes of one standard deviation, those that matter
+        most first.
+    source : str
+        "tag: source" of the values.
+    values : mapping of tuple
+        Changes of the natural logarithm of other values in the first modes, by name: `CALIBRATED`. Counts determine the
+        product of gain and throughput, for instance, so that an error of the gain changes both.
+    """
+
+    wavelength_nm: Annotated[Float, Unit("nm")]
+    modes: Float
+    source: str = "A: assumed, no source given"
+    values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        nm, modes = np.array(self.wavelength_nm, np.float64), np.array(self.modes, np.float64)
+        if nm.ndim != 1 or nm.size < 2 or not np.isfinite(nm).all() or not (np.diff(nm) > 0).all():
+            raise InputError.of("wavelength_nm", nm.shape, "at least two finite, ascending wavelengths")
+        if modes.ndim != 2 or modes.shape[1] != nm.size or not np.isfinite(modes).all():
+            raise InputError.of("modes", modes.shape, f"finite values of the shape (n_mode, {nm.size})")
+        for name, values in (("wavelength_nm", nm), ("modes", modes)):
+            values.setflags(write=False)
+            object.__setattr__(self, name, values)
+        others = self.values
+        if not isinstance(others, Mapping) or not set(others) <= set(CALIBRATED):
+            raise InputError.of("values", others, f"some of {', '.join(CALIBRATED)}")
+        for name, changes in others.items():
+            given = np.asarray(changes)
+            if (
+                given.ndim != 1
+                or given.size > len(modes)
+                or given.dtype.kind not in "fi"
+                or not np.isfinite(given).all()
+            ):
+                raise InputError.of(
+                    f"values.{name}", changes, f"at most {len(modes)} finite numbers, one for each mode"
+                )
+        object.__setattr__(self, "values", {name: tuple(map(float, changes)) for name, changes in others.items()})
+
+    @classmethod
+    def of_covariance(
+        cls,
+        wavelength_nm: ArrayLike,
+        covariance: ArrayLike,
+        source: str,
+        *,
+        names: Sequence[str] = (),
+        sums: Float | None = None,
+        lost: float = 1e-4,
+    ) -> ThroughputErrors:
+        """Return the modes of a covariance of log throughput and of the logarithms of other values.
+
+        Parameters
+        ----------
+        wavelength_nm : array_like, shape (n,)
+        covariance : array_like, shape (n + n_name, n + n_name)
+        source : str
+        names : sequence of str
+            Of the other values.
+        sums : ndarray, shape (n_sum, n), optional
+            Weighted sums of the curve, such as the light in bands. The first modes hold all errors of these sums and of
+            the other values.
+        lost : float
+            Share of the variances that is lost by leaving out the smallest modes.
+        """
+        nm, total = np.asarray(wavelength_nm, np.float64), np.asarray(covariance, np.float64)
+        sd = np.sqrt(np.diag(total))
+        scale = np.where(sd > 0, sd, 1.0)
+        variances, vectors = np.linalg.eigh(total / np.outer(scale, scale))
+        variances, vectors = np.maximum(variances[::-1], 0.0), vectors[:, ::-1]
+        left = 1.0 - np.cumsum(variances) / max(variances.sum(), np.finfo(float).tiny)
+        kept = int((left > lost).sum()) + 1
+        modes = scale[:, None] * (vectors * np.sqrt(variances))[:, :kept]
+        first = np.vstack([np.zeros((0, nm.size)) if sums is None else sums]) @ modes[: nm.size]
+        first = np.vstack([first, modes[nm.size :] / scale[nm.size :, None]])
+        if len(first):
+            # Any rotation of the modes has the same covariance.
+            modes = modes @ np.linalg.svd(first)[2].T
+        others = {
+            name: tuple(row[: len(first)]) for name, row in zip(names, modes[nm.size :], strict=True) if row.any()
+        }
+        return cls(nm, modes[: nm.size].T, source, others)
+
+    @classmethod
+    def read(cls, path: str | Path) -> ThroughputErrors:
+        """Read an ECSV table with the columns wavelength (nm) and mode_1, mode_2 and so on."""
+        table = read_numbers(path, "throughput errors")
+        names = [name for name in table.columns if name.startswith(MODE)]
+        if "wavelength" not in table.columns or not names or len(names) + 1 != len(table.columns):
+            raise InputError(
+                f"throughput errors {path} have the columns {', '.join(table.columns)}",
+                f"wavelength, {MODE}1, {MODE}2 and so on",
+                key="columns",
+                value=table.columns,
+            )
+        if table.units["wavelength"] != "nm":
+            raise InputError.of("unit", table.units["wavelength"], "nm", where=f"throughput errors {path}")
+        source = f"{table.meta.get('tag', 'A')}: {table.meta.get('source', f'assumed, no source in {Path(path).name}')}"
+        try:
+            modes = np.array([table[name] for name in names])
+            return cls(table["wavelength"], modes, source, table.meta.get("values", {}))
+        except InputError as error:
+            raise error.within(f"throughput errors {path}") from None
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the values."""
+        others = repr(sorted(self.values.items())).encode() if self.values else b""
+        return hashlib.sha256(self.wavelength_nm.tobytes() + self.modes.tobytes() + others).hexdigest()
+
+    def __repr__(self) -> str:
+        # The instrument's digest is computed from representations.
+        return f"ThroughputErrors({self.digest})"
+
+    def _line(self) -> str:
+        return f"{len(self.modes)} modes, {self.source}"
+
+    def at(self, wavelength_nm: ArrayLike) -> Float:
+        """Return the modes at wavelengths in nm, one row per mode."""
+        nm = np.asarray(wavelength_nm, np.float64)
+        return np.array([np.interp(nm, self.wavelength_nm, mode) for mode in self.modes]).reshape(-1, *nm.shape)
+
+    def sd(self, wavelength_nm: ArrayLike) -> Float:
+        """Return the standard deviation of the logarithm of the throughput, shape of `wavelength_nm`."""
+        return np.asarray(np.sqrt((self.at(wavelength_nm) ** 2).sum(axis=0)))

@@ -1,4 +1,0 @@
-"""Zodiacal light by position and date."""
-
-#: Default surface brightness, V mag arcsec-2: the ecliptic opposite the Sun in the paper's table.
-DEFAULT_SKY = 22.1

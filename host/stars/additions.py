@@ -1,0 +1,354 @@
+"""Additions to the user's own stars, from files and from public collections of HST spectra."""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import io
+import re
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import IO
+from urllib.parse import urljoin, urlsplit
+
+from mauvecl.host.files.atomic import write_whole
+from mauvecl.host.files.parsing import parsing
+from mauvecl.host.files.size_limits import limit_bytes, read_bytes
+from mauvecl.host.spectra.coverage import check_covers
+from mauvecl.host.spectra.formats import without_columns
+from mauvecl.host.stars import library as catalogue
+from mauvecl.host.stars.library import OwnStar, find, folder, kept, spectrum_digest
+from mauvecl.host.stars.source import Source
+from mauvecl.host.version import VERSION
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
+
+
+def add(
+    path: str | Path,
+    name: str | None = None,
+    *,
+    origin: str | None = None,
+    replace: bool = False,
+    wavelength_unit: str | None = None,
+    flux_unit: str | None = None,
+    extend: str | None = None,
+) -> OwnStar:
+    """Keep a spectrum from a file under a name.
+
+    Parameters
+    ----------
+    path : str or Path
+        File of any format that `formats.read_spectrum` supports.
+    name : str, optional
+        Name of the star. The default is that of the file's header, or the file name.
+    origin : str, optional
+        Origin of the spectrum, for reports. The default is the file name.
+    replace : bool
+        Whether to replace a kept star of the same name.
+    wavelength_unit, flux_unit, extend : str, optional
+        As for `Source.read`.
+
+    Raises
+    ------
+    InputError
+        If the file holds no usable spectrum, the name is taken or invalid, or the folder cannot be written.
+    """
+    from astropy.table import Table
+
+    given = path
+    path, _ = without_columns(path)
+    content = read_bytes(path, "spectrum file")
+    source = Source.read(given, wavelength_unit=wavelength_unit, flux_unit=flux_unit, extend=extend)
+    check_covers(source.name, source.measured_nm or (source.wavelength_nm[0], source.wavelength_nm[-1]))
+    name = (name or source.name).strip()
+    if not re.fullmatch(r"[\w][\w .+\-*'()]{0,63}", name):
+        raise InputError.of("name", name, "up to 64 letters, digits, spaces and . + - * ' ( )")
+    if catalogue.embedded(name) is not None:
+        raise InputError(
+            f"star name {name!r} is one of the embedded library's",
+            "another: give one with `name`",
+            key="name",
+            value=name,
+        )
+    there = find(name)
+    if there is not None and not replace:
+        raise InputError(f"star {name!r} is kept already", "another name, or `replace=True`", key="name", value=name)
+    dereddened = any("dereddened" in note for note in source.notes)
+    table = Table({"wavelength": source.wavelength_nm, "flux": source.flux_flam})
+    table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
+    table.meta |= {
+        "name": name,
+        "origin": origin or f"file {path.name}",
+        "file_sha256": hashlib.sha256(content).hexdigest(),
+        "spectrum_sha256": spectrum_digest(source.wavelength_nm, source.flux_flam),
+        "kept_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "dereddened": dereddened,
+        "notes": list(source.notes),
+        "told": list(source.messages),
+        "unscaled": source.unscaled,
+    }
+    if source.measured_nm is not None:
+        table.meta["measured_nm"] = list(source.measured_nm)
+    place = folder() / f"{re.sub(r'[^A-Za-z0-9.+-]', '_', name)}.ecsv" if there is None else there.path
+    alike = re.sub(r"[\s_]+", "_", name.casefold())
+    if there is None and any(re.sub(r"[\s_]+", "_", star.name.casefold()) == alike for star in kept()):
+        raise InputError(
+            f"star name {name!r} is too much like another kept star's", "another name", key="name", value=name
+        )
+    if there is None and place.exists():
+        # Letters that file names cannot have, such as Greek ones, are equal in them: the digest of the name differs.
+        place = place.with_stem(f"{place.stem}-{hashlib.sha256(name.casefold().encode()).hexdigest()[:8]}")
+    text = io.StringIO()
+    table.write(text, format="ascii.ecsv")
+    try:
+        write_whole(place, text.getvalue().encode(), shared=True)
+    except InputError as error:
+        raise error.within("star folder (MAUVECL_DATA_DIR sets another)") from error
+    known = find(name)
+    assert known is not None
+    return known
+
+
+#: Timeout of a connection, s.
+TIMEOUT_S = 20.0
+#: Schemes of an address; a local file is added, not downloaded.
+SCHEMES = ("http", "https", "ftp")
+#: Longest duration of a download, s: the largest file of `size_limits.LIMITS` at 0.5 MB/s.
+MAX_DOWNLOAD_S = 600.0
+#: Largest size of a listing, bytes.
+MAX_LISTING_BYTES = 20 * 2**20
+
+
+@dataclass(frozen=True)
+class Collection:
+    """A public collection of HST spectra."""
+
+    name: str
+    title: str
+    citation: str
+    base: str  # address of the files, from the archive's pages; not verified by the tests
+    # Path of a star's file below the base, from its name and a function that lists the files of a folder.
+    file_of: Callable[[str, Callable[[str], list[str]]], str]
+
+
+def _file_name(name: str) -> str:
+    """Return a star's name as archives write it in file names."""
+    return re.sub(r"[^a-z0-9+-]", "", name.casefold())
+
+
+def _six_digit_name(name: str) -> str:
+    """Return a star's name as in file names, with HD numbers padded to six digits."""
+    plain = _file_name(name)
+    match = re.fullmatch(r"(hd)0*(\d{1,6})", plain)
+    return f"{match[1]}{int(match[2]):06d}" if match else plain
+
+
+def _latest_calspec(name: str, listing: Callable[[str], list[str]]) -> str:
+    """Return the name of a star's STIS file with the highest version number."""
+    plain = _file_name(name)
+    files = [file for file in listing("") if re.fullmatch(rf"{re.escape(plain)}_stis(wfcnic|wfc|nic)?_\d+\.fits", file)]
+    if not files:
+        raise FileNotFoundError(plain)
+    return max(files, key=lambda file: (int(file.rsplit("_", 1)[1][:-5]), file))
+
+
+COLLECTIONS = (
+    Collection(
+        "calspec",
+        "CALSPEC, HST's flux standards",
+        "Bohlin, Gordon & Tremblay 2014, PASP 126, 711, doi 10.1086/677655",
+        "https://archive.stsci.edu/hlsps/reference-atlases/cdbs/current_calspec/",
+        _latest_calspec,
+    ),
+    Collection(
+        "ngsl",
+        "Next Generation Spectral Library, version 2",
+        "Heap & Lindler 2007, ASP Conf. Ser. 374, 409",
+        "https://archive.stsci.edu/pub/hlsp/stisngsl/v2/",
+        lambda name, listing: f"{_six_digit_name(name)}/h_stis_ngsl_{_six_digit_name(name)}_v2.fits",
+    ),
+    Collection(
+        "lowlib",
+        "the HST stellar library of 513 stars, dereddened",
+        "Pal et al. 2023, doi 10.17909/kmdt-pw63",
+        "https://archive.stsci.edu/hlsps/lowlib/",
+        lambda name, listing: f"hlsp_lowlib_hst_stis_{_file_name(name)}_g230lb-g430l-g750l_v1.0_spect.fits",
+    ),
+)
+
+
+def fetch(
+    name: str,
+    *,
+    base: str | None = None,
+    replace: bool = False,
+    show_progress: bool = True,
+    extend: str | None = None,
+) -> OwnStar:
+    """Download a star from a public collection and keep it.
+
+    Parameters
+    ----------
+    name : str
+        A name such as ``"HD 37202"``, which is searched for in all collections, or ``"ngsl:HD 37202"``.
+    base : str, optional
+        Address of a mirror of the collection's files. `name` must then include the collection.
+    replace : bool
+        Whether to replace a kept star of the same name.
+    show_progress : bool
+    extend : str, optional
+        Library spectrum that continues the star's beyond its end.
+
+    Raises
+    ------
+    InputError
+        If the network fails, the star is unknown, or its file holds no usable spectrum.
+    """
+    word, colon, star = (part.strip() for part in name.partition(":"))
+    chosen = [c for c in COLLECTIONS if c.name == word.casefold()] if colon else list(COLLECTIONS)
+    known = ", ".join(c.name for c in COLLECTIONS)
+    if not chosen:
+        raise InputError.of("collection", word, f"one of {known}")
+    if base is not None and not colon:
+        raise InputError(
+            f"another address is given for {name!r}", f"its collection too, such as ngsl:{name}", key="name", value=name
+        )
+    star = star if colon else word
+    if not _file_name(star):
+        raise InputError(f"star {name!r} has an empty name", "a name such as ngsl:HD 37202", key="name", value=name)
+    for collection in chosen:
+        address = base or collection.base
+        try:
+            _check_address(address)
+            url = urljoin(_folder(address), collection.file_of(star, partial(_listing, address)))
+            downloaded = _download(url, show_progress)
+        except FileNotFoundError:
+            continue
+        file = url.rsplit("/", 1)[1]
+        # Messages and notes use the archive's file name.
+        local = downloaded.rename(downloaded.with_name(f"{downloaded.name}-{file}"))
+        try:
+            title = f"{collection.title}; {collection.citation}; {url}"
+            return add(local, star, origin=title, replace=replace, extend=extend)
+        except InputError as error:
+            raise InputError(
+                f"{url} was downloaded but is not a usable spectrum ({str(error).replace(local.name, file)})",
+                "a whole file",
+                key="base",
+                value=url,
+            ) from error
+        finally:
+            local.unlink(missing_ok=True)
+    where = " or ".join(c.title for c in chosen)
+    raise InputError(
+        f"no star {star!r} in {where}",
+        "its name there, such as HD 37202; or bring the file: mauvecl library add",
+        key="name",
+        value=name,
+    )
+
+
+def _folder(address: str) -> str:
+    return address if address.endswith("/") else address + "/"
+
+
+def _check_address(address: str) -> None:
+    """Raise InputError unless the address is a URL of a supported scheme."""
+    with parsing(f"address {shortened(address)}", "one such as https://host/folder/"):
+        parts = urlsplit(address)
+        known = parts.scheme in SCHEMES and bool(parts.hostname) and parts.port != 0
+    if not (known and address.isprintable() and " " not in address):
+        raise InputError.of("base", address, "one such as https://host/folder/")
+
+
+def _download(url: str, show_progress: bool, max_bytes: int | None = None) -> Path:
+    """Download a file within limits of size and time; raises FileNotFoundError if the server has none."""
+    # Imported here because TLS is slow to import and most runs download nothing.
+    import http.client
+    import urllib.error
+
+    max_bytes = limit_bytes("MAUVECL_LARGEST_FILE_MIB") if max_bytes is None else max_bytes
+    descriptor, name = tempfile.mkstemp(prefix="mauvecl-fetch-")
+    try:
+        with open(descriptor, "wb") as file:
+            _receive(url, file, max_bytes, show_progress)
+        return Path(name)
+    except BaseException as error:
+        Path(name).unlink(missing_ok=True)
+        if isinstance(error, InputError):
+            raise
+        if isinstance(error, urllib.error.HTTPError):
+            if error.code in (403, 404, 410):
+                # Object stores answer 403 for a missing file.
+                raise FileNotFoundError(url) from error
+            raise InputError(
+                f"{url} answers {error.code} {error.reason}", "the file: try again later", key="base", value=url
+            ) from error
+        if not isinstance(error, OSError | ValueError | http.client.HTTPException):
+            raise
+        # Invalid host names raise ValueError (IDNA codec), malformed responses HTTPException.
+        reason = getattr(error, "reason", error)
+        raise InputError(
+            f"{url} cannot be reached ({reason})",
+            f"a network; without one bring the file: mauvecl library add {url.rsplit('/', 1)[1] or 'FILE'}",
+            key="base",
+            value=url,
+        ) from error
+
+
+def _receive(url: str, file: IO[bytes], max_bytes: int, show_progress: bool) -> None:
+    """Write a response in pieces, since a server may state no size or a wrong one and never stop sending."""
+    import urllib.request
+
+    from astropy.utils.console import ProgressBarOrSpinner
+
+    latest, got = time.monotonic() + MAX_DOWNLOAD_S, 0
+    request = urllib.request.Request(url, headers={"User-Agent": f"mauvecl/{VERSION}"})
+    with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer:
+        length = answer.headers.get("Content-Length", "")
+        size = int(length) if length.isascii() and length.isdigit() and len(length) < 20 else None
+        shown = sys.stderr if show_progress else io.StringIO()
+        with ProgressBarOrSpinner(size, f"Fetching {url}", file=shown) as bar:
+            while (size is None or size <= max_bytes) and (piece := answer.read1(1 << 16)):
+                file.write(piece)
+                got += len(piece)
+                bar.update(got)
+                if got > max_bytes:
+                    size = got
+                if time.monotonic() > latest:
+                    raise InputError(
+                        f"the download of {url} takes more than {MAX_DOWNLOAD_S:.0f} s",
+                        "less: try again later",
+                        key="base",
+                        value=url,
+                    )
+    if size is not None and size > max_bytes:
+        raise InputError(
+            f"{url} has more than {max_bytes >> 20} MiB",
+            "less; MAUVECL_LARGEST_FILE_MIB sets the limit of files",
+            key="MAUVECL_LARGEST_FILE_MIB",
+            value=max_bytes >> 20,
+        )
+    if size is not None and got < size:
+        raise InputError(
+            f"the download of {url} ended early ({got} of {size} bytes received)",
+            "the whole file: try again",
+            key="base",
+            value=url,
+        )
+
+
+def _listing(address: str, below: str) -> list[str]:
+    """Return the names of the files to which a server's page of a folder links."""
+    page = _download(urljoin(_folder(address), below), False, MAX_LISTING_BYTES)
+    try:
+        text = page.read_text(encoding="utf-8", errors="replace")
+    finally:
+        page.unlink(missing_ok=True)
+    return [link.rsplit("/", 1)[-1] for link in re.findall(r'href="([^"?#]+)"', text, flags=re.IGNORECASE)]

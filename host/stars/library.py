@@ -1,0 +1,487 @@
+"""Stars by name: the embedded library, the user's own stars, formulas, spectral types and well-known stars.
+
+The user's own stars, which supplement the embedded library.
+
+Each star is an ECSV file in the user's data folder, with its origin and the digest of its spectrum, which is verified
+at every reading.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import hashlib
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from importlib import resources
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mauvecl.host.tables.ecsv import Numbers, parse_numbers, read_ecsv
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Range, checked, checked_number
+from mauvecl.schema.physical import Temperature
+from mauvecl.schema.tables import Column
+from mauvecl.schema.text import shortened
+
+if TYPE_CHECKING:
+    import numpy as np
+    from astropy.table import Table
+    from numpy.typing import NDArray
+
+#: Names by which they are offered.
+EXAMPLES = ("blackbody 9000 K", "power law -2")
+#: Indices of power laws that are accepted; steeper spectra say nothing of stars (assumed).
+INDEX = Range(-10, 10)
+#: First and last wavelength of the spectra, nm, and number of points: they cover all bands, and straight lines between
+#: them are true to 2e-5 for 3000 K at 200 nm, and closer elsewhere and for hotter stars.
+GRID = (100.0, 3000.0, 8000)
+#: Wavelength at which a power law has unit flux, nm.
+PIVOT_NM = 550.0
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?"
+_NAME = re.compile(
+    rf"\s*(?:(?P<body>black[ -]?body|planck)\s+(?P<kelvin>{_NUMBER})\s*K?|power[ -]?law\s+(?P<index>{_NUMBER}))\s*",
+    flags=re.IGNORECASE,
+)
+
+
+@dataclass(frozen=True)
+class ModelStar:
+    """Blackbody of a temperature, or power law of an index; exactly one of them is given."""
+
+    temperature_k: float | None
+    index: float | None
+
+    @classmethod
+    def named(cls, text: str) -> ModelStar | None:
+        """Return the star of a name such as "blackbody 9000 K" or "power law -2", or None for another name.
+
+        Raises InputError if the number is out of range.
+        """
+        found = _NAME.fullmatch(text)
+        if found is None:
+            return None
+        if found["body"] is not None:
+            return cls(checked(Temperature, "temperature of the blackbody", float(found["kelvin"])), None)
+        return cls(None, checked_number("index of the power law", float(found["index"]), "", INDEX))
+
+    @property
+    def name(self) -> str:
+        """Name that gives this star again."""
+        return f"blackbody {self.temperature_k:.15g} K" if self.index is None else f"power law {self.index:.15g}"
+
+    @property
+    def origin(self) -> str:
+        """Formula of the spectrum."""
+        return "Planck's law" if self.index is None else f"flux per wavelength proportional to its power {self.index:g}"
+
+    def spectrum(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return wavelengths, nm, and fluxes, erg s-1 cm-2 A-1, of an arbitrary level."""
+        import numpy as np
+
+        nm = np.geomspace(*GRID)
+        if self.index is not None:
+            return nm, (nm / PIVOT_NM) ** self.index
+        from mauvecl.host.stars.blackbody import blackbody
+
+        assert self.temperature_k is not None
+        return nm, blackbody(nm, self.temperature_k)
+
+
+@dataclass(frozen=True)
+class OwnStar:
+    """Metadata of a kept star; fields as in `Source`."""
+
+    name: str
+    origin: str
+    notes: tuple[str, ...]
+    dereddened: bool
+    path: Path
+    messages: tuple[str, ...] = ()
+    measured_nm: tuple[float, float] | None = None
+    unscaled: str = ""
+
+
+def folder() -> Path:
+    """Return the folder of kept stars, below ``MAUVECL_DATA_DIR`` or the user's data folder."""
+    import platformdirs
+
+    given = os.environ.get("MAUVECL_DATA_DIR")
+    return (Path(given) if given else platformdirs.user_data_path("mauvecl")) / "stars"
+
+
+def kept() -> list[OwnStar]:
+    """Return all kept stars, sorted by file name."""
+    return [star for path in sorted(folder().glob("*.ecsv")) if (star := _described(path)) is not None]
+
+
+def find(name: str) -> OwnStar | None:
+    """Return a kept star by name in any case, or None."""
+    wanted = name.strip().casefold()
+    return next((star for star in kept() if star.name.casefold() == wanted), None)
+
+
+def _described(path: Path) -> OwnStar | None:
+    meta = _read(path).meta
+    if not {"name", "origin", "spectrum_sha256"} <= set(meta):
+        return None
+    notes = tuple(str(note) for note in meta.get("notes", ()))
+    messages = tuple(str(text) for text in meta.get("told", ()))
+    measured = meta.get("measured_nm")
+    return OwnStar(
+        str(meta["name"]), str(meta["origin"]), notes, bool(meta.get("dereddened")), path, messages,
+        None if measured is None else (float(measured[0]), float(measured[1])), str(meta.get("unscaled", "")),
+    )  # fmt: skip
+
+
+def _read(path: Path) -> Table:
+    return read_ecsv(path, "kept star", "the file as it was kept: `mauvecl library remove` takes it away")
+
+
+def spectrum(star: OwnStar) -> tuple[np.ndarray, np.ndarray]:
+    """Return wavelengths, nm, and fluxes, erg s-1 cm-2 A-1; raises InputError if the file was changed."""
+    import numpy as np
+
+    table = _read(star.path)
+    wavelength, flux = (np.asarray(table[name], float) for name in ("wavelength", "flux"))
+    if spectrum_digest(wavelength, flux) != table.meta["spectrum_sha256"]:
+        raise InputError(
+            f"kept star {star.name!r} was changed after it was kept (its digest differs)",
+            "the unchanged file: add or fetch it again",
+            key="name",
+            value=star.name,
+        )
+    return wavelength, flux
+
+
+def spectrum_digest(wavelength: np.ndarray, flux: np.ndarray) -> str:
+    """Return the SHA-256 of wavelengths and fluxes, in hexadecimal."""
+    return hashlib.sha256(wavelength.tobytes() + flux.tobytes()).hexdigest()
+
+
+def remove(name: str) -> None:
+    """Delete a kept star; raises InputError for an unknown name."""
+    wanted = name.strip().casefold()
+    paths = sorted(folder().glob("*.ecsv"))
+    # A damaged file has no name but that of the file.
+    stem = re.sub(r"[^a-z0-9.+-]", "_", wanted)
+    found = [path for path in paths if _named(path) == wanted] or [
+        path for path in paths if path.stem.casefold() == stem and _named(path) is None
+    ]
+    if found:
+        found[0].unlink()
+        return
+    names = ", ".join(star.name for star in kept()) or "no star is kept"
+    raise InputError.of("name", name, f"one of: {names}")
+
+
+def _named(path: Path) -> str | None:
+    try:
+        described = _described(path)
+    except InputError:
+        return None
+    return None if described is None else described.name.casefold()
+
+
+#: Abbreviations of Greek letters in catalogues.
+_GREEK = {"alpha": "alp", "beta": "bet", "gamma": "gam", "delta": "del", "epsilon": "eps", "zeta": "zet", "iota": "iot",
+          "kappa": "kap", "sigma": "sig", "omicron": "omi"}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class WellKnown:
+    """Star of the embedded list."""
+
+    name: str
+    others: tuple[str, ...]  # its other names
+    ra_deg: float  # ICRS, as the declination
+    dec_deg: float
+    distance_pc: float
+    magnitude: float  # in V
+    spectral_type: str
+    source: str
+
+    @property
+    def about(self) -> str:
+        """Its type, distance and magnitude with their source, in words."""
+        return f"{self.spectral_type}, {self.distance_pc:g} pc, V = {self.magnitude:g}; {self.source.partition(',')[0]}"
+
+
+def text() -> str:
+    """Return the list as ECSV."""
+    return resources.files(__package__).joinpath("library", "well_known.ecsv").read_text(encoding="utf-8")
+
+
+@cache
+def stars() -> tuple[WellKnown, ...]:
+    """Return the stars of the list."""
+    lines = [line for line in text().splitlines() if not line.startswith("#")]
+    return tuple(
+        WellKnown(
+            row["name"], tuple(name.strip() for name in row["other_names"].split(",")), float(row["ra"]),
+            float(row["dec"]), float(row["distance"]), float(row["V"]), row["spectral_type"], row["source"],
+        )
+        for row in csv.DictReader(lines, delimiter=" ")
+    )  # fmt: skip
+
+
+@cache
+def by_key() -> Mapping[str, WellKnown]:
+    """Return every star by each of its normalised names."""
+    return {name_key(name): star for star in stars() for name in (star.name, *star.others)}
+
+
+def name_key(name: str) -> str:
+    """Normalise a name: lower case, no separators but decimal points, abbreviated Greek letters."""
+    key = re.sub(r"[\s_*']+|(?<!\d)\.|\.(?!\d)", "", name).casefold()
+    for long, short in _GREEK.items():
+        if key.startswith(long):
+            return short + key.removeprefix(long)
+    return key
+
+
+_LIBRARY = files("mauvecl.host.stars") / "library"
+
+
+@cache
+def _index() -> dict[str, dict[str, str]]:
+    # Read without astropy, which keeps the error for a misspelt name fast.
+    text = _LIBRARY.joinpath("index.ecsv").read_text(encoding="utf-8")
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
+    return {entry["name"].casefold(): entry for entry in csv.DictReader(lines, delimiter=" ")}
+
+
+@cache
+def _keys() -> dict[str, str]:
+    """Return the key of the index entry for every normalised name and alias."""
+    keys: dict[str, str] = {}
+    for key, entry in _index().items():
+        keys[name_key(key)] = key
+        for other in (entry["alias"], entry["star"]):
+            keys.setdefault(name_key(other), key)
+    keys.pop("", None)
+    return keys
+
+
+def entries() -> list[dict[str, str]]:
+    """Return the index entries of all embedded spectra."""
+    return list(_index().values())
+
+
+def names() -> list[str]:
+    """Return the distinct names of all embedded spectra: types, aliases and stars."""
+    each = [entry[column] for entry in entries() for column in ("name", "alias", "star")]
+    # A collection's name in front of a type says nothing that the type does not.
+    return [name for name in dict.fromkeys(each) if name and not name.startswith("Pickles ")]
+
+
+def _ratios(quality: str) -> str:
+    """Return the ratios of an entry on the ultraviolet: "190-210: 0.1 (S/N 5), ...; ..." gives "0.1, ..."."""
+    return ", ".join(part.split()[0] for part in quality.split("; ")[0].split(": ")[1].split(", "))
+
+
+#: Columns of the table of embedded spectra as people read it.
+COLUMNS = (
+    Column("name", heading="name"),
+    Column("alias", heading="also"),
+    Column("spectral_type", heading="type"),
+    Column("star", heading="star"),
+    Column("temperature_k", heading="K"),
+    Column("uv_quality", heading="UV at 190-210, 240-260, 290-310 nm", format=_ratios),
+    Column("noisy_below_nm", heading="noisy below", format=lambda below: f"{below} nm" if below else ""),
+    Column("licence", heading="licence"),
+)
+#: Columns of that of the user's own.
+OWN_COLUMNS = (
+    Column("name", heading="name"),
+    Column("origin", heading="origin"),
+    Column("treatment", heading="notes"),
+)
+
+
+def library_table() -> Table:
+    """Return the embedded spectra, followed by the user's own.
+
+    Returns
+    -------
+    astropy.table.Table
+        Columns name, alias, spectral_type, star, origin, citation, licence, treatment, uv_quality and kept. All are
+        text; the last is "embedded" or "yours".
+    """
+    from astropy.table import Table
+
+    table = Table.read(_LIBRARY.joinpath("index.ecsv").read_text(encoding="utf-8"), format="ascii.ecsv")
+    # The reader masks empty text.
+    table = table.filled("")
+    table.remove_columns(["file", "source_file"])
+    table["kept"] = "embedded"
+    for star in kept():
+        row = dict.fromkeys(table.colnames, "") | {"name": star.name, "star": star.name, "origin": star.origin}
+        row |= {"treatment": "; ".join(star.notes), "kept": "yours"}
+        for name in table.colnames:
+            # A column of dtype str is only as wide as its longest entry.
+            table[name] = table[name].astype(object)
+        table.add_row(row)
+    return table
+
+
+def embedded(name: str) -> dict[str, str] | None:
+    """Return the index entry of an embedded spectrum by name, alias or star in any case and spacing, or None.
+
+    A type may lack its luminosity class: "M3" is M3V.
+    """
+    key = name_key(name)
+    found = _keys().get(key) or _keys().get(f"{key}v")
+    return None if found is None else _index()[found]
+
+
+@lru_cache(8)
+def spectrum_table(file: str) -> Numbers:
+    """Read a library spectrum with the columns wavelength (nm) and flux (erg s-1 cm-2 A-1)."""
+    return _numbers("spectra", file)
+
+
+def band_table(file: str) -> Numbers:
+    """Read a photometric band with the columns wavelength (nm) and throughput (per photon)."""
+    return _numbers("bands", file)
+
+
+def _numbers(folder: str, file: str) -> Numbers:
+    return parse_numbers(_LIBRARY.joinpath(folder, file).read_text(encoding="utf-8"), f"library file {file}")
+
+
+#: Spectral classes in order of decreasing temperature.
+CLASSES = "OBAFGKM"
+_TYPE = re.compile(rf"\s*(?:d)?([{CLASSES}])\s*(\d(?:\.\d+)?)?")
+
+
+def subtype(spectral_type: str) -> float:
+    """Convert a spectral type to a number, ten per class: K5 is 55, M0 is 60, and a class without subtype is x5."""
+    matched = _TYPE.match(spectral_type)
+    if not matched:
+        raise InputError(
+            f"spectral type {shortened(spectral_type)} is unknown",
+            "one from O to M, such as M3V",
+            key="spectral_type",
+            value=spectral_type,
+        )
+    return 10.0 * CLASSES.index(matched[1]) + (5.0 if matched[2] is None else float(matched[2]))
+
+
+def as_type(text: str) -> str | None:
+    """Return the spectral type of a dwarf or subgiant that a text names, as in "M3.5V" for "m3.5", or None."""
+    found = re.fullmatch(rf"d?([{CLASSES}])(\d(?:\.\d+)?)(IV|V)?", "".join(text.split()), flags=re.IGNORECASE)
+    return None if found is None else f"{found[1]}{found[2]}{found[3] or 'V'}".upper()
+
+
+def nearest_spectrum(spectral_type: str) -> str:
+    """Return the name of the embedded spectrum of the nearest type; the first in the library if there are several."""
+    wanted = subtype(spectral_type)
+    names = [(one["name"], one["spectral_type"]) for one in entries() if _TYPE.match(one["spectral_type"])]
+    return min(names, key=lambda one: abs(subtype(one[1]) - wanted))[0]
+
+
+@dataclass(frozen=True)
+class NamedStar:
+    """Star or spectral type that was found by name."""
+
+    name: str
+    spectrum: str | None  # name of its own spectrum, in the library or among the user's
+    known: WellKnown | None  # its entry in the list of well-known stars
+
+    @property
+    def nearest(self) -> str:
+        """Library spectrum that represents it: its own, or that of the nearest type."""
+        if self.spectrum is not None:
+            return self.spectrum
+        return nearest_spectrum(self.name if self.known is None else self.known.spectral_type)
+
+
+def resolve(text: str, *, own: bool = True) -> NamedStar | None:
+    """Find a star or spectral type by any name, in any case and spacing, or return None.
+
+    Parameters
+    ----------
+    text : str
+        A name of the library ("M3V", short "M3"), a star ("GJ 581", "Proxima", "HD 1835"), any other spectral type, or
+        a formula ("blackbody 9000 K", "power law -2").
+    own : bool
+        Whether to search among the user's own stars.
+    """
+    model = ModelStar.named(text)
+    if model is not None:
+        return NamedStar(model.name, model.name, None)
+    entry, known = embedded(text), by_key().get(name_key(text))
+    if entry is None and known is not None:
+        # The library has the star under another of its names.
+        entries = (embedded(name) for name in (known.name, *known.others))
+        entry = next((one for one in entries if one is not None), None)
+    mine = find(text) if own and entry is None else None
+    spectrum = entry["name"] if entry is not None else None if mine is None else mine.name
+    if known is not None:
+        return NamedStar(known.name, spectrum, known)
+    if spectrum is not None:
+        return NamedStar(spectrum, spectrum, None)
+    spectral_type = as_type(text)
+    return None if spectral_type is None else NamedStar(spectral_type, None, None)
+
+
+def spectrum_name(text: str, key: str = "star", *, own: bool = True) -> str:
+    """Return the name of the spectrum of a star.
+
+    Raises InputError if the star has no spectrum; the message proposes one and, for a well-known star, its magnitude.
+
+    Parameters
+    ----------
+    key : str
+        Key of the error.
+    own : bool
+        Whether to search among the user's own stars.
+    """
+    star = resolve(text, own=own)
+    if star is None:
+        raise InputError(
+            f"star {text.strip()!r} is unknown", f"a name such as {', '.join(near_names(text))}", key=key, value=text
+        )
+    if star.spectrum is not None:
+        return star.spectrum
+    proposed = f"`{key}={star.nearest!r}`"
+    if star.known is None:
+        raise InputError(
+            f"spectral type {text.strip()!r} has no spectrum in the library",
+            f"the nearest, {proposed}, or a name such as {', '.join(near_names(text))}",
+            key=key,
+            value=text,
+        )
+    raise InputError(
+        f"star {text.strip()!r} has no spectrum in the library",
+        f"that of the nearest type and its V: {proposed} with `magnitude={star.known.magnitude:g}` "
+        f"({star.name}: {star.known.about})",
+        key=key,
+        value=text,
+    )
+
+
+def all_names() -> list[str]:
+    """Return the names of all embedded spectra and well-known stars, without designations, and of two formulas."""
+    return list(dict.fromkeys([*names(), *EXAMPLES, *(star.name for star in stars())]))
+
+
+def near_names(text: str, *, stars_only: bool = False) -> list[str]:
+    """Return up to four known names that resemble a text, or a few examples.
+
+    Parameters
+    ----------
+    stars_only : bool
+        Whether names must be of stars with known coordinates.
+    """
+    known = {key: star.name for key, star in by_key().items()}
+    if not stars_only:
+        known |= {name_key(name): name for name in names()}
+        known |= {name_key(star.name): star.name for star in kept()}
+    near = difflib.get_close_matches(name_key(text), known, n=4, cutoff=0.5)
+    return list(dict.fromkeys(known[one] for one in near)) or ["eps Eri", "AU Mic"] + ["G2V"] * (not stars_only)

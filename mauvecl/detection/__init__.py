@@ -1,0 +1,1 @@
+"""Statistics, their distributions, detections and S/N."""

@@ -1,0 +1,392 @@
+"""Chi-squared statistics of pixels, of resolution elements, relative to a noisy exposure, and of the MauveSim paper."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from mauvecl.detection.distributions import QuadraticForm
+from mauvecl.detection.statistics import Differences, QuadraticStatistic, Setting, Tilt
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+    from mauvecl.host.exposure.expectation import Expectation
+
+#: Relative width of the groups of pixels, by ratio of true to assumed variance, in closed forms.
+GROUP_WIDTH = 0.005
+
+
+class Chi2(QuadraticStatistic):
+    """Sum over pixels of the squared difference divided by its variance."""
+
+    name = "chi2"
+    definition: ClassVar[str] = "sum over pixels of (observed - reference)^2 / variance"
+    label: ClassVar[str] = "chi2 over pixels"
+    kernel_sum: ClassVar[str | None] = "chi2"
+
+    def dof(self, setting: Setting) -> int:
+        return int(setting.used.sum()) - self._free(setting)
+
+    @staticmethod
+    def _free(setting: Setting) -> int:
+        return setting.nuisances.free if setting.nuisances else 0
+
+    def form(self, setting: Setting, seen: Differences, flare: Expectation | None = None) -> QuadraticForm:
+        true, scatter = seen.variance * setting.used, seen.scatter
+        model = true if seen.estimated else self.variance(setting) * setting.used
+        delta, model, true = (self._grouped(setting, values) for values in (seen.mean, model, true))
+        counts = (model > 0) & (true > 0)
+        delta, model, true = delta[counts], model[counts], true[counts]
+        if setting.nuisances:
+            if scatter is not None:
+                scatter = self._grouped(setting, scatter * setting.used)[:, counts]
+            return self._marginal_form(setting, counts, delta, model, true, scatter)
+        return QuadraticForm(true / model, delta / np.sqrt(true))
+
+    def _marginal_form(
+        self,
+        setting: Setting,
+        counts: NDArray[np.bool_],
+        delta: Float,
+        model: Float,
+        true: Float,
+        scatter: Float | None,
+    ) -> QuadraticForm:
+        """Return the distribution of x^T C^-1 x for normal x of mean `delta`, true variance and nuisance scatter."""
+        nuisances = setting.nuisances
+        assert nuisances is not None
+        if scatter is None and not delta.any() and np.array_equal(model, true):
+            size = delta.size - nuisances.free
+            return QuadraticForm(np.ones(size), np.zeros(size))
+        scale = np.sqrt(model)
+
+        def projection() -> tuple[Float, Float]:
+            spectra = self._spectra(setting)[:, counts]
+            return spectra, nuisances.rows(model, spectra) * scale
+
+        # The nodes of an integral over drawn factors share the model's variances.
+        pixels = np.packbits(counts).tobytes().hex()
+        spectra, rows = setting.cached(f"projection of {self.name} on {pixels}", projection)
+        drawn = (nuisances.finite(spectra) if scatter is None else scatter) / scale
+        basis, rest = _span(np.vstack([spectra / scale, drawn, delta / scale]), true / model)
+        # Covariance and quadratic form within the span.
+        noise = basis.T @ ((true / model)[:, None] * basis) + (drawn @ basis).T @ (drawn @ basis)
+        taken, root = rows @ basis, np.linalg.cholesky(noise)
+        weight, vectors = np.linalg.eigh(root.T @ root - (taken @ root).T @ (taken @ root))
+        # Projected-out directions have no weight.
+        kept = weight > 1e-9 * weight[-1]
+        shift = vectors.T @ solve_triangular(root, basis.T @ (delta / scale), lower=True)
+        weights, shifts = np.append(weight[kept], rest), np.append(shift[kept], np.zeros(rest.size))
+        return QuadraticForm(weights, shifts)
+
+    def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
+        x, variance = x * setting.used, variance * setting.used
+        subtracted = np.sum((x @ self.subtracted_rows(setting).T) ** 2, axis=-1)
+        x, variance = (self._grouped(setting, values) for values in (x, variance))
+        total = np.sum(np.divide(x**2, variance, out=np.zeros_like(x), where=variance > 0), axis=-1)
+        return np.asarray(total - subtracted)
+
+    def subtracted_rows(self, setting: Setting) -> Float:
+        if not setting.nuisances:
+            return super().subtracted_rows(setting)
+        model = self._grouped(setting, self.variance(setting) * setting.used)
+        return self._per_pixel(setting, setting.nuisances.rows(model, self._spectra(setting)))
+
+    def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
+        from scipy.sparse import eye_array
+
+        directions = eye_array(setting.used.size, format="csr")[setting.used]
+        return Tilt(directions, np.ones(directions.shape[0]))
+
+    def square_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
+        model = self._grouped(setting, self.variance(setting) * setting.used)
+        inverse = np.divide(1.0, model, out=np.zeros_like(model), where=model > 0)
+        weights = self._per_pixel(setting, inverse) - np.sum(self.subtracted_rows(setting) ** 2, axis=0)
+        return np.asarray(weights * setting.used)
+
+    def _grouped(self, setting: Setting, values: Float) -> Float:
+        """Convert values per pixel, along the last axis, to values per squared term."""
+        return values
+
+    def _per_pixel(self, setting: Setting, values: Float) -> Float:
+        """Convert values per squared term to values per pixel."""
+        return values
+
+    def _spectra(self, setting: Setting) -> Float:
+        """Return the nuisance spectra per squared term."""
+        assert setting.nuisances is not None
+        return self._grouped(setting, setting.nuisances.spectra * setting.used)
+
+
+def _span(vectors: Float, ratio: Float) -> tuple[Float, Float]:
+    """Return an orthonormal basis of the vectors' parts in groups of pixels, and the weights outside its span.
+
+    Parameters
+    ----------
+    vectors : ndarray, shape (k, n)
+        Vectors in standard deviations of each value.
+    ratio : ndarray, shape (n,)
+        True variances divided by the model's.
+
+    Returns
+    -------
+    basis : ndarray, shape (n, m)
+    rest : ndarray, shape (n - m,)
+        Coefficients of squares along the directions outside the span: the mean of the group, which preserves the sum.
+
+    Notes
+    -----
+    The result is exact if ratios are equal within groups. Groups are `GROUP_WIDTH` wide, and the coupling of the span
+    to the rest changes eigenvalues by the square of this width.
+    """
+    order = np.argsort(ratio)
+    group = np.floor(np.log(ratio[order] / ratio[order[0]]) / GROUP_WIDTH)
+    parts, rest = [], []
+    for members in np.split(order, np.flatnonzero(np.diff(group)) + 1):
+        basis, sizes, _ = np.linalg.svd(vectors[:, members].T, full_matrices=False)
+        basis = basis[:, sizes > 1e-13 * sizes[0]] if sizes[0] > 0 else basis[:, :0]
+        part = np.zeros((ratio.size, basis.shape[1]))
+        part[members] = basis
+        parts.append(part)
+        left = members.size - basis.shape[1]
+        total = float(ratio[members].sum() - ratio[members] @ np.sum(basis**2, axis=1))
+        rest.append(np.full(left, total / max(left, 1)))
+    return np.hstack(parts), np.concatenate(rest)
+
+
+class Chi2Element(Chi2):
+    """Sum over resolution elements of the squared difference divided by its variance."""
+
+    name = "chi2_element"
+    definition: ClassVar[str] = "the same over sums of 10.5 nm resolution elements"
+    label: ClassVar[str] = "chi2 over 10.5 nm elements"
+    kernel_sum: ClassVar[str | None] = "chi2_element"
+    by_element: ClassVar[bool] = True
+
+    def dof(self, setting: Setting) -> int:
+        return int(np.unique(setting.quiet.element[setting.used]).size) - self._free(setting)
+
+    def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
+        element = setting.quiet.element
+        member = element[None, :] == np.unique(element[setting.used])[:, None]
+        directions = member * np.sqrt(self.variance(setting)) * setting.used
+        return Tilt(directions / np.linalg.norm(directions, axis=1)[:, None], np.ones(len(directions)))
+
+    def _grouped(self, setting: Setting, values: Float) -> Float:
+        starts = np.flatnonzero(np.append(True, np.diff(setting.quiet.element) > 0))
+        return np.asarray(np.add.reduceat(values, starts, axis=-1))
+
+    def _per_pixel(self, setting: Setting, values: Float) -> Float:
+        return np.asarray(values[..., np.unique(setting.quiet.element, return_inverse=True)[1]])
+
+
+class Chi2Pair(Chi2):
+    """Chi-squared over pixels of the difference between two exposures."""
+
+    name = "chi2_pair"
+    definition: ClassVar[str] = "against a noisy quiescent exposure: twice the variance"
+    label: ClassVar[str] = "chi2 against a noisy exposure"
+    kernel_sum: ClassVar[str | None] = "chi2_pair"
+    paired: ClassVar[bool] = True
+    marginal: ClassVar[bool] = False
+
+
+Float = NDArray[np.float64]
+
+#: FWHM of the paper's smoothing, nm.
+SMOOTHING_NM = 10.5
+#: Centres per standard deviation of the smoothing, and points of the interpolation between them, which give the sum
+#: over all pixels to 1e-4.
+STEPS_PER_SIGMA = 2
+POINTS = 8
+#: Relative error of the sum's mean above which every pixel becomes a centre.
+MAX_MEAN_ERROR = 1e-4
+#: Variance, relative to the largest, below which a mode is due to rounding.
+MIN_MODE_VARIANCE = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothing:
+    """A Gaussian smoothing at a few centres that represents the sum of squares over all pixels.
+
+    Smoothed spectra vary slowly, so their squares are interpolated between the centres. The sum over all pixels is then
+    a weighted sum over the centres.
+    """
+
+    centres: NDArray[np.int64]  # pixels at which the smoothed spectrum is computed, shape (n_centre,)
+    between: Float  # interpolation of squares from centres to pixels, shape (n_pixel, n_centre)
+    sigma: float  # standard deviation of the smoothing, pixels
+    weights: csr_array  # smoothing weights, zero for unused pixels, shape (n_centre, n_pixel)
+
+    @cached_property
+    def rows(self) -> Float:
+        """Dense array of the weights."""
+        return np.asarray(self.weights.toarray())
+
+    @classmethod
+    def of(cls, x: Expectation, used: NDArray[np.bool_], flares: Sequence[Expectation] = ()) -> Smoothing:
+        """Make the smoothing of the used pixels of spectra like `x`, accurate for the sums of `flares`."""
+        n = x.wavelength_nm.size
+        sigma = SMOOTHING_NM / np.sqrt(8 * np.log(2)) / float(np.median(np.diff(x.wavelength_nm)))
+        step = max(int(sigma / STEPS_PER_SIGMA), 1)
+        rows = _rows(n, sigma)
+        centres, between = _interpolation(n, step)
+        smoothing = cls(centres, between, sigma, rows[centres].multiply(used).tocsr())
+        if step == 1 or all(smoothing._preserves_sum(flare, used) for flare in flares or (x,)):
+            return smoothing
+        return cls(np.arange(n), np.eye(n), sigma, rows.multiply(used).tocsr())
+
+    def _preserves_sum(self, flare: Expectation, used: NDArray[np.bool_]) -> bool:
+        """Return whether non-negative factors of the centres reproduce the mean of the sum over all pixels."""
+        scale, squares = self.scale(flare), _squares(used.size, self.sigma) @ (used * flare.variance_dn2)
+        whole, ours = float(self._inverse_flare(flare) @ squares), float(scale @ squares[self.centres])
+        return bool((scale >= 0).all() and abs(ours - whole) <= MAX_MEAN_ERROR * whole)
+
+    def _inverse_flare(self, flare: Expectation) -> Float:
+        """Return the inverse of the smoothed flare at every pixel, for squares of DN; zero where there is no light."""
+        from scipy.ndimage import gaussian_filter1d
+
+        expected = gaussian_filter1d(flare.recorded_light_dn, self.sigma, mode="nearest")
+        return np.asarray(1.0 / np.where(expected > 0, expected, np.inf) / flare.exposure_s)
+
+    def scale(self, flare: Expectation) -> Float:
+        """Return the factors of squared smoothed DN in the sum of (F - Q)^2 / F in DN/s, shape (n_centre,)."""
+        return np.asarray(self._inverse_flare(flare) @ self.between)
+
+    def form(self, scale: Float, delta: Float, variance: Float) -> QuadraticForm:
+        """Return the distribution of the sum for Gaussian noise with a mean and variance per pixel."""
+        if not delta.any():
+            weight = np.linalg.eigvalsh(self._covariance(scale, variance))
+            weight = weight[weight > MIN_MODE_VARIANCE * weight[-1]]
+            return QuadraticForm(weight, np.zeros(weight.size))
+        weight, vectors = self._eigenmodes(scale, variance)
+        return QuadraticForm(weight, (np.sqrt(scale) * (self.weights @ delta)) @ vectors / np.sqrt(weight))
+
+    def modes(self, scale: Float, variance: Float) -> tuple[Float, Float]:
+        """Return the variances of the sum's independent modes, shape (n_mode,), and their weights per pixel."""
+        weight, vectors = self._eigenmodes(scale, variance)
+        return weight, vectors.T @ (np.sqrt(scale)[:, None] * self.rows)
+
+    def _eigenmodes(self, scale: Float, variance: Float) -> tuple[Float, Float]:
+        """Return the variances of the modes, and their weights per centre, shape (n_centre, n_mode)."""
+        values, vectors = np.linalg.eigh(self._covariance(scale, variance))
+        kept = values > MIN_MODE_VARIANCE * values[-1]
+        return values[kept], vectors[:, kept]
+
+    def _covariance(self, scale: Float, variance: Float) -> Float:
+        """Return the covariance of the smoothed values times the roots of their factors."""
+        half = self.weights * np.sqrt(scale)[:, None]
+        return np.asarray(((half * variance) @ half.T).toarray())
+
+    def bands(self, n_padded: int, chunk: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+        """Return the weights of unfinished centres per chunk of pixels, and the number of centres each chunk finishes.
+
+        Returns
+        -------
+        weights : ndarray of float32, shape (n_chunk, n_slot, chunk)
+            Slot 0 belongs to the first unfinished centre.
+        finished : ndarray of uint32, shape (n_chunk,)
+        """
+        n_centre, n_pixel = self.rows.shape
+        weighs = self.rows != 0
+        some = weighs.any(axis=1)
+        first = np.where(some, weighs.argmax(axis=1), self.centres)
+        last = np.where(some, n_pixel - 1 - weighs[:, ::-1].argmax(axis=1), self.centres)
+        ends = np.arange(chunk, n_padded + 1, chunk)
+        # Centres are finished in order.
+        done = np.searchsorted(np.maximum.accumulate(last), ends - 1, side="right")
+        begun = np.searchsorted(np.minimum.accumulate(first[::-1])[::-1], ends, side="left")
+        before = np.append(0, done[:-1])
+        slots = -(-int((begun - before).max()) // 4) * 4
+        weights = np.zeros((ends.size, slots, chunk), np.float32)
+        padded = np.zeros((n_centre, n_padded), np.float32)
+        padded[:, :n_pixel] = self.rows
+        for c, (low, high) in enumerate(zip(before, begun, strict=True)):
+            weights[c, : high - low] = padded[low:high, c * chunk : (c + 1) * chunk]
+        return weights, np.diff(done, prepend=0).astype(np.uint32)
+
+
+@lru_cache(maxsize=4)
+def _interpolation(n: int, step: int) -> tuple[NDArray[np.int64], Float]:
+    """Return evenly spaced pixels, including both ends, and the interpolation from them to all pixels.
+
+    Returns
+    -------
+    centres : ndarray of int, shape (n_centre,)
+    between : ndarray, shape (n, n_centre)
+        Lagrange polynomials through the nearest eight centres.
+    """
+    even = np.linspace(0, n - 1, -(-(n - 1) // step) + 1).round().astype(int)
+    # One more centre next to each end, where interpolation is least accurate.
+    centres = np.unique([*even, step // 2, n - 1 - step // 2]) if step > 1 else np.arange(n)
+    points = min(POINTS, centres.size)
+    between = np.zeros((n, centres.size))
+    first = np.clip(np.searchsorted(centres, np.arange(n), side="right") - points // 2, 0, centres.size - points)
+    near = first[:, None] + np.arange(points)
+    at, own = centres[near], np.eye(points, dtype=bool)
+    ratios = (np.arange(n)[:, None, None] - at[:, None, :]) / np.where(own, 1, at[:, :, None] - at[:, None, :])
+    np.put_along_axis(between, near, np.where(own, 1.0, ratios).prod(axis=2), axis=1)
+    between.setflags(write=False)
+    return centres, between
+
+
+@lru_cache(maxsize=2)
+def _rows(n: int, sigma: float) -> csr_array:
+    """Return the weights of pixels in the smoothed spectrum; cached, as the computation takes a tenth of a second."""
+    from scipy.ndimage import gaussian_filter1d
+    from scipy.sparse import csr_array
+
+    return csr_array(gaussian_filter1d(np.eye(n), sigma, axis=0, mode="nearest"))
+
+
+@lru_cache(maxsize=2)
+def _squares(n: int, sigma: float) -> csr_array:
+    """Return the squared weights of `_rows`."""
+    return _rows(n, sigma).power(2)
+
+
+class Paper(QuadraticStatistic):
+    """Sum of (F - Q)^2 / F of smoothed spectra, where F is an exposure with a flare and Q one without."""
+
+    name = "paper"
+    definition: ClassVar[str] = (
+        "the MauveSim paper's sum of (F - Q)^2 / F on smoothed spectra in DN/s, Q a noisy exposure, F flaring; a few "
+        "faint pixels make most of it (see `effective_terms`)"
+    )
+    label: ClassVar[str] = "the paper's sum on smoothed spectra"
+    shaped: ClassVar[bool] = True
+    paired: ClassVar[bool] = True
+    marginal: ClassVar[bool] = False
+
+    def smoothing(self, setting: Setting) -> Smoothing:
+        """Return the paper's smoothing of the used pixels."""
+        return setting.cached("smoothing", lambda: Smoothing.of(setting.quiet, setting.used, setting.flares))
+
+    def scale(self, setting: Setting, flare: Expectation | None) -> Float:
+        """Return the factors of the squares of smoothed DN, shape (n_centre,)."""
+        assert flare is not None
+        return self.smoothing(setting).scale(flare)
+
+    def dof(self, setting: Setting) -> int:
+        return int(setting.used.sum())
+
+    def form(self, setting: Setting, seen: Differences, flare: Expectation | None = None) -> QuadraticForm:
+        return self.smoothing(setting).form(self.scale(setting, flare), seen.mean, seen.variance)
+
+    def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
+        return np.asarray((x @ self.smoothing(setting).rows.T) ** 2 @ self.scale(setting, flare))
+
+    def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
+        sd = np.sqrt(self.variance(setting)) * setting.used
+        square, modes = self.smoothing(setting).modes(self.scale(setting, flare), sd**2)
+        return Tilt(modes * sd / np.sqrt(square)[:, None], square)
+
+    def square_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
+        return np.asarray(self.scale(setting, flare) @ self.smoothing(setting).rows ** 2)

@@ -1,0 +1,477 @@
+"""Exact histograms and moments of statistics, independent of order and tiling.
+
+Sparse histogram of values outside the fine bins, with bins of equal relative width over all of float32.
+
+A bin is a range of the float's ordered integer representation (sign, exponent, leading bits of the mantissa), so no
+value lies beyond the last bin. Sums are exact integers, independent of order and tiling.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.detection.distributions import Interval, central_counts
+from mauvecl.noise import layout
+from mauvecl.schema.errors import InputError
+
+#: Low bits of the integer representation that a bin ignores, which makes bins 2**-13 of the value wide, or less.
+DROPPED_BITS = 10
+#: Offset of the keys of bins above the fine ones, since a single bin may reach from below them to above.
+ABOVE = 1 << (32 - DROPPED_BITS)
+#: Sums are integer multiples of 2**-UNIT_BITS, the smallest float32, and of its square.
+UNIT_BITS = 149
+#: Number of squared mantissas whose sum is below 2**64.
+CHUNK = 2**15
+#: Range of keys up to which an array counts them; wider ranges are sorted.
+MAX_DENSE_KEYS = 2**16
+
+
+class SparseCounts:
+    """Counts by integer key, merged from time to time."""
+
+    def __init__(self) -> None:
+        self._keys = np.zeros(0, np.int64)
+        self._counts = np.zeros(0, np.int64)
+        self._waiting: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
+        self._waits = 0
+
+    @property
+    def keys(self) -> NDArray[np.int64]:
+        """Keys with counts, ascending."""
+        self._merge()
+        return self._keys
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """Count of each key."""
+        self._merge()
+        return self._counts
+
+    def add(self, keys: NDArray[np.int64], counts: NDArray[np.int64]) -> None:
+        """Add counts of ascending keys."""
+        if keys.size:
+            self._waiting.append((keys, counts))
+            self._waits += keys.size
+            if self._waits > max(MAX_DENSE_KEYS, self._keys.size):
+                self._merge()
+
+    def count(self, keys: NDArray[np.int64]) -> None:
+        """Add one for each key, in any order."""
+        self.add(*unique_counts(keys))
+
+    def _merge(self) -> None:
+        if not self._waiting:
+            return
+        keys, counts = (np.concatenate(parts) for parts in zip((self._keys, self._counts), *self._waiting, strict=True))
+        self._keys, place = np.unique(keys, return_inverse=True)
+        self._counts = np.zeros(self._keys.size, np.int64)
+        np.add.at(self._counts, place, counts)
+        self._waiting, self._waits = [], 0
+
+
+def unique_counts(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the distinct keys, ascending, and their counts."""
+    if not keys.size:
+        return keys, keys
+    low = int(keys.min())
+    if int(keys.max()) - low < MAX_DENSE_KEYS:
+        counts = np.bincount(keys - low)
+        where = np.flatnonzero(counts)
+        return where + low, counts[where]
+    return np.unique_counts(keys)
+
+
+def keys_of(values: NDArray[np.float32], *, above: bool) -> NDArray[np.int64]:
+    """Return the key of each finite value's bin; keys are ordered as values, with those above the fine bins last."""
+    # Adding zero turns negative zero into positive zero.
+    image = (values + np.float32(0.0)).view(np.int32)
+    keys = (_ordered(image) >> DROPPED_BITS).astype(np.int64)
+    return keys + ABOVE if above else keys
+
+
+def _ordered(image: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Map representations of floats to integers in the order of the floats; the map is its own inverse."""
+    return image ^ ((image >> 31) & np.int32(0x7FFFFFFF))
+
+
+def edges_of(keys: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the lower edges of bins: the smallest value in each."""
+    ordered = ((keys - np.where(is_above(keys), ABOVE, 0)) << DROPPED_BITS).astype(np.int32)
+    edges = _ordered(ordered).view(np.float32).astype(np.float64)
+    # The value after the largest float32.
+    return np.where(np.isinf(edges), 2.0**128, edges)
+
+
+def is_above(keys: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return whether bins lie above the fine ones."""
+    return np.asarray(keys >= ABOVE // 2)
+
+
+def sums_of(values: NDArray[np.float32]) -> tuple[int, int]:
+    """Return the exact sums of finite values and of their squares, in units of 2**-149 and 2**-298."""
+    image = values.view(np.int32)
+    exponent = (image >> 23) & 0xFF
+    # Signed mantissas; subnormal numbers have no implicit leading bit.
+    mantissa = image & 0x7FFFFF
+    mantissa |= 0x800000
+    mantissa[exponent == 0] ^= 0x800000
+    mantissa = (mantissa ^ (image >> 31)) - (image >> 31)
+    first = second = 0
+    low, high = int(exponent.min(initial=255)), int(exponent.max(initial=0))
+    for one in range(low, high + 1):
+        mine = mantissa if low == high else mantissa[exponent == one]
+        shift = max(one, 1) - 1
+        first += int(mine.sum(dtype=np.int64)) << shift
+        for begin in range(0, mine.size, CHUNK):
+            part = mine[begin : begin + CHUNK].astype(np.int64).view(np.uint64)
+            # Squares of negative numbers agree modulo 2**64.
+            second += int((part * part).sum()) << 2 * shift
+    return first, second
+
+
+@dataclass(frozen=True, eq=False)
+class FarCounts:
+    """Values of a distribution outside its fine bins."""
+
+    keys: NDArray[np.int64]  # filled bins, ascending, shape (m,)
+    counts: NDArray[np.int64]  # shape (m,)
+    first: int = 0  # sum of values, in units of 2**-149
+    second: int = 0  # sum of squares, in units of 2**-298
+    undefined: int = 0  # number of infinite values and NaN
+
+    @cached_property
+    def n(self) -> int:
+        """Number of finite values."""
+        return int(self.counts.sum())
+
+    def edges(self, low: float, high: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the lower and upper edges of the bins, limited by the range `low` to `high` of the fine bins."""
+        above = is_above(self.keys)
+        lower = np.where(above, np.maximum(edges_of(self.keys), high), edges_of(self.keys))
+        upper = np.where(above, edges_of(self.keys + 1), np.minimum(edges_of(self.keys + 1), low))
+        # The grid rounds in float32, so a value at its end may lie inside the float64 edges.
+        return np.where(above, lower, np.minimum(lower, upper)), np.where(above, np.maximum(lower, upper), upper)
+
+    def equals(self, other: FarCounts) -> bool:
+        """Return whether all counts and sums are equal."""
+        mine, theirs = ((x.first, x.second, x.undefined, x.keys.tolist(), x.counts.tolist()) for x in (self, other))
+        return mine == theirs
+
+
+class FarTally:
+    """Accumulator of `FarCounts`."""
+
+    def __init__(self) -> None:
+        self.bins = SparseCounts()
+        self.first = self.second = self.undefined = 0
+
+    def add(self, values: NDArray[np.float32], *, above: bool) -> None:
+        """Count values outside the fine bins, all above or all below them."""
+        finite = np.isfinite(values)
+        if not finite.all():
+            self.undefined += int(values.size - finite.sum())
+            values = values[finite]
+        if values.size:
+            self.bins.count(keys_of(values, above=above))
+            first, second = sums_of(values)
+            self.first += first
+            self.second += second
+
+    def merge(self, other: FarCounts) -> None:
+        """Add counts of other realisations."""
+        self.bins.add(other.keys, other.counts)
+        self.first += other.first
+        self.second += other.second
+        self.undefined += other.undefined
+
+    def frozen(self) -> FarCounts:
+        """Return the counts so far."""
+        return FarCounts(self.bins.keys, self.bins.counts, self.first, self.second, self.undefined)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Bins of a histogram."""
+
+    channel: int  # channel whose values are counted
+    centre: float
+    sigma: float  # standard deviation to which the bins are scaled
+
+    @staticmethod
+    def pack(grids: Sequence[Grid]) -> NDArray[np.void]:
+        """Return the grids in the layout of the device, shape (n_grid,)."""
+        packed = np.zeros(len(grids), layout.GRID)
+        packed["channel"] = [grid.channel for grid in grids]
+        with np.errstate(over="ignore", divide="ignore"):
+            packed["centre"] = [grid.centre for grid in grids]
+            packed["steps_per_unit"] = layout.STEPS_PER_SIGMA / np.array([grid.sigma for grid in grids], float)
+        # If float32 cannot represent the steps, all values count as far.
+        scale = packed["steps_per_unit"]
+        bad = ~(np.isfinite(packed["centre"]) & np.isfinite(scale) & (scale >= np.finfo(np.float32).tiny))
+        packed["centre"][bad], scale[bad] = 0.0, np.nan
+        return packed
+
+
+#: First and last fine bin, and their range of steps.
+FIRST_BIN, LAST_BIN = 1, layout.BINS - 2
+LOW_STEP, HIGH_STEP = ((n - layout.BINS // 2) * 2**layout.FINE_BITS for n in (FIRST_BIN, LAST_BIN + 1))
+
+
+class Tally:
+    """Accumulator of the histograms and sums of many channels."""
+
+    def __init__(self, grids: Sequence[Grid]) -> None:
+        self.grids = tuple(grids)
+        self.packed = Grid.pack(self.grids)
+        # Fine bins, by grid times BINS plus bin: few are filled. The first and the last of each grid stay empty.
+        self.fine = SparseCounts()
+        # Sums of steps in fine bins and of their squares; Python integers, since squares may exceed 64 bits.
+        self.sums = np.zeros((len(grids), 2), object)
+        self.far = [FarTally() for _ in grids]
+        self.n = 0
+
+    def add(self, histogram: NDArray[np.integer], sums: NDArray[np.generic], n: int) -> None:
+        """Add the counts of one or more tiles in fine bins.
+
+        `histogram` has the shape (n_grid, BINS). `sums`, shape (n_grid, 2), holds sums of fine steps and of their
+        squares. `n` is the number of realisations, including those counted by `add_far`.
+        """
+        grid, inner = np.nonzero(histogram[:, FIRST_BIN : LAST_BIN + 1])
+        counts = histogram[grid, FIRST_BIN + inner].astype(np.int64)
+        self.merge(grid * layout.BINS + FIRST_BIN + inner, counts, sums, n)
+
+    def merge(self, keys: NDArray[np.int64], counts: NDArray[np.int64], sums: NDArray[np.generic], n: int) -> None:
+        """Add counts of fine bins by their keys, as in `fine`; other parameters as for `add`."""
+        self.fine.add(keys, counts)
+        self.sums += sums.astype(object)
+        self.n += n
+
+    def add_far(self, index: int, values: NDArray[np.float32]) -> int:
+        """Count the values of a grid's channel that lie outside its fine bins, and return their number."""
+        grid = self.packed[index]
+        with np.errstate(over="ignore", invalid="ignore"):
+            steps = np.rint((values - grid["centre"]) * grid["steps_per_unit"])
+        above = steps >= HIGH_STEP
+        # The complement counts NaN as below.
+        below = ~(steps >= LOW_STEP)
+        for there, side in ((above, True), (below, False)):
+            if there.any():
+                self.far[index].add(values if there.all() else values[there], above=side)
+        return int(above.sum() + below.sum())
+
+    def distribution(self, index: int) -> Distribution:
+        """Return the distribution of a grid."""
+        packed = self.packed[index]
+        first, second = (int(value) for value in self.sums[index])
+        mine = slice(*np.searchsorted(self.fine.keys, (index * layout.BINS, (index + 1) * layout.BINS)))
+        return Distribution(
+            centre=float(packed["centre"]),
+            step=1.0 / float(packed["steps_per_unit"]),
+            filled=self.fine.keys[mine] - index * layout.BINS,
+            filled_counts=self.fine.counts[mine].copy(),
+            first=first,
+            second=second,
+            n=self.n,
+            far=self.far[index].frozen(),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Distribution:
+    """A histogram of unlimited range with exact integer moments.
+
+    Bins are 1/512 of a standard deviation wide within 32 standard deviations of the centre, and 2**-13 of the value
+    beyond.
+    """
+
+    centre: float  # value of the statistic at step 0
+    step: float  # size of a fine step
+    filled: NDArray[np.int64]  # fine bins with counts, ascending, shape (m,)
+    filled_counts: NDArray[np.int64]  # shape (m,)
+    first: int  # sum of the fine steps
+    second: int  # sum of their squares
+    n: int  # number of realisations
+    far: FarCounts  # values outside the fine bins
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """Counts of all fine bins, shape (BINS,)."""
+        counts = np.zeros(layout.BINS, np.int64)
+        counts[self.filled] = self.filled_counts
+        return counts
+
+    @cached_property
+    def _moments(self) -> tuple[Fraction, Fraction]:
+        """Exact mean and variance of all values."""
+        total, squares = Fraction(self.far.first, 2**UNIT_BITS), Fraction(self.far.second, 2 ** (2 * UNIT_BITS))
+        inside = self.n - self.far.n
+        if inside:
+            centre, step = Fraction(self.centre), Fraction(self.step)
+            total += inside * centre + step * self.first
+            squares += inside * centre**2 + 2 * centre * step * self.first + step**2 * self.second
+        mean = total / self.n
+        return mean, squares / self.n - mean**2
+
+    def refuse_undefined(self, what: str = "the statistic") -> None:
+        """Raise InputError if values are not finite."""
+        if self.far.undefined:
+            raise InputError(
+                f"{what} is infinite or no number in {self.far.undefined} of {self.n} realisations",
+                "finite values of float32",
+                key="statistic",
+                value=self.far.undefined,
+            )
+
+    @property
+    def mean(self) -> float:
+        """Mean of the statistic."""
+        self.refuse_undefined()
+        if self.far.n:
+            return float(self._moments[0])
+        return self.centre + self.step * (self.first / self.n)
+
+    @property
+    def std(self) -> float:
+        """Standard deviation of the statistic."""
+        self.refuse_undefined()
+        if self.far.n:
+            return math.sqrt(self._moments[1])
+        # Integer arithmetic keeps the precision of a narrow distribution far from the centre.
+        variance = (self.second * self.n - self.first**2) / self.n**2
+        return self.step * float(np.sqrt(variance))
+
+    def edge(self, index: int | NDArray[np.intp]) -> float | NDArray[np.float64]:
+        """Return the lower edge of a fine bin."""
+        steps = (np.asarray(index) - layout.BINS // 2) * 2.0**layout.FINE_BITS - 0.5
+        edges: NDArray[np.float64] = self.centre + self.step * steps
+        return edges if np.ndim(index) else float(edges)
+
+    # Computed when needed: a detection of hundreds of flares has thousands of distributions.
+    @property
+    def bins(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+        """Lower edges, upper edges and counts of all filled bins, ascending; each shape (m,)."""
+        self.refuse_undefined()
+        filled, counts = self.filled, self.filled_counts
+        lower, upper = np.asarray(self.edge(filled)), np.asarray(self.edge(filled + 1))
+        if not self.far.n:
+            return lower, upper, counts
+        ends = (
+            (float(self.edge(FIRST_BIN)), float(self.edge(LAST_BIN + 1)))
+            if math.isfinite(self.step)
+            else (math.inf,) * 2
+        )
+        far_lower, far_upper = self.far.edges(*ends)
+        place = int(np.count_nonzero(~is_above(self.far.keys)))
+        return (
+            np.insert(far_lower, place, lower),
+            np.insert(far_upper, place, upper),
+            np.insert(self.far.counts, place, counts),
+        )
+
+    def above(self, value: float) -> float:
+        """Return the number of realisations at or above a value: exact at edges of bins, interpolated between."""
+        lower, upper, counts = self.bins
+        below = _below(counts)
+        # The first bin with an upper edge above the value.
+        index = int(np.searchsorted(upper, value, side="right"))
+        if index == counts.size:
+            return 0.0
+        if value <= lower[index]:
+            return float(below[-1] - below[index])
+        share = (upper[index] - value) / (upper[index] - lower[index])
+        return float(below[-1] - below[index + 1] + share * counts[index])
+
+    def edge_with_at_most(self, n_above: int) -> float:
+        """Return the lowest edge of a bin with at most `n_above` realisations at or above it, or minus infinity."""
+        _, upper, counts = self.bins
+        below = _below(counts)
+        more = np.flatnonzero(below[-1] - below[:-1] > n_above)
+        return float(upper[more[-1]]) if more.size else -math.inf
+
+    def around(self, edge: float) -> tuple[int, int]:
+        """Return the counts at or above the lower edge of a bin, and in the filled bin below that edge."""
+        _, upper, counts = self.bins
+        at = int(np.searchsorted(upper, edge, side="right"))
+        return int(counts[at:].sum()), int(counts[at - 1]) if at else 0
+
+    def quantile(self, probability: float | NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return quantiles, interpolated linearly within bins."""
+        lower, upper, counts = self.bins
+        below = _below(counts)
+        edges = np.column_stack([lower, upper]).ravel()
+        cumulative = np.column_stack([below[:-1], below[1:]]).ravel() / self.n
+        return np.asarray(np.interp(probability, cumulative, edges))
+
+    def quantile_interval(self, probability: float) -> Interval:
+        """Return a quantile with the 95 % interval of order statistics, rounded outwards to edges of bins."""
+        if not 0.0 < probability < 1.0:
+            raise InputError.of("probability", probability, "a probability between 0 and 1")
+        # The number of values below the quantile is binomial, so it lies between these ranks with 95 %.
+        low, high = central_counts(self.n, probability)
+        lower, upper, counts = self.bins
+        first, last = (int(np.searchsorted(counts.cumsum(), rank)) for rank in (low, high + 1))
+        ends = float(lower[first]) if low else -np.inf, float(upper[last]) if high < self.n else np.inf
+        return Interval(float(self.quantile(probability)), *ends)
+
+    def histogram(self, bins: int = 200) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return edges, shape (m + 1,), and counts, shape (m,), in at most `bins` equal bins, for plots."""
+        lower, upper, _ = self.bins
+        if self.far.n:
+            # No bin is narrower than the widest bin of the counts.
+            span = upper[-1] - lower[0]
+            edges = np.linspace(lower[0], upper[-1], max(min(bins, int(span / (upper - lower).max())), 1) + 1)
+        else:
+            low, high = int(self.filled[0]), int(self.filled[-1]) + 1
+            group = -(-(high - low) // bins)
+            edges = np.asarray(self.edge(np.arange(low, high + group, group)))
+        above = [self.above(edge) for edge in edges]
+        return edges, -np.diff(np.rint(above)).astype(np.int64)
+
+
+def _below(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the number of realisations below each filled bin, and in total; shape (m + 1,)."""
+    return np.concatenate([[0], np.cumsum(counts)])
+
+
+#: Number of extreme values of each tail that are kept with their realisations.
+TAIL_SAMPLES = 1000
+
+
+class TailSamples:
+    """The largest (or smallest) values of a channel and their realisations."""
+
+    def __init__(self, *, largest: bool) -> None:
+        self._sign = np.float32(1.0 if largest else -1.0)
+        self.values = np.empty(0, np.float32)
+        self.realisations = np.empty(0, np.int64)
+
+    def add(self, values: NDArray[np.float32], first: int) -> None:
+        """Add the values of realisations from `first` on; among equal values the earlier realisation is kept."""
+        signed = self._sign * values
+        if self.values.size == TAIL_SAMPLES:
+            beyond = np.flatnonzero(signed > self._sign * self.values[-1])
+        elif values.size > TAIL_SAMPLES:
+            # Partitioning before sorting is faster.
+            beyond = np.flatnonzero(signed >= np.partition(signed, -TAIL_SAMPLES)[-TAIL_SAMPLES])
+        else:
+            beyond = np.arange(values.size)
+        if not beyond.size:
+            return
+        merged = np.concatenate([self.values, values[beyond]])
+        realisations = np.concatenate([self.realisations, first + beyond])
+        self._keep(merged, realisations)
+
+    def merge(self, values: NDArray[np.float32], realisations: NDArray[np.int64]) -> None:
+        """Add the extreme values of other realisations, in any order."""
+        self._keep(np.concatenate([self.values, values]), np.concatenate([self.realisations, realisations]))
+
+    def _keep(self, values: NDArray[np.float32], realisations: NDArray[np.int64]) -> None:
+        order = np.lexsort((realisations, -self._sign * values))[:TAIL_SAMPLES]
+        self.values, self.realisations = values[order], realisations[order]

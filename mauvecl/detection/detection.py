@@ -1,0 +1,663 @@
+"""Detections: thresholds with a known false-alarm probability, detection probabilities and ROC curves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from mauvecl.detection.chi2 import Smoothing
+from mauvecl.detection.counts import Distribution, TailSamples, Tally
+from mauvecl.detection.distributions import (
+    CONFIDENCE,
+    Form,
+    Interval,
+    central_counts,
+    clopper_pearson,
+    clopper_pearson_ends,
+    detection_interval,
+)
+from mauvecl.detection.fap_checks import NoThresholdError, Tails, check_atom, check_fap, countable
+from mauvecl.detection.requests import ChannelPlan, Hypotheses, Key
+from mauvecl.detection.statistics import Differences, LinearStatistic, QuadraticStatistic
+from mauvecl.detection.tails import Tail, tail
+from mauvecl.host.content_equality import ContentEquality
+from mauvecl.noise.drawing import Cumulants
+from mauvecl.noise.unknowns import ADDITIVE
+from mauvecl.schema.calls import validated
+from mauvecl.schema.drawable import Drawable
+from mauvecl.schema.fields import Range
+from mauvecl.schema.messages import Message
+from mauvecl.schema.tables import INTERVAL, Column, interval, number, percent, table_of
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.host.exposure.expectation import Expectation
+
+Float = NDArray[np.float64]
+
+#: Differences above this many standard errors are significant.
+SIGNIFICANT = 4.0
+
+
+@dataclass(frozen=True)
+class Departure:
+    """False-alarm probability of a statistic at the threshold for Gaussian noise."""
+
+    statistic: str
+    template: int  # flare that a shaped statistic uses as template
+    threshold: float  # for Gaussian noise
+    fap: float  # wanted false-alarm probability
+    simulated: Interval  # simulated false-alarm probability at the threshold
+    # Predicted changes of the false-alarm probability at the threshold, relative to `fap`.
+    skew: float  # due to third and fourth cumulants of the noise
+    rounding: float  # due to the steps of the ADC
+    clipping: float  # due to the ends of its range
+    others: tuple[str, ...]  # effects that the closed form does not include and that have no prediction
+    realisations: int
+
+    @property
+    def ratio(self) -> float:
+        """Simulated divided by wanted false-alarm probability."""
+        return self.simulated.value / self.fap
+
+    @property
+    def error(self) -> float:
+        """Standard error of the ratio if the closed form is exact."""
+        return float(np.sqrt((1.0 - self.fap) / (self.fap * self.realisations)))
+
+    @property
+    def differs(self) -> bool:
+        """True if the ratio deviates significantly from 1."""
+        return abs(self.ratio - 1.0) > SIGNIFICANT * self.error
+
+    @property
+    def why(self) -> str:
+        """Largest cause of a significant deviation, else an empty string."""
+        if not self.differs:
+            return ""
+        causes = {"skew of the noise": self.skew, "rounding": self.rounding, "clipping": self.clipping}
+        rest = self.ratio - 1.0 - sum(causes.values())
+        if self.others:
+            causes[" and ".join(self.others)] = rest
+        name, size = max(causes.items(), key=lambda item: abs(item[1]))
+        return name if abs(size) > 0.2 * abs(self.ratio - 1.0) else "unexplained"
+
+
+@validated
+def departures(detection: Detection, fap: float) -> list[Departure]:
+    """Return the departures of all statistics from the closed forms.
+
+    Shaped statistics have one departure per flare.
+
+    Parameters
+    ----------
+    detection : Detection
+    fap : float
+        Wanted false-alarm probability per test.
+    """
+    scene = detection.scene
+    others = []
+    if scene.comparison.estimated:
+        others.append("variances estimated from the counts")
+    others += [ADDITIVE[name].label for name in scene.additive]
+    if scene.modulations and not detection.setting.integrates:
+        others.append("priors that the reference does not know")
+    elif detection.nuisances is not None and not scene.modulations:
+        others.append("unknowns that are marginalised over and not drawn")
+    digital = _adc_moments(detection.quiet) if scene.clip else None
+    rows = []
+    for statistic in detection.statistics:
+        for template in range(len(detection.flares)) if detection.statistic(statistic).shaped else (0,):
+            null = detection.closed_form(statistic, template=template)
+            cut = null.isf(fap)
+            rounding = clipping = 0.0
+            if digital is not None:
+                rounding = _shifted_fap(detection, statistic, template, *digital[0], cut) / fap - 1.0
+                clipping = _shifted_fap(detection, statistic, template, *digital[1], cut) / fap - 1.0 - rounding
+            rows.append(
+                Departure(
+                    statistic,
+                    template,
+                    cut,
+                    fap,
+                    detection.false_alarm_probability(cut, statistic, template=template),
+                    _skewed_fap(detection, statistic, template, null, cut) / fap - 1.0,
+                    rounding,
+                    clipping,
+                    tuple(others),
+                    detection.realisations,
+                )
+            )
+    return rows
+
+
+def departure_table(detection: Detection, amplitudes: Sequence[float], fap: float) -> QTable:
+    """Return the departures of a detection as a table, without rows if too few realisations lie beyond thresholds.
+
+    `amplitudes` are those of the detection's flares.
+    """
+    rows = departures(detection, fap) if countable(fap, detection.realisations) else []
+
+    def amplitude(row: Departure) -> float:
+        return amplitudes[row.template] if detection.statistic(row.statistic).shaped else float("nan")
+
+    columns = [replace(one, get=amplitude) if one.name == "amplitude" else one for one in DEPARTURE_COLUMNS]
+    return table_of(columns, rows, fap=fap)
+
+
+#: Columns of the table of departures.
+DEPARTURE_COLUMNS = (
+    Column("statistic", description="detection statistic", heading="statistic", kind=str),
+    Column("amplitude", description="flare amplitude: relative rise of the photons in the flare's band",
+           heading="flare", format=percent("g")),
+    Column("gaussian_threshold", "threshold", description="threshold for Gaussian noise"),
+    Column("fap", "simulated.value", description="simulated false-alarm probability there", heading="simulated",
+           format=".3g"),
+    Column("fap_low", "simulated.low", description="its 95 % interval, lower end", heading=INTERVAL,
+           format=interval(".3g"), others=("fap_high",)),
+    Column("fap_high", "simulated.high", description="its 95 % interval, upper end"),
+    Column("ratio", description="simulated over wanted false-alarm probability", heading="ratio", format=".3f"),
+    Column("ratio_error", "error", description="standard error of the ratio"),
+    Column("skew", description="predicted change of the ratio by the noise's skew and kurtosis"),
+    Column("rounding", description="predicted change of the ratio by the ADC's steps"),
+    Column("clipping", description="predicted change of the ratio by the ADC's ends"),
+    Column("differs", description="whether chance does not explain the ratio: 4 standard errors", kind=bool),
+    Column("why", description="main cause of a difference from the closed form", heading="why", kind=str),
+)  # fmt: skip
+
+
+def _skewed_fap(detection: Detection, statistic: str, template: int, null: Form, cut: float) -> float:
+    """Return the false-alarm probability at a threshold with the noise's third and fourth cumulants."""
+    scene, quiet = detection.scene, detection.quiet
+    each = 1 if scene.frames else quiet.n_frames
+    c, draws = Cumulants.of(quiet, each), quiet.n_frames // each
+    one, flare = detection.statistic(statistic), detection.shape(statistic, template)
+    # Cumulants of the difference between an exposure and the mean of reference exposures.
+    added = one.added_variance(detection.setting)
+    third, fourth, sixth = (
+        draws * (c.photon_cumulant(r) + c.dark_cumulant(r)) * (1.0 + (-1.0) ** r * added ** (r - 1)) for r in (3, 4, 6)
+    )
+    variance = one.variance(detection.setting)
+    if isinstance(one, LinearStatistic):
+        weights = one.weights_per_dn(detection.setting, flare)
+        sd = float(np.sqrt(weights**2 @ variance))
+        z, skew, excess = cut / null.std, weights**3 @ third / sd**3, weights**4 @ fourth / sd**4
+        # Edgeworth series (Abramowitz & Stegun 26.2.48).
+        series = skew * (z**2 - 1) / 6 + excess * (z**3 - 3 * z) / 24 + skew**2 * (z**5 - 10 * z**3 + 15 * z) / 72
+        return float(null.sf(cut) + np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) * series)
+    assert isinstance(one, QuadraticStatistic)
+    # The square of a skewed variable has more variance and skew than that of a normal one.
+    weights = one.square_weights(detection.setting, flare)
+    second = null.std**2
+    skewed = null.third
+    more = weights**2 @ fourth, weights**3 @ (12.0 * fourth * variance + 10.0 * third**2 + sixth)
+    plain, there = (
+        _gamma_sf(cut, null.mean, second + part * float(more[0]), skewed + part * float(more[1])) for part in (0.0, 1.0)
+    )
+    return null.sf(cut) * there / plain
+
+
+def _gamma_sf(value: float, mean: float, variance: float, third: float) -> float:
+    """Return the probability of exceeding a value for a shifted gamma distribution with given cumulants."""
+    shape = 4.0 * variance**3 / third**2
+    return float(special.gammaincc(shape, max(shape + (value - mean) / np.sqrt(variance) * np.sqrt(shape), 0.0)))
+
+
+def _shifted_fap(
+    detection: Detection, statistic: str, template: int, shift: Float, variance: Float, cut: float
+) -> float:
+    """Return the false-alarm probability at a threshold for a changed mean and variance of each pixel."""
+    one, used = detection.statistic(statistic), detection.scene.used
+    added = one.added_variance(detection.setting)
+    moved = Differences(np.where(used, (1.0 - (added > 0)) * shift, 0.0), (1.0 + added) * variance)
+    return one.integrate_drawn(detection.setting, detection.quiet, moved, detection.shape(statistic, template)).sf(cut)
+
+
+def _adc_moments(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
+    """Compute the mean shift and the variance of an exposure behind the ADC, without and with its lower limit, in DN.
+
+    Saturation at the upper limit is part of the closed forms.
+
+    Returns
+    -------
+    rounded, clipped : (shift, variance), each shape (n_pixel,)
+    """
+    mean, sd = x.mean_raw_dn, np.sqrt(np.maximum(x.unsaturated_variance_dn2 / x.n_frames - 1 / 12, 0.0))
+    recorded = x.recorded_dn / x.n_frames
+    moments = []
+    for low, high in ((-np.inf, float(x.highest_dn)), (0.0, float(x.highest_dn))):
+        shift, variance = np.zeros_like(mean), np.zeros_like(mean)
+        for p, (m, s) in enumerate(zip(mean, sd, strict=True)):
+            # Integers around the mean; the outermost ones include the tails.
+            dn = np.arange(np.floor(m - 9 * s) - 1, np.ceil(m + 9 * s) + 2)
+            below = special.ndtr((dn[:-1] + 0.5 - m) / s) if s > 0 else (dn[:-1] + 0.5 >= m).astype(float)
+            chance = np.diff(below, prepend=0.0, append=1.0)
+            seen = np.clip(dn, low, high)
+            centre = float(chance @ seen)
+            shift[p], variance[p] = centre - recorded[p], chance @ (seen - centre) ** 2
+        moments.append((x.n_frames * shift, x.n_frames * variance))
+    return moments[0], moments[1]
+
+
+#: Chi-squared and reduced chi-squared by amplitude, for the G2V star, V = 7.4, 50 s (the paper, section "G2V star").
+PAPER_G2V = {0.24: (6159.88, 3.75), 0.081: (1078.36, 0.66)}
+
+WHY = (
+    "The paper's values are no calibrated chi-squared: with 1643 points a reduced value scatters by 0.035 about one, "
+    "so 0.66 lies ten standard deviations below. Divided by the smoothed flare spectrum in DN/s instead of the noise's "
+    "variance they are reproduced; what such a number means, only its simulated null can tell (`statistic='paper'`)."
+)
+
+
+def reconstruct(quiet: Expectation, flare: Expectation) -> Interval:
+    """Return the median and central 95 % of the reduced statistic `paper` with a flare, for Gaussian noise.
+
+    The paper does not define its chi-squared. Among the definitions that were tried, this one is nearest to its two G2V
+    values: both noisy spectra are smoothed with a Gaussian of 10.5 nm FWHM, as stated in its figure, and compared as in
+    `scipy.stats.chisquare`, with the flare's mean as expected values.
+    """
+    smoothing = Smoothing.of(quiet, np.ones(quiet.wavelength_nm.size, bool), (flare,))
+    delta, variance = flare.recorded_light_dn - quiet.recorded_light_dn, flare.variance_dn2 + quiet.variance_dn2
+    form = smoothing.form(smoothing.scale(flare), delta, variance)
+    middle, low, high = (form.isf(p) / quiet.wavelength_nm.size for p in (0.5, 0.975, 0.025))
+    return Interval(middle, low, high)
+
+
+#: Rows of a curve's table.
+ROC_ROWS = 200
+#: Columns of a curve's table.
+ROC_COLUMNS = (
+    Column("threshold", description="value at and above which a detection is claimed"),
+    Column("fap", description="false-alarm probability per test, with a 95 % Clopper-Pearson interval"),
+    Column("fap_low", description="95 % interval of the false-alarm probability, lower end"),
+    Column("fap_high", description="95 % interval of the false-alarm probability, upper end"),
+    Column("probability", description="detection probability, with a 95 % Clopper-Pearson interval"),
+    Column("probability_low", description="95 % interval of the detection probability, lower end"),
+    Column("probability_high", description="95 % interval of the detection probability, upper end"),
+)
+#: Columns of the area, in tables of several curves.
+AREA_COLUMNS = (
+    Column("area", "area.value", description="under the curve; 95 % interval by DeLong's method"),
+    Column("area_low", "area.low", description="95 % interval of the area, lower end"),
+    Column("area_high", "area.high", description="95 % interval of the area, upper end"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Roc(Drawable):
+    """ROC curve from the lowest threshold to the highest, at edges of filled bins."""
+
+    threshold: Float  # shape (n,)
+    fap: Float  # false-alarm probability, shape (n,)
+    probability: Float  # detection probability, shape (n,)
+    realisations: int  # of the null, and of the flare
+    area: Interval  # probability that a flare's value exceeds a null's, counting ties half
+
+    @classmethod
+    def of(cls, null: Distribution, flare: Distribution) -> Roc:
+        """Compute the curve of two histograms on the same grid.
+
+        The area's variance follows DeLong et al. (1988, doi 10.2307/2531595) for independent null and flare. Here they
+        share their draws, so the interval is conservative. Without any overlap, its lower end is that of Clopper and
+        Pearson for as many pairs as there are realisations.
+        """
+        # Union of the filled bins.
+        bins = null.bins, flare.bins
+        lower, first = np.unique(np.concatenate([bins[0][0], bins[1][0]]), return_index=True)
+        upper = np.concatenate([bins[0][1], bins[1][1]])[first]
+        share, above = np.zeros((2, lower.size)), np.zeros((2, lower.size + 1))
+        for i, (d, (own, _, filled)) in enumerate(zip((null, flare), bins, strict=True)):
+            counts = np.zeros(lower.size, np.int64)
+            counts[np.searchsorted(lower, own)] = filled
+            share[i] = counts / d.n
+            # Integer counts above each edge make the ends of the curve exactly 1 and 0.
+            above[i, :-1] = counts[::-1].cumsum()[::-1] / d.n
+        beaten, beating = 1.0 - above[0, :-1] + 0.5 * share[0], above[1, :-1] - 0.5 * share[1]
+        area = float(np.clip(share[1] @ beaten, 0.0, 1.0))
+        spread = [float(c @ (values - area) ** 2) for c, values in ((share[1], beaten), (share[0], beating))]
+        reach = float(special.ndtri(0.5 + CONFIDENCE / 2)) * float(np.sqrt(spread[0] / flare.n + spread[1] / null.n))
+        low, high = max(area - reach, 0.0), min(area + reach, 1.0)
+        if bins[0][0][-1] < bins[1][0][0] or bins[1][0][-1] < bins[0][0][0]:
+            area = float(round(area))
+            n = min(null.n, flare.n)
+            sure = clopper_pearson(round(area) * n, n)
+            low, high = sure.low, sure.high
+        return cls(np.append(lower[0], upper), above[0], above[1], null.n, Interval(area, low, high))
+
+    def plot(self, path: str | Path | None = None, *, name: str = "", ax: Any = None) -> Any:
+        """Plot detection probability against false-alarm probability; needs matplotlib."""
+        return self._draw(path, ax, name=name)
+
+    def table(self, rows: int = ROC_ROWS) -> QTable:
+        """Return at most `rows` rows of the curve, evenly spaced in the logarithm of the false-alarm probability.
+
+        Both ends are included. Probabilities have Clopper-Pearson intervals; the metadata contain the area.
+        """
+        area = {column.name: column.value(self) for column in AREA_COLUMNS}
+        return table_of(ROC_COLUMNS, [self.points(rows)], realisations=self.realisations, **area)
+
+    def points(self, rows: int = ROC_ROWS) -> dict[str, Float]:
+        """Return at most `rows` points of the curve with their intervals, by the names of `COLUMNS`."""
+        n = self.realisations
+        wanted = np.append(np.geomspace(1.0, 1.0 / n, max(rows - 1, 1)), 0.0)
+        chosen = np.unique(np.minimum(np.searchsorted(-self.fap, -wanted), self.fap.size - 1))
+        points = {"threshold": self.threshold[chosen]}
+        for name, chance in (("fap", self.fap), ("probability", self.probability)):
+            ends = clopper_pearson_ends(np.rint(chance[chosen] * n).astype(np.int64), n)
+            points |= dict(zip((name, f"{name}_low", f"{name}_high"), ends, strict=True))
+        return points
+
+
+@validated
+@dataclass(eq=False)
+class Detection(Drawable, ContentEquality, Hypotheses):
+    """Simulated null and flare distributions, as returned by `Engine.detect`.
+
+    Attributes are those of `Hypotheses` and the following.
+
+    Attributes
+    ----------
+    realisations : int
+    tails : {"counted", "sampled"}
+        Whether a threshold with too few realisations beyond it raises InputError, or is found by importance sampling.
+    seed : int
+        Seed of the draws.
+    """
+
+    realisations: int
+    tails: Tails = "counted"
+    seed: int = 0
+    _tails: dict[tuple[str, int, float], Tail] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _distributions: dict[Key, Distribution] = field(default_factory=dict, init=False, repr=False)
+    _samples: dict[Key, TailSamples] = field(default_factory=dict, init=False, repr=False)
+
+    @classmethod
+    def of(cls, hypotheses: Hypotheses, realisations: int, tails: Tails, seed: int) -> Self:
+        """Make a detection that shares the prepared state and closed forms of `hypotheses`."""
+        made = object.__new__(cls)
+        counts: dict[str, Any] = {"_tails": {}, "_distributions": {}, "_samples": {}}
+        vars(made).update(vars(hypotheses) | counts, realisations=realisations, tails=tails, seed=seed)
+        return made
+
+    def _line(self) -> str:
+        flares, names = len(self.flares), ", ".join(self.statistics)
+        return (
+            f"of {self.quiet.name!r}, {flares} flare{'s'[: flares != 1]} by {names}, {self.realisations} realisations"
+        )
+
+    def collect(self, plan: ChannelPlan, tally: Tally, samples: Sequence[TailSamples | None]) -> None:
+        """Add the distributions and tails of one batch."""
+        for index, (key, kept) in enumerate(zip(plan.keys, samples, strict=True)):
+            self._distributions[key] = tally.distribution(index)
+            if kept is not None:
+                self._samples[key] = kept
+
+    def distribution(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Distribution:
+        """Return the simulated distribution of a statistic.
+
+        Parameters
+        ----------
+        statistic : str
+        flare : int, optional
+            Index of the flare; None for the null distribution.
+        template : int
+            Index of the flare that shaped statistics use as template, for the null distribution.
+        """
+        self._check(statistic, flare, template)
+        if flare is None:
+            return self._at(self._null_key(statistic, template))
+        return self._at((statistic, "flare", flare))
+
+    def _at(self, key: Key) -> Distribution:
+        """Return a counted distribution; raises InputError if values are not finite."""
+        statistic, role, flare = key
+        counted = self._distributions[key]
+        of = "without a flare" if role == "null" else f"with flare {flare + 1}"
+        counted.refuse_undefined(f"statistic {statistic!r} {of}")
+        return counted
+
+    def histogram(
+        self, statistic: str, flare: int | None = None, *, template: int = 0, bins: Annotated[int, Range(1)] = 200
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return edges and counts for plots; parameters as for `distribution`."""
+        return self.distribution(statistic, flare, template=template).histogram(bins)
+
+    def threshold(self, fap: float = 1e-3, statistic: str = "chi2", *, template: int = 0) -> Interval:
+        """Return the threshold at a false-alarm probability.
+
+        Parameters
+        ----------
+        fap : float
+            False-alarm probability per test.
+        statistic : str
+        template : int
+            Index of the flare that shaped statistics use as template.
+
+        Returns
+        -------
+        Interval
+            The simulated upper quantile, rounded up to a bin's edge (1/512 of a standard deviation, or 2**-13 of the
+            value beyond 32 of them), with an order-statistic interval; or the result of importance sampling, if tails
+            are sampled and too few realisations lie beyond.
+
+        Raises
+        ------
+        InputError
+            If fewer than 100 realisations lie beyond and tails are counted: the tail is never extrapolated.
+        NoThresholdError
+            If no threshold has this probability, because one value of the statistic is more probable.
+        """
+        return self._cut(fap, statistic, template)
+
+    def tail(self, fap: float, statistic: str = "chi2", *, template: int = 0) -> Tail | None:
+        """Return the importance sampling behind a threshold, or None if realisations were counted."""
+        self._check(statistic, None, template)
+        check_fap(fap, self.realisations, self.tails)
+        if countable(fap, self.realisations):
+            return None
+        key = (statistic, self._null(statistic, template), fap)
+        if key not in self._tails:
+            self._tails[key] = tail(self, fap, statistic, template=template, seed=self.seed)
+        return self._tails[key]
+
+    def false_alarm_probability(self, threshold: float, statistic: str = "chi2", *, template: int = 0) -> Interval:
+        """Return the fraction of null realisations at or above a threshold; the inverse of `threshold`.
+
+        The fraction is exact at edges of bins, such as counted thresholds, and interpolated linearly within a bin.
+        """
+        null = self.distribution(statistic, template=template)
+        return self._share_above(null, Interval(threshold, threshold, threshold))
+
+    def detection_probability(self, fap: float = 1e-3, statistic: str = "chi2") -> list[Interval]:
+        """Return the fraction of realisations at or above the threshold for each flare.
+
+        The interval has 95 % coverage for the probability above the true threshold; see `detection_interval`. The
+        values are NaN for `blinding` flares, and if no threshold has the false-alarm probability (`without_threshold`).
+        """
+        probabilities = []
+        for flare in range(len(self.flares)):
+            if flare in self.blinding:
+                probabilities.append(Interval(np.nan, np.nan, np.nan))
+                continue
+            try:
+                cut = self._cut(fap, statistic, flare)
+            except NoThresholdError:
+                probabilities.append(Interval(np.nan, np.nan, np.nan))
+                continue
+            counted = self._at((statistic, "flare_on_null_grid", flare))
+            above = [counted.above(value) for value in (cut.value, cut.high, cut.low)]
+            shared = 0.0
+            if countable(fap, self.realisations) and counted.std > 0:
+                # A flare only adds uncorrelated noise; tilted draws are independent of the flare's.
+                shared = min(self._at(self._null_key(statistic, flare)).std / counted.std, 1.0)
+            probabilities.append(detection_interval(above, counted.n, fap, shared))
+        return probabilities
+
+    def without_threshold(self, fap: float) -> tuple[Message, ...]:
+        """Return a sentence for each statistic of which no threshold has a false-alarm probability."""
+        sentences = []
+        for statistic in self.statistics:
+            for template in range(len(self.flares)) if self.statistic(statistic).shaped else (0,):
+                try:
+                    self._cut(fap, statistic, template)
+                except NoThresholdError as error:
+                    sentences.append(Message(f"NO THRESHOLD: {error}.", "no threshold"))
+        return tuple(dict.fromkeys(sentences))
+
+    @staticmethod
+    def _share_above(distribution: Distribution, cut: Interval) -> Interval:
+        """Return the fraction at or above a threshold, with an interval that includes the threshold's."""
+        value, low, high = (distribution.above(x) for x in (cut.value, cut.high, cut.low))
+        return Interval(
+            value / distribution.n,
+            clopper_pearson(int(np.floor(low)), distribution.n).low,
+            clopper_pearson(int(np.ceil(high)), distribution.n).high,
+        )
+
+    def quantile(
+        self, probability: float, statistic: str = "chi2", flare: int | None = None, *, template: int = 0
+    ) -> Interval:
+        """Return a quantile of a simulated distribution with its order-statistic interval; see `distribution`."""
+        return self.distribution(statistic, flare, template=template).quantile_interval(probability)
+
+    def tail_samples(self, statistic: str = "chi2", flare: int | None = None, *, template: int = 0) -> QTable:
+        """Return the 1000 largest values of a null, or the smallest of a flare, with their realisations.
+
+        `Engine.realise` with the same seed draws the spectrum of a realisation again.
+
+        Returns
+        -------
+        QTable
+            ``realisation`` and ``value``, the most extreme first.
+        """
+        self._check(statistic, flare, template)
+        key: Key = (statistic, "flare", flare) if flare is not None else self._null_key(statistic, template)
+        self._at(key)
+        return table_of(TAIL_COLUMNS, [self._samples[key]])
+
+    def roc(self, statistic: str = "chi2", flare: int = 0) -> Roc:
+        """Return the ROC curve and the area under it."""
+        self._check(statistic, flare)
+        null = self._at(self._null_key(statistic, flare))
+        return Roc.of(null, self._at((statistic, "flare_on_null_grid", flare)))
+
+    def plot(self, path: str | Path | None = None, *, fap: float = 1e-3, ax: Any = None) -> Any:
+        """Plot the null and flare distributions of all statistics with their thresholds; needs matplotlib."""
+        return self._draw(path, ax, fap=fap)
+
+    def table(self, fap: float = 1e-3) -> QTable:
+        """Return expected and simulated values, thresholds and probabilities, one row per flare and statistic.
+
+        Undefined values are NaN; see `detection_probability`.
+        """
+        probability = {statistic: self.detection_probability(fap, statistic) for statistic in self.statistics}
+        rows = [
+            self._row(fap, statistic, flare, probability[statistic][flare])
+            for flare in range(len(self.flares))
+            for statistic in self.statistics
+        ]
+        tails = "counted" if countable(fap, self.realisations) else "importance sampling"
+        about = {"realisations": self.realisations, "exposure_s": self.quiet.exposure_s, "tails": tails}
+        return table_of(COLUMNS, rows, fap=fap, **about)
+
+    def _row(self, fap: float, statistic: str, flare: int, probability: Interval) -> dict[str, Any]:
+        """Return the row of one flare and statistic, as `COLUMNS` have it."""
+        d, dof = self.distribution(statistic, flare), self.dof(statistic)
+        try:
+            cut = self.threshold(fap, statistic, template=flare)
+        except NoThresholdError:
+            cut = Interval(np.nan, np.nan, np.nan)
+        theory = self.closed_form(statistic, flare)
+        limit = self.closed_form(statistic, template=flare).isf(fap)
+        # A weighted sum has no reduced value.
+        reduced = np.nan if isinstance(self.statistic(statistic), LinearStatistic) else d.mean / dof
+        of_flare = (theory.mean, d.mean, d.std, reduced, theory.sf(limit))
+        if flare in self.blinding:
+            of_flare = (np.nan,) * 5
+        keys = ("expected", "mean", "std", "reduced", "closed_form_probability")
+        return dict(zip(keys, of_flare, strict=True)) | {
+            "name": self.flares[flare].name,
+            "statistic": statistic,
+            "dof": dof,
+            "threshold": cut.value,
+            "threshold_low": cut.low,
+            "threshold_high": cut.high,
+            "probability": probability.value,
+            "low": probability.low,
+            "high": probability.high,
+            "closed_form_threshold": limit,
+            "fap_error": self._fap_error(fap, statistic, flare),
+        }
+
+    def _fap_error(self, fap: float, statistic: str, template: int) -> float:
+        """Return the relative standard error of the false-alarm probability at a threshold, NaN where there is none."""
+        try:
+            self._cut(fap, statistic, template)
+        except NoThresholdError:
+            return float("nan")
+        tail = self.tail(fap, statistic, template=template)
+        return float(np.sqrt((1 - fap) / (fap * self.realisations))) if tail is None else tail.relative_error
+
+    def _null_key(self, statistic: str, template: int) -> Key:
+        return statistic, "null", self._null(statistic, template)
+
+    def _null(self, statistic: str, template: int) -> int:
+        return template if self.statistic(statistic).shaped else 0
+
+    def _cut(self, fap: float, statistic: str, template: int) -> Interval:
+        """Return the sampled threshold, or the lowest edges of the null's bins with few enough counts above."""
+        sampled = self.tail(fap, statistic, template=template)
+        if sampled is not None:
+            return sampled.threshold
+        null = self._at(self._null_key(statistic, template))
+        n_low, n_high = central_counts(null.n, fap)
+        wanted = (int(np.floor(fap * null.n * (1 + 1e-12))), n_high, max(n_low - 1, 0))
+        cut = Interval(*map(null.edge_with_at_most, wanted))
+        beyond, at = null.around(cut.value)
+        check_atom(f"{statistic} of {self.quiet.name}", fap, beyond / null.n, at / null.n)
+        return cut
+
+
+def _detected(probability: float, threshold: float) -> str:
+    """Return a detection probability, or why there is none."""
+    if probability == probability:
+        return f"{probability:.4f}"
+    return "saturated" if threshold == threshold else "no threshold"
+
+
+#: Columns of the table of detections.
+COLUMNS = (
+    Column("name"),
+    Column("statistic", description="detection statistic", heading="statistic"),
+    Column("dof", description="degrees of freedom without a flare"),
+    Column("expected", description="closed-form mean with the flare", heading="expected", format=".2f"),
+    Column("mean", description="simulated mean with the flare", heading="simulated", format=".2f"),
+    Column("std", description="simulated standard deviation with the flare"),
+    Column("reduced", description="simulated mean over degrees of freedom; none for weighted sums", heading="reduced",
+           format=number(".3f")),
+    Column("threshold", description="simulated threshold at the false-alarm probability, per test",
+           heading="threshold", format=".2f"),
+    Column("threshold_low", description="its 95 % interval, lower end"),
+    Column("threshold_high", description="its 95 % interval, upper end"),
+    Column("probability", description="detection probability at that threshold", heading="detected",
+           format=_detected, others=("threshold",)),
+    Column("low", description="its 95 % interval, lower end, the threshold's error included", heading=INTERVAL,
+           format=interval(".4f"), others=("high",)),
+    Column("high", description="its 95 % interval, upper end, the threshold's error included"),
+    Column("closed_form_threshold", description="threshold for Gaussian noise"),
+    Column("closed_form_probability", description="detection probability for Gaussian noise", heading="closed form",
+           format=".4f"),
+    Column("fap_error", description="relative standard error of the false-alarm probability at the threshold"),
+)  # fmt: skip
+#: Columns of the table of extremes.
+TAIL_COLUMNS = (
+    Column("realisation", "realisations", description="number of the realisation, by which it can be drawn again"),
+    Column("value", "values", description="of the statistic, as the device computed it"),
+)

@@ -1,0 +1,332 @@
+"""Nuisance parameters: unknown amplitudes of known spectra, which statistics marginalise over.
+
+Nuisance parameters: unknown amplitudes of known spectra, which statistics marginalise over (METHODS section 7).
+
+The covariance of an exposure is C = V + U^T S U with the diagonal V of the noise, the nuisance spectra U and the
+variances S of their amplitudes. An amplitude of infinite variance is projected out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.content_equality import ContentEquality
+from mauvecl.host.files.parsing import LARGEST, SMALLEST, read_text
+from mauvecl.host.tables.text_lines import columns
+from mauvecl.noise.unknowns import NUISANCES
+from mauvecl.schema.calls import validated
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
+
+if TYPE_CHECKING:
+    from mauvecl.host.exposure.expectation import Expectation
+
+Float = NDArray[np.float64]
+
+
+@validated
+@dataclass(frozen=True, eq=False)
+class Nuisances(ContentEquality):
+    """Unknown amplitudes of known spectra.
+
+    Attributes
+    ----------
+    names : tuple of str
+    spectra : ndarray, shape (k, n_pixel)
+        DN of the exposure for unit amplitude.
+    sd : ndarray, shape (k,)
+        Prior standard deviations of the amplitudes; infinite for a flat prior.
+    of_flare : ndarray, shape (k, n_pixel), optional
+        Relative change of the light of a flare for unit amplitude: 1 for a factor on all light, 0 by default. Fits of
+        flares use it; statistics test for a flare, and use the spectra without one.
+    mean : ndarray, shape (k,), optional
+        Prior means of the amplitudes in fits of flares, 0 by default.
+    factor_prior : ndarray, shape (2, n), optional
+        Values of the factor on all light, in standard deviations from its mean, and their probabilities, if its prior
+        is not normal; fits of flares use it.
+    """
+
+    names: tuple[str, ...]
+    spectra: Float
+    sd: Float
+    of_flare: Float = field(default_factory=lambda: np.zeros((0, 0)))
+    mean: Float = field(default_factory=lambda: np.zeros(0))
+    factor_prior: Float = field(default_factory=lambda: np.zeros((2, 0)))
+
+    def __post_init__(self) -> None:
+        shapes = np.shape(self.spectra), np.shape(self.sd)
+        if len(shapes[0]) != 2 or shapes[0][:1] != shapes[1] or shapes[1] != (len(self.names),):
+            raise InputError(
+                f"{len(self.names)} names of unknowns, spectra of the shape {shapes[0]} and standard deviations of "
+                f"the shape {shapes[1]}",
+                "one spectrum and one standard deviation for each name",
+                key="names",
+                value=self.names,
+            )
+        for name, spectrum, sd in zip(self.names, self.spectra, self.sd, strict=True):
+            if not np.isfinite(spectrum).all():
+                raise InputError(
+                    f"the spectrum of the unknown {name!r} is not finite everywhere",
+                    "numbers",
+                    key="spectra",
+                    value=name,
+                )
+            if not sd > 0:
+                raise InputError(
+                    f"the unknown {name!r} has a standard deviation of {sd:g}",
+                    "one above 0 or 'free'",
+                    key="sd",
+                    value=sd,
+                )
+        for name, expected in (("of_flare", np.shape(self.spectra)), ("mean", np.shape(self.sd))):
+            given = getattr(self, name)
+            values = np.asarray(given, np.float64) if np.size(given) else np.zeros(expected)
+            if values.shape != expected or not np.isfinite(values).all():
+                raise InputError(f"{name} of the unknowns has the shape {values.shape}", f"finite numbers, {expected}",
+                                 key=name, value=values.shape)  # fmt: skip
+            object.__setattr__(self, name, values)
+
+    @classmethod
+    def of(
+        cls, quiet: Expectation, sd: Mapping[str, float], own: Mapping[str, NDArray[np.float64]] | None = None
+    ) -> Nuisances:
+        """Compute the nuisance spectra of a quiescent exposure.
+
+        Parameters
+        ----------
+        quiet : Expectation
+        sd : mapping of str to float
+            Prior standard deviations by name, of `NUISANCES` or `own`; infinite to project a parameter out.
+        own : mapping of str to ndarray, shape (n_pixel,), optional
+            User-defined spectra, DN of the exposure for unit amplitude.
+
+        Raises
+        ------
+        InputError
+            If a name has no spectrum, or a spectrum is zero everywhere.
+        """
+        own = own or {}
+        spectra, of_flare = [], []
+        for name in sd:
+            row = None if name in own else NUISANCES.get(name)
+            shape = quiet.wavelength_nm.shape
+            of_flare.append(np.zeros(shape) if row is None or row.of_flare is None else row.of_flare(quiet))
+            if name in own:
+                spectrum = np.asarray(own[name], np.float64)
+                if spectrum.shape != quiet.wavelength_nm.shape:
+                    raise InputError(
+                        f"the spectrum of the unknown {name!r} has the shape {spectrum.shape}",
+                        f"one value for each of the {quiet.wavelength_nm.size} pixels",
+                        key="own",
+                        value=spectrum.shape,
+                    )
+            else:
+                spectrum = spectrum_of(name, quiet)
+            if not spectrum.any():
+                raise InputError(
+                    f"the unknown {name!r} changes no pixel of {quiet.name}",
+                    "a spectrum that changes pixels",
+                    key="own",
+                    value=name,
+                )
+            spectra.append(spectrum)
+        shape = len(spectra), quiet.wavelength_nm.size
+        return cls(
+            tuple(sd),
+            np.array(spectra).reshape(shape),
+            np.array(list(sd.values()), np.float64),
+            np.array(of_flare).reshape(shape),
+        )
+
+    def _line(self) -> str:
+        return ", ".join(
+            f"{name} +-{sd:g}" if np.isfinite(sd) else f"{name} free"
+            for name, sd in zip(self.names, self.sd, strict=True)
+        )
+
+    def __bool__(self) -> bool:
+        return bool(self.names)
+
+    @property
+    def free(self) -> int:
+        """Number of projected-out parameters."""
+        return int(np.isinf(self.sd).sum())
+
+    def without(self, names: Collection[str]) -> Nuisances:
+        """Return all parameters but those named."""
+        return self._rows([i for i, name in enumerate(self.names) if name not in names])
+
+    def _rows(self, kept: Sequence[int]) -> Nuisances:
+        kept = list(kept)
+        spectra, sd, of_flare, mean = (one[kept] for one in (self.spectra, self.sd, self.of_flare, self.mean))
+        return Nuisances(tuple(self.names[i] for i in kept), spectra, sd, of_flare, mean, self.factor_prior)
+
+    def with_spectrum(self, name: str, spectrum: Float, sd: float) -> Nuisances:
+        """Return the parameters with another one that leaves the light of a flare as it is."""
+        self._check_pixels("spectrum", spectrum)
+        return self.joined(Nuisances((name,), spectrum[None], np.array([sd])))
+
+    def _check_pixels(self, key: str, values: Float) -> None:
+        """Raise InputError unless there is a value for each pixel."""
+        expected = (self.spectra.shape[1],)
+        if values.shape != expected:
+            raise InputError.of(key, values.shape, f"the shape {expected}, one value for each pixel")
+
+    def joined(self, other: Nuisances) -> Nuisances:
+        """Return these parameters and others."""
+        return Nuisances(
+            (*self.names, *other.names),
+            np.vstack([self.spectra, other.spectra]),
+            np.append(self.sd, other.sd),
+            np.vstack([self.of_flare, other.of_flare]),
+            np.append(self.mean, other.mean),
+            np.hstack([self.factor_prior, other.factor_prior]),
+        )
+
+    def with_prior(self, name: str, mean: float, sd: float) -> Nuisances:
+        """Return the parameters with another prior of one amplitude."""
+        chosen = np.array([one == name for one in self.names])
+        return replace(self, sd=np.where(chosen, sd, self.sd), mean=np.where(chosen, mean, self.mean))
+
+    @property
+    def has_factor(self) -> bool:
+        """Whether the last parameter multiplies all light, that of a flare included; see `around`."""
+        return bool(self.names) and bool((self.of_flare[-1] == 1.0).all())
+
+    def around(self, flare_dn: Float) -> Nuisances:
+        """Return the parameters for fits of a flare next to one that is recorded with these DN.
+
+        The factor on all light is the last one, and its spectrum is that without a flare: fits find the flare as it is
+        recorded. The spectra of the others include the flare.
+        """
+        self._check_pixels("flare_dn", flare_dn)
+        order, factors = np.arange(len(self.names)), np.flatnonzero((self.of_flare == 1.0).all(axis=1))
+        if factors.size:
+            order = np.append(np.delete(order, factors[0]), factors[0])
+        found = self._rows(order.tolist())
+        spectra = found.spectra + found.of_flare * flare_dn
+        if factors.size:
+            spectra[-1] = found.spectra[-1]
+        return replace(found, spectra=spectra)
+
+    @property
+    def mean_factor(self) -> float:
+        """Prior mean of the factor on all light, that of a flare included."""
+        return 1.0 + float(self.mean[(self.of_flare == 1.0).all(axis=1)].sum())
+
+    @property
+    def mean_dn(self) -> Float:
+        """Mean change of the exposure by the priors' means, DN, shape (n_pixel,)."""
+        return np.asarray(self.mean @ self.spectra)
+
+    def finite(self, spectra: Float) -> Float:
+        """Return the spectra with finite priors times their standard deviations, shape (k_finite, n)."""
+        known = np.isfinite(self.sd)
+        return np.asarray(spectra[known] * self.sd[known, None])
+
+    def rows(self, variance: Float, spectra: Float) -> Float:
+        """Return the rows of x^T C^-1 x = sum x^2 / v - sum (rows @ x)^2 (Woodbury identity), shape (k, n).
+
+        Parameters
+        ----------
+        variance : ndarray, shape (n,)
+            Diagonal v; zero for unused values.
+        spectra : ndarray, shape (k, n)
+
+        Raises
+        ------
+        InputError
+            If projected-out spectra are linearly dependent.
+        """
+        inverse = np.divide(1.0, variance, out=np.zeros_like(variance), where=variance > 0)
+        information = np.diag(self.sd**-2.0) + (spectra * inverse) @ spectra.T
+        # Scaled to standard deviations, because amplitudes have different units.
+        scale = np.sqrt(np.diag(information))
+        eigenvalues = np.linalg.eigvalsh(information / np.outer(scale, scale))
+        if eigenvalues[0] < 1e-10:
+            raise InputError(
+                f"the unknowns {', '.join(self.names)} cannot be distinguished in these pixels",
+                "fewer of them or standard deviations instead of 'free'",
+                key="nuisances",
+                value=self.names,
+            )
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(information), spectra * inverse))
+
+
+def spectrum_of(name: str, quiet: Expectation) -> Float:
+    """Return the spectrum of one of `NUISANCES`, DN of the exposure for unit amplitude, shape (n_pixel,)."""
+    if name not in NUISANCES:
+        raise InputError(
+            f"the unknown {name!r} has no spectrum",
+            f"one of {', '.join(NUISANCES)} or a file",
+            key="nuisances",
+            value=name,
+        )
+    return np.asarray(NUISANCES[name].spectrum(quiet))
+
+
+def as_nuisances(given: Nuisances | Mapping[str, float] | None, quiet: Expectation) -> Nuisances | None:
+    """Convert standard deviations by name to nuisance parameters; an empty mapping becomes None."""
+    if given is None or isinstance(given, Nuisances):
+        return given
+    return Nuisances.of(quiet, given) if given else None
+
+
+def join_names(names: Sequence[str]) -> str:
+    """Join names for a sentence: "a, b and c"."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def read_spectrum(name: str, path: Path, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Read a nuisance spectrum from a file of wavelengths, nm, and DN per exposure, and interpolate it to pixels."""
+    return read_values(f"spectrum {shortened(path.name)} of {shortened(name)}", "DN", path, wavelength_nm)
+
+
+def read_values(what: str, kind: str, path: Path, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Read values of a file of two columns, and interpolate them to pixels."""
+    rows = columns(what, read_text(path, kind if kind == "weights" else "spectrum"))
+    return at_pixels(what, kind, rows, wavelength_nm)
+
+
+def at_pixels(
+    what: str, kind: str, rows: NDArray[np.float64], wavelength_nm: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Interpolate values linearly to pixels, 0 outside their range, shape (n_pixel,).
+
+    Parameters
+    ----------
+    what, kind : str
+        Names of the source and of its values, for messages.
+    rows : ndarray, shape (n, 2)
+        Wavelengths, nm, and values.
+    wavelength_nm : ndarray, shape (n_pixel,)
+    """
+    if rows.ndim != 2 or rows.shape[1] != 2 or not np.all(np.diff(rows[:, 0]) > 0):
+        raise InputError(
+            f"{what} have {rows.shape[1] if rows.ndim == 2 else 'no'} columns",
+            f"ascending wavelengths in nm and {kind}",
+            key=what,
+        )
+    sizes = np.abs(rows)
+    bad = ~((rows == 0) | ((sizes >= SMALLEST) & (sizes <= LARGEST)))
+    if bad.any():
+        raise InputError(
+            f"{what} hold {rows[bad][0]!r}",
+            f"0 or a size from {SMALLEST:g} to {LARGEST:g}",
+            key=what,
+            value=rows[bad][0].tolist(),
+        )
+    values = np.interp(wavelength_nm, rows[:, 0], rows[:, 1], left=0.0, right=0.0)
+    if not values.any():
+        raise InputError(
+            f"{what} are 0 at every pixel",
+            f"some of {wavelength_nm.min():.0f}-{wavelength_nm.max():.0f} nm to count",
+            key=what,
+        )
+    return np.asarray(values)

@@ -1,0 +1,514 @@
+"""Requests to an engine as plain data: statistics by name, hypotheses, channels and shards.
+
+Requests to an engine as plain data, from which every worker computes the same result.
+
+A shard is a range of realisations of one part of a request. Its counts are integers, and its extreme values carry their
+realisations, so shards can be counted in any order, on any device, and more than once; `sums` adds them up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, fields
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, Literal, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.detection.chi2 import Chi2, Chi2Element, Chi2Pair, Paper
+from mauvecl.detection.counts import Grid, TailSamples
+from mauvecl.detection.distributions import Form
+from mauvecl.detection.fap_checks import Tails
+from mauvecl.detection.names import DEFAULT_STATISTICS, check_statistic
+from mauvecl.detection.nuisances import Nuisances, as_nuisances
+from mauvecl.detection.statistics import (
+    Linear,
+    LinearStatistic,
+    Matched,
+    QuadraticStatistic,
+    Setting,
+    Statistic,
+    UvExcess,
+)
+from mauvecl.host.exposure.expectation import Expectation
+from mauvecl.noise.comparison import NOISE_FREE, Comparison
+from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingOptions
+from mauvecl.noise.layout import FIXED_STATISTICS
+from mauvecl.noise.scene import BATCH, FactorDistributions, Scene, prepare
+from mauvecl.schema.calls import validated
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import OneOrMore
+from mauvecl.schema.messages import Message
+from mauvecl.schema.physical import FirstRealisation, Realisations, Seed
+
+#: All statistics in the order of tables and plots; add a new one here.
+STATISTICS: dict[str, Statistic] = {
+    one.name: one for one in (Chi2(), Chi2Element(), Chi2Pair(), Matched(), UvExcess(), Paper())
+}
+
+
+def statistics_by_name(asked: Sequence[str | Linear]) -> dict[str, Statistic]:
+    """Return the requested statistics by name.
+
+    `asked` holds names of `STATISTICS` and user-defined statistics. Raises InputError if it is empty, or a name is
+    unknown or not unique.
+    """
+    named: dict[str, Statistic] = {}
+    own: set[str] = set()
+    for one in asked:
+        if isinstance(one, str):
+            check_statistic(one)
+            named.setdefault(one, STATISTICS[one])
+            continue
+        if one.name in STATISTICS:
+            raise InputError(
+                f"statistic {one.name!r} is one of mauvecl's own", "another name", key="statistics", value=one.name
+            )
+        if one.name in own:
+            raise InputError.of("statistics", one.name, "different names")
+        own.add(one.name)
+        named[one.name] = one
+    if not named:
+        raise InputError("no statistic named", f"some of {', '.join(STATISTICS)}", key="statistics")
+    return named
+
+
+def label(name: str) -> str:
+    """Return the axis label of a statistic; that of a user-defined one is its name."""
+    return STATISTICS[name].label if name in STATISTICS else name
+
+
+#: Standard deviations by which a flare lowers a weighted sum before it is reported; less is rounding.
+LEAST_SHIFT = 1e-3
+
+
+@validated
+@dataclass(eq=False)
+class Hypotheses:
+    """The null hypothesis, the flares, and the statistics that distinguish them."""
+
+    quiet: Expectation
+    flares: tuple[Expectation, ...]
+    asked: Sequence[str | Linear]  # requested statistics
+    scene: Scene
+    _: KW_ONLY
+    nuisances: Nuisances | None = None  # parameters over which the statistics are marginalised
+    statistics: tuple[str, ...] = field(init=False)  # names of the statistics
+    setting: Setting = field(init=False, repr=False)
+    _chosen: dict[str, Statistic] = field(init=False, repr=False)
+    _forms: dict[tuple[str, int | None, int], Form] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        self._chosen = statistics_by_name(self.asked)
+        self.statistics = tuple(self._chosen)
+        drawn = FactorDistributions.of(self.scene) if self.nuisances else None
+        self.setting = Setting(self.quiet, self.scene.used, self.scene.comparison, self.flares, self.nuisances, drawn)
+        shaped = next((name for name, one in self._chosen.items() if one.shaped), None)
+        if shaped is not None and not self.flares:
+            raise InputError("no flare given", f"at least one for the statistic {shaped!r}", key="flares", value=shaped)
+        if not self.scene.used.any():
+            raise InputError(
+                f"every pixel of {self.quiet.name} is saturated", "a fainter star", key="quiet", value=self.quiet.name
+            )
+        for one in self._chosen.values():
+            one.check(self.setting)
+        if "matched" in self._chosen:
+            self._check_shapes()
+
+    def _check_shapes(self) -> None:
+        """Raise InputError for a flare without effect, unless it saturates every pixel, which `messages` report."""
+        for k, flare in enumerate(self.flares):
+            if k not in self.blinding:
+                check_shape(self.quiet, flare, self.scene.used, k)
+
+    def statistic(self, name: str) -> Statistic:
+        """Return a statistic by name; raises InputError if it was not requested."""
+        if name not in self._chosen:
+            raise InputError.of("statistic", name, f"one of {', '.join(self.statistics)}")
+        return self._chosen[name]
+
+    def shape(self, statistic: str, template: int = 0) -> Expectation | None:
+        """Return the flare that a shaped statistic uses as template; None for other statistics."""
+        self._check(statistic, None, template)
+        return self.flares[template] if self.statistic(statistic).shaped else None
+
+    def weights(self, statistic: str, template: int = 0) -> NDArray[np.float64] | None:
+        """Return the weights per DN of a linear statistic, shape (n_pixel,); None for others.
+
+        Parameters
+        ----------
+        template : int
+            Index of the flare that shaped statistics use as template.
+        """
+        one = self.statistic(statistic)
+        return (
+            one.weights_per_dn(self.setting, self.shape(statistic, template))
+            if isinstance(one, LinearStatistic)
+            else None
+        )
+
+    @cached_property
+    def blinding(self) -> tuple[int, ...]:
+        """Indices of flares that saturate every used pixel."""
+        used = self.scene.used
+        return tuple(k for k, x in enumerate(self.flares) if x.saturated[used].all())
+
+    @property
+    def messages(self) -> tuple[Message, ...]:
+        """Remarks on saturating flares."""
+        return tuple(
+            Message(
+                f"SATURATED: flare {k + 1} saturates every pixel of {self.quiet.name} that counts: what is recorded no "
+                "longer depends on the flare, and no number is given.",
+                "saturated",
+            )
+            for k in self.blinding
+        )
+
+    @cached_property
+    def lowered(self) -> tuple[Message, ...]:
+        """Sentences on weighted sums that a flare lowers, so that it is never detected however bright it is."""
+        sentences = []
+        for name in self.statistics:
+            if not isinstance(self.statistic(name), LinearStatistic):
+                continue
+            for k, flare in enumerate(self.flares):
+                falls = self.fall(name, k)
+                if falls:
+                    matched = Matched().closed_form(self.setting, flare, flare)
+                    how = "marginalised over unknowns, " if self.nuisances else ""
+                    text = (
+                        f"WRONG SIGN: {how}{name} falls by {falls:.3g} standard deviations with flare {k + 1} of "
+                        f"{self.quiet.name}, and only higher values are alarms: its detection probability says nothing "
+                        f"of the flare, which matched has at {matched.mean / matched.std:.3g}."
+                    )
+                    sentences.append(Message(text, "wrong sign"))
+        return tuple(sentences)
+
+    def fall(self, statistic: str, flare: int) -> float:
+        """Return the standard deviations by which a flare lowers a weighted sum, or 0 if it does not."""
+        if flare in self.blinding or not isinstance(self.statistic(statistic), LinearStatistic):
+            return 0.0
+        return fall_between(self.closed_form(statistic, template=flare), self.closed_form(statistic, flare))
+
+    def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Form:
+        """Return a statistic's distribution for Gaussian noise; parameters as for `Detection.distribution`."""
+        self._check(statistic, flare, template)
+        # Only the nulls of shaped statistics depend on the template.
+        key = statistic, flare, template if flare is None and self.statistic(statistic).shaped else 0
+        if key not in self._forms:
+            self._forms[key] = self._closed_form(statistic, flare, template)
+        return self._forms[key]
+
+    def _closed_form(self, statistic: str, flare: int | None, template: int) -> Form:
+        observed = self.quiet if flare is None else self.flares[flare]
+        looked_for = self.shape(statistic, template if flare is None else flare)
+        return self.statistic(statistic).closed_form(self.setting, observed, looked_for)
+
+    def dof(self, statistic: str) -> int:
+        """Return the degrees of freedom without a flare: pixels, resolution elements, or one."""
+        return self.statistic(statistic).dof(self.setting)
+
+    def _check(self, statistic: str, flare: int | None, template: int = 0) -> None:
+        if self.statistic(statistic).shaped and flare is None:
+            flare = template
+        if flare is not None and not 0 <= flare < len(self.flares):
+            raise InputError.of("flare", flare, f"0 to {len(self.flares) - 1}")
+
+
+def fall_between(null: Form, flare: Form) -> float:
+    """Return the standard deviations by which a flare lowers the mean of a statistic, or 0 if it does not."""
+    shift = (flare.mean - null.mean) / null.std
+    return -shift if shift < -LEAST_SHIFT else 0.0
+
+
+def check_shape(quiet: Expectation, flare: Expectation, used: NDArray[np.bool_], number: int = 0) -> None:
+    """Raise InputError if a flare changes no used pixel, since it cannot be a template."""
+    if not (flare.recorded_light_dn != quiet.recorded_light_dn)[used].any():
+        raise InputError(
+            f"flare {number + 1} of {quiet.name} changes no pixel that counts",
+            "an amplitude above 0 for the statistic 'matched', which looks for its shape",
+            key="amplitude",
+            value=number + 1,
+        )
+
+
+#: Distributions: without a flare, with a flare in the bins of the null, with a flare in bins around its mean.
+Role = Literal["null", "flare_on_null_grid", "flare"]
+Key = tuple[str, Role, int]
+
+
+@dataclass(frozen=True)
+class ChannelPlan:
+    """Channels that a launch computes for a batch of flares."""
+
+    weights: NDArray[np.float32]  # shape (n_linear, n_padded)
+    linear_end: NDArray[np.uint32]  # one past the last linear statistic of each scenario, shape (n_scenario,)
+    # One past the last linear statistic with weights per pixel, shape (n_scenario,). Later ones have weights per
+    # resolution element, stored at the element's last pixel.
+    pixels_end: NDArray[np.uint32]
+    scales: NDArray[np.float32]  # of the statistic `paper` (see `Smoothing`), shape (n_smoothed, n_centre)
+    scale_end: NDArray[np.uint32]  # one past the last smoothed statistic of each scenario, shape (n_scenario,)
+    grids: list[Grid]
+    keys: list[Key]  # distribution that each grid counts
+    # Row of chi-squared, and first and one past the last row whose squares are subtracted from it, shape (3, n).
+    subtractions: NDArray[np.uint32]
+
+    def tails(self) -> list[TailSamples | None]:
+        """Return accumulators of each grid's extremes: the largest values of a null, the smallest of a flare."""
+        kinds: dict[Role, bool] = {"null": True, "flare": False}
+        return [TailSamples(largest=kinds[role]) if role in kinds else None for _, role, _ in self.keys]
+
+    @property
+    def n_rows(self) -> int:
+        """Number of channels."""
+        return len(FIXED_STATISTICS) * len(self.linear_end) + len(self.weights) + len(self.scales)
+
+
+@dataclass(eq=False)
+class _Rows:
+    """Rows of weights of one kind, ordered by scenario."""
+
+    rows: list[NDArray[np.float64]] = field(default_factory=list)
+    ends: list[int] = field(default_factory=list)  # one past the last row of each scenario
+    pixels_end: list[int] = field(default_factory=list)  # one past the last row with weights per pixel
+    index: dict[tuple[str, int, int], int] = field(default_factory=dict)  # by statistic, scenario and template
+
+    def add(self, statistic: str, scenario: int, flare: int, row: NDArray[np.float64]) -> None:
+        self.index[statistic, scenario, flare] = len(self.rows)
+        self.rows.append(row)
+
+    def end_pixels(self) -> None:
+        """End the rows of a scenario with weights per pixel."""
+        self.pixels_end.append(len(self.rows))
+
+    def end(self) -> None:
+        """End a scenario."""
+        if len(self.pixels_end) == len(self.ends):
+            self.end_pixels()
+        self.ends.append(len(self.rows))
+
+
+def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) -> ChannelPlan:
+    """Plan the channels of a batch of flares; scenario 0 is always the quiescent one.
+
+    If `first`, the batch also counts the null distributions that all batches share.
+    """
+    asked = [hypotheses.statistic(name) for name in hypotheses.statistics]
+    weighted, smoothed = _Rows(), _Rows()
+    for scenario in range(1 + len(batch)):
+        # Quiescent draws are compared with every flare's template, draws of a flare only with its own.
+        shapes = [flare for i, flare in enumerate(batch) if scenario in (0, i + 1)]
+        # Shaped statistics come first, since the kernel fuses the first row, and sums over elements last.
+        for one in sorted(asked, key=lambda s: (s.by_element, not s.shaped)):
+            if one.by_element:
+                weighted.end_pixels()
+            for flare in shapes if one.shaped else [0]:
+                looked_for = hypotheses.shape(one.name, flare)
+                if isinstance(one, LinearStatistic):
+                    weighted.add(one.name, scenario, flare, one.weights_per_dn(hypotheses.setting, looked_for))
+                elif isinstance(one, QuadraticStatistic) and one.kernel_sum is not None:
+                    for number, own in enumerate(one.subtracted_rows(hypotheses.setting)):
+                        weighted.add(one.name, scenario, number, own)
+                elif isinstance(one, Paper):
+                    smoothed.add(one.name, scenario, flare, one.scale(hypotheses.setting, looked_for))
+        weighted.end()
+        smoothed.end()
+    n_scenario, fixed = 1 + len(batch), len(FIXED_STATISTICS)
+
+    def row(one: Statistic, scenario: int, flare: int) -> int:
+        if one.kernel_sum is not None:
+            return fixed * scenario + FIXED_STATISTICS.index(one.kernel_sum)
+        where = one.name, scenario, flare if one.shaped else 0
+        if isinstance(one, LinearStatistic):
+            return fixed * n_scenario + weighted.index[where]
+        return fixed * n_scenario + len(weighted.rows) + smoothed.index[where]
+
+    nuisances = hypotheses.setting.nuisances
+    subtractions = []
+    for one in asked if nuisances else []:
+        for scenario in range(n_scenario) if one.kernel_sum is not None else []:
+            begin = fixed * n_scenario + weighted.index[one.name, scenario, 0]
+            subtractions.append((row(one, scenario, 0), begin, begin + len(nuisances.names if nuisances else ())))
+    grids: list[Grid] = []
+    keys: list[Key] = []
+
+    def add(one: Statistic, role: Role, flare: int, channel: int, shape: Form) -> None:
+        grids.append(Grid(channel, shape.mean, shape.std))
+        keys.append((one.name, role, flare))
+
+    for one in asked:
+        if first and not one.shaped:
+            add(one, "null", 0, row(one, 0, 0), hypotheses.closed_form(one.name))
+        for i, flare in enumerate(batch):
+            null = hypotheses.closed_form(one.name, template=flare)
+            if one.shaped:
+                add(one, "null", flare, row(one, 0, flare), null)
+            channel = row(one, i + 1, flare)
+            add(one, "flare_on_null_grid", flare, channel, null)
+            add(one, "flare", flare, channel, hypotheses.closed_form(one.name, flare))
+    weights = np.zeros((len(weighted.rows), len(hypotheses.scene.pixels)), np.float32)
+    weights[:, : hypotheses.scene.n_pixel] = np.array(weighted.rows).reshape(len(weights), hypotheses.scene.n_pixel)
+    scales = np.array(smoothed.rows, np.float32) if smoothed.rows else np.zeros((0, 1), np.float32)
+    ends = (np.array(ends, np.uint32) for ends in (weighted.ends, weighted.pixels_end, smoothed.ends))
+    linear_end, pixels_end, scale_end = ends
+    taken = np.array(subtractions, np.uint32).reshape(len(subtractions), 3).T
+    return ChannelPlan(weights, linear_end, pixels_end, scales, scale_end, grids, keys, taken)
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Range of realisations, `start` to `start + count - 1`, of one part of a request."""
+
+    part: int
+    start: int
+    count: int
+
+    @property
+    def name(self) -> str:
+        """Name in files."""
+        return f"{self.part}-{self.start}-{self.count}"
+
+    def __str__(self) -> str:
+        return f"realisations {self.start} to {self.start + self.count - 1}"
+
+
+def check_last(start: int, realisations: int) -> None:
+    """Raise InputError if the last realisation has no number of 63 bits."""
+    if start + realisations >= 2**63:
+        raise InputError.of("start", start, f"at most {2**63 - 1 - realisations} for {realisations} realisations")
+
+
+class Countable:
+    """Base class of requests, which are pickled without cached results."""
+
+    least: ClassVar[int] = 2**12
+
+    @classmethod
+    def of(cls, *what: Any, **how: Any) -> Self:
+        """Make a request from keywords that may include the fields of a `Drawing`."""
+        words = {name: how.pop(name) for name in DrawingOptions.__annotations__ if name in how}
+        return cls(*what, **how | {"drawing": Drawing(**words)})
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state to pickle: request fields only, no caches."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}  # type: ignore[arg-type]
+
+
+class _RealisationRequest(Countable):
+    """Base class of requests for realisations."""
+
+    def __post_init__(self) -> None:
+        check_last(vars(self)["start"], vars(self)["realisations"])
+
+
+@validated
+@dataclass(frozen=True, eq=False)
+class DetectRequest(_RealisationRequest):
+    """Arguments of `Engine.detect`."""
+
+    quiet: Expectation
+    flares: Annotated[tuple[Expectation, ...], OneOrMore((Expectation,))]
+    realisations: Realisations
+    seed: Seed
+    statistics: Annotated[Sequence[str | Linear], OneOrMore((str, Linear))] = DEFAULT_STATISTICS
+    start: FirstRealisation = 0
+    drawing: Drawing = AUTOMATIC
+    comparison: Comparison = NOISE_FREE
+    tails: Tails = "counted"
+    nuisances: Nuisances | Mapping[str, float] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "nuisances", as_nuisances(self.nuisances, self.quiet))
+
+    @cached_property
+    def hypotheses(self) -> Hypotheses:
+        """Scene and statistics of the request."""
+        scene = prepare([self.quiet, *self.flares], self.drawing, comparison=self.comparison)
+        nuisances = as_nuisances(self.nuisances, self.quiet)
+        return Hypotheses(self.quiet, self.flares, self.statistics, scene, nuisances=nuisances)
+
+    @cached_property
+    def plans(self) -> list[tuple[ChannelPlan, Scene]]:
+        """Channels and scene of each part, with as many flares as a launch can process."""
+        scene, count = self.hypotheses.scene, len(self.flares)
+        size = BATCH[scene.frames] - 1
+        batches = [range(i, min(i + size, count)) for i in range(0, count, size)] or [range(0)]
+        return [
+            (plan_channels(self.hypotheses, batch, first=number == 0), scene.part([0, *(k + 1 for k in batch)]))
+            for number, batch in enumerate(batches)
+        ]
+
+    @property
+    def parts(self) -> int:
+        """Number of parts, whose launches differ."""
+        return len(self.plans)
+
+    @property
+    def work(self) -> int:
+        """Work per realisation: pixels times scenarios."""
+        return self.hypotheses.scene.n_pixel * max(len(scene.levels) for _, scene in self.plans)
+
+
+@validated
+@dataclass(frozen=True, eq=False)
+class SnrRequest(_RealisationRequest):
+    """Arguments of `Engine.snr`."""
+
+    expectation: Expectation
+    realisations: Realisations
+    seed: Seed
+    start: FirstRealisation = 0
+    drawing: Drawing = AUTOMATIC
+
+    parts = 1
+
+    @cached_property
+    def scene(self) -> Scene:
+        """Scene to draw."""
+        return prepare([self.expectation], self.drawing)
+
+    @property
+    def work(self) -> int:
+        """Work per realisation: pixels."""
+        return self.scene.n_pixel
+
+
+@validated
+@dataclass(frozen=True, eq=False)
+class RealiseRequest(_RealisationRequest):
+    """Arguments of `Engine.realise`, computed as a single shard, so callers limit the number of realisations."""
+
+    expectation: Expectation
+    realisations: Realisations
+    seed: Seed
+    start: FirstRealisation = 0
+    drawing: Drawing = AUTOMATIC
+
+
+class Divisible(Protocol):
+    """Request that can be divided into shards.
+
+    Attributes
+    ----------
+    realisations, start : int
+    parts : int
+        Number of parts, whose launches differ.
+    work : int
+        Approximate work per realisation: pixels times scenarios.
+    least : int
+        Smallest number of realisations of a shard, a power of two.
+    """
+
+    @property
+    def realisations(self) -> int: ...
+    @property
+    def start(self) -> int: ...
+    @property
+    def parts(self) -> int: ...
+    @property
+    def work(self) -> int: ...
+    @property
+    def least(self) -> int: ...

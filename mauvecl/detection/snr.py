@@ -1,0 +1,389 @@
+"""Distributions of signal-to-noise ratios, and exact sums over shards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.detection.counts import FarCounts, SparseCounts, TailSamples, Tally
+from mauvecl.detection.detection import Detection
+from mauvecl.detection.requests import DetectRequest, SnrRequest
+from mauvecl.host.content_equality import ContentEquality
+from mauvecl.noise import layout
+from mauvecl.noise.random_numbers import Floats, fma
+from mauvecl.noise.scene import Scene
+from mauvecl.schema.drawable import Drawable
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import Column, table_of
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.host.exposure.expectation import Expectation
+
+#: Bins per standard deviation of an element's S/N, which cover +-8 standard deviations.
+BINS_PER_SIGMA = 128.0
+#: Percentages of the reported quantiles: the median and one, two and three sigma.
+PERCENTAGES = (0.135, 2.5, 16.0, 50.0, 84.0, 97.5, 99.865)
+#: Columns of the tables of pixels and elements.
+COLUMNS = (
+    Column("wavelength", unit="nm", description="vacuum wavelength, the middle of the pixel or element", heading="nm",
+           format=".1f"),
+    Column("expected", description="closed-form S/N of the mean spectrum", heading="closed form", format=".2f"),
+    Column("mean", description="mean S/N of the realisations", heading="mean", format=".2f"),
+    Column("std", description="standard deviation of the S/N of the realisations", heading="std", format=".2f"),
+    *(
+        Column(f"q{percentage:g}", description=f"{percentage:g} % quantile of the realisations",
+               heading=f"{percentage:g} %" if percentage in (2.5, 50.0, 97.5) else "", format=".2f")
+        for percentage in PERCENTAGES
+    ),
+)  # fmt: skip
+#: Columns that the table of pixels has as well.
+CLIPPED_COLUMNS = tuple(
+    Column(f"clipped_{end}", description="share of frames cut off at this end: zero or saturation")
+    for end in ("low", "high")
+)
+
+
+def observers(x: Expectation, scene: Scene) -> NDArray[np.void]:
+    """Return the bias and dark that an observer subtracts, and the noise model, of each pixel.
+
+    Returns
+    -------
+    ndarray of layout.OBSERVER, shape (n_padded,)
+        The sky is subtracted per resolution element.
+    """
+    table = np.zeros(len(scene.pixels), layout.OBSERVER)
+    table["variance"] = 1.0  # padding: 0 / 1
+    real = table[: scene.n_pixel]
+    real["net_offset"] = scene.n_draws * scene.base_dn[0] - x.n_frames * (x.bias_dn + x.dark_dn)
+    real["gain"] = x.gain_dn_per_electron
+    real["variance"] = x.n_frames * (x.read_noise_dn**2 + x.dark_variance_dn2)
+    # The narrowest bins of whole DN that cover +-8 sigma: sigma / 128 to sigma / 64.
+    wanted = 16.0 * np.sqrt(x.variance_dn2) / layout.OBSERVER_BINS
+    real["bin_shift"] = np.ceil(np.log2(np.maximum(wanted, 1.0)))
+    return table
+
+
+def elements(x: Expectation) -> NDArray[np.void]:
+    """Return the resolution elements with bins centred on the closed-form S/N and scaled to its linearised spread.
+
+    Returns
+    -------
+    ndarray of layout.ELEMENT, shape (n_element,)
+    """
+    first = np.searchsorted(x.element, np.arange(x.element_wavelength_nm.size))
+    table = np.zeros(first.size, layout.ELEMENT)
+    table["first"], table["end"] = first, np.append(first[1:], x.element.size)
+    table["sky"] = x.per_element(x.subtracted_dn)
+    signal, light = x.per_element(x.signal_dn), x.per_element(x.recorded_light_dn)
+    shot = x.per_element(x.gain_dn_per_electron * x.recorded_light_dn)
+    noise = np.sqrt(shot + x.per_element(x.n_frames * (x.read_noise_dn**2 + x.dark_variance_dn2)))
+    gain = np.divide(shot, light, out=np.zeros_like(light), where=light > 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slope = 1.0 / noise - signal * gain / (2.0 * noise**3)
+        table["centre"] = np.nan_to_num(signal / noise)
+        # The bins of a noiseless element do not matter.
+        table["bins_per_unit"] = np.nan_to_num(BINS_PER_SIGMA / (np.sqrt(x.per_element(x.variance_dn2)) * slope))
+    return table
+
+
+#: First and last dense bin; bin 0 contains the expected value.
+FIRST_BIN, LAST_BIN = 1 - layout.OBSERVER_BINS // 2, layout.OBSERVER_BINS // 2 - 2
+#: Limit of the absolute value of bin numbers.
+MAX_BIN = 2**31
+
+
+class Counts:
+    """Accumulator of the histograms of all pixels and elements."""
+
+    def __init__(self, n_pixel: int, n_element: int) -> None:
+        # Dense bins; the first and the last stay empty.
+        self.pixel = np.zeros((n_pixel, layout.OBSERVER_BINS), np.int64)
+        self.element = np.zeros((n_element, layout.OBSERVER_BINS), np.int64)
+        # Bins of the same width beyond, with keys that combine the pixel or element and the bin.
+        self.far = {"pixel": SparseCounts(), "element": SparseCounts()}
+        # Frames clipped at zero and at saturation.
+        self.clipped = np.zeros((n_pixel, 2), np.int64)
+        self.n = 0
+
+    def add(
+        self, pixel: NDArray[np.integer], element: NDArray[np.integer], clipped: NDArray[np.integer], n: int
+    ) -> None:
+        """Add the counts of one or more tiles."""
+        inner = slice(1, layout.OBSERVER_BINS - 1)
+        self.pixel[:, inner] += pixel[:, inner]
+        self.element[:, inner] += element[:, inner]
+        self.clipped += clipped
+        self.n += n
+
+    def add_far(
+        self, dn: NDArray[np.integer], observers: NDArray[np.void], elements: NDArray[np.void], asked: NDArray[np.intp]
+    ) -> None:
+        """Count the values outside the dense bins of some elements and their pixels.
+
+        `dn`, shape (n_pixel, n), holds raw DN minus the scene's base. `asked` holds the indices of the elements.
+        """
+        for e in asked:
+            element = elements[e]
+            first, end = int(element["first"]), int(element["end"])
+            for p in range(first, end):
+                self._count_far("pixel", p, dn[p].astype(np.int64) >> int(observers[p]["bin_shift"]))
+            ratio = signal_to_noise(dn[first:end], observers[first:end], element["sky"])
+            steps = np.rint((ratio - element["centre"]) * element["bins_per_unit"])
+            if not (np.abs(steps) < MAX_BIN).all():
+                raise InputError(
+                    f"the S/N of resolution element {e} is {ratio[np.abs(steps).argmax()]:g} in a realisation",
+                    f"something nearer to its closed form of {element['centre']:g}",
+                    key="expectation",
+                    value=float(ratio[np.abs(steps).argmax()]),
+                )
+            self._count_far("element", e, steps.astype(np.int64))
+
+    def _count_far(self, kind: str, which: int, bins: NDArray[np.int64]) -> None:
+        outside = bins[(bins < FIRST_BIN) | (bins > LAST_BIN)]
+        if outside.size:
+            self.far[kind].count(which * (2 * MAX_BIN) + MAX_BIN + outside)
+
+    def outlying(self, kind: str) -> NDArray[np.int64]:
+        """Return the pixels or elements with values outside the dense bins."""
+        return np.unique(self.far[kind].keys // (2 * MAX_BIN))
+
+    def filled(self, kind: str, which: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the filled bins of a pixel or element, ascending, with 0 at the expected value, and their counts."""
+        dense = (self.pixel if kind == "pixel" else self.element)[which]
+        inner = np.flatnonzero(dense)
+        numbers, counts = inner - layout.OBSERVER_BINS // 2, dense[inner]
+        far, offset = self.far[kind], which * (2 * MAX_BIN) + MAX_BIN
+        mine = slice(*np.searchsorted(far.keys, (offset - MAX_BIN, offset + MAX_BIN)))
+        outside = far.keys[mine] - offset
+        below = int(np.count_nonzero(outside < 0))
+        return np.insert(outside, below, numbers), np.insert(far.counts[mine], below, counts)
+
+
+def signal_to_noise(dn: NDArray[np.integer], observers: NDArray[np.void], sky: np.float32) -> Floats:
+    """Compute an element's S/N in the device's order, shape (n,), from DN above the base, shape (n_pixel, n)."""
+    signal, variance = (np.zeros(dn.shape[1], np.float32) for _ in range(2))
+    for n, observer in zip(dn, observers, strict=True):
+        net = n.astype(np.float32) + observer["net_offset"]
+        signal = signal + net
+        variance = variance + fma(np.maximum(net, np.float32(0.0)), observer["gain"], observer["variance"])
+    signal = signal - sky
+    # The ratio is zero if the estimated noise is zero.
+    return np.divide(signal, np.sqrt(variance), out=np.zeros_like(signal), where=variance > 0)
+
+
+@dataclass(frozen=True, eq=False)
+class SnrResult(Drawable, ContentEquality):
+    """Distributions of the S/N over realisations."""
+
+    expectation: Expectation
+    scene: Scene
+    observers: NDArray[np.void]  # layout.OBSERVER, shape (n_padded,)
+    elements: NDArray[np.void]  # layout.ELEMENT, shape (n_element,)
+    counts: Counts
+
+    @property
+    def pixel(self) -> QTable:
+        """S/N per pixel: wavelength, closed form, simulated mean, standard deviation, quantiles, clipped frames.
+
+        The expectation's `signal` defines the signal. The histogram counts whole DN, of which the S/N is a function, in
+        bins of at most 1/64 of a standard deviation.
+        """
+        x, seen = self.expectation, self.observers[: self.scene.n_pixel]
+        width, sky = 2.0 ** seen["bin_shift"].astype(float), x.subtracted_dn
+
+        def snr(which: NDArray[np.intp], place: NDArray[np.number]) -> NDArray[np.float64]:
+            # A bin contains the whole DN from its lower edge up to the next.
+            dn = width[which] * place - 0.5
+            net = dn + seen["net_offset"].astype(float)[which]
+            noise2 = np.maximum(net, 0.0) * seen["gain"][which] + seen["variance"][which]
+            return np.asarray(np.divide(net - sky[which], np.sqrt(noise2), out=np.zeros_like(net), where=noise2 > 0))
+
+        low, high = self.counts.clipped.T / (self.counts.n * x.n_frames)
+        values = self._values("pixel", x.wavelength_nm, x.snr(), snr) | {"clipped_low": low, "clipped_high": high}
+        return self._table((*COLUMNS, *CLIPPED_COLUMNS), values)
+
+    @property
+    def element(self) -> QTable:
+        """S/N per resolution element of 10.5 nm, with the columns of `pixel` except clipped frames."""
+        x = self.expectation
+        step = np.divide(
+            1.0,
+            self.elements["bins_per_unit"],
+            out=np.zeros(len(self.elements)),
+            where=self.elements["bins_per_unit"] > 0,
+        )
+
+        def snr(which: NDArray[np.intp], place: NDArray[np.number]) -> NDArray[np.float64]:
+            return np.asarray(self.elements["centre"][which] + step[which] * (place - 0.5))
+
+        return self._table(COLUMNS, self._values("element", x.element_wavelength_nm, x.snr_per_element(), snr))
+
+    def _line(self) -> str:
+        return f"of {self.expectation.name!r}, {self.counts.n} realisations"
+
+    def _table(self, columns: Iterable[Column], values: Mapping[str, NDArray[np.float64]]) -> QTable:
+        x = self.expectation
+        about = {"exposure_s": x.exposure_s, "name": x.name, "signal": x.signal}
+        return table_of(columns, [values], realisations=self.counts.n, **about)
+
+    def _values(
+        self,
+        kind: str,
+        wavelength_nm: NDArray[np.float64],
+        expected: NDArray[np.float64],
+        snr: Callable[[NDArray[np.intp], NDArray[np.number]], NDArray[np.float64]],
+    ) -> dict[str, NDArray[np.float64]]:
+        """Return the columns of pixels or elements by name; `snr` converts fractional bin numbers to ratios."""
+        counts = self.counts.pixel if kind == "pixel" else self.counts.element
+        numbers, every = (
+            np.arange(layout.OBSERVER_BINS + 1) - layout.OBSERVER_BINS // 2,
+            np.arange(len(counts))[:, None],
+        )
+        centres, edges = snr(every, numbers[:-1] + 0.5), snr(every, numbers)
+        share = counts / self.counts.n
+        mean = np.sum(share * centres, axis=1)
+        std = np.sqrt(np.sum(share * (centres - mean[:, None]) ** 2, axis=1))
+        cumulative = np.concatenate([np.zeros((len(counts), 1)), np.cumsum(counts, axis=1)], axis=1) / self.counts.n
+        outlying = self.counts.outlying(kind)
+        quantiles = np.array([
+            np.zeros(len(PERCENTAGES)) if i in outlying else _quantiles(c, e)
+            for i, (c, e) in enumerate(zip(cumulative, edges, strict=True))
+        ])  # fmt: skip
+        for i in outlying:
+            filled, held = self.counts.filled(kind, i)
+            middle = snr(i, filled + 0.5)
+            mean[i] = held @ middle / self.counts.n
+            std[i] = np.sqrt(held @ (middle - mean[i]) ** 2 / self.counts.n)
+            ends = np.column_stack([snr(i, filled), snr(i, filled + 1)]).ravel()
+            quantiles[i] = np.interp(np.array(PERCENTAGES) / 100, steps_of(held) / self.counts.n, ends)
+        values = {"wavelength": wavelength_nm, "expected": expected, "mean": mean, "std": std}
+        return values | {f"q{percentage:g}": quantiles[:, i] for i, percentage in enumerate(PERCENTAGES)}
+
+
+def _quantiles(cumulative: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the quantiles of a histogram, interpolated linearly within bins."""
+    filled = np.flatnonzero(np.diff(cumulative))
+    span = slice(filled[0], filled[-1] + 2)
+    return np.asarray(np.interp(np.array(PERCENTAGES) / 100, cumulative[span], edges[span]))
+
+
+def steps_of(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the number of realisations below the lower and the upper edge of each bin, alternating, shape (2 m,)."""
+    above = np.cumsum(counts)
+    return np.column_stack([above - counts, above]).ravel()
+
+
+Arrays = dict[str, NDArray[Any]]
+
+
+def pack_detection(tally: Tally, samples: Sequence[TailSamples | None]) -> Arrays:
+    """Pack a shard of a detection as arrays."""
+    shard = _pack_counts("counts", tally.fine.keys, tally.fine.counts)
+    shard["sums"] = np.array([[str(value) for value in row] for row in tally.sums])
+    shard["n"] = np.array(tally.n)
+    for number, far in enumerate(tally.far):
+        beyond = far.frozen()
+        if beyond.n or beyond.undefined:
+            shard |= _pack_counts(f"far-{number}", beyond.keys, beyond.counts)
+            shard[f"far-{number}-sums"] = np.array([str(x) for x in (beyond.first, beyond.second, beyond.undefined)])
+    for number, kept in enumerate(samples):
+        if kept is not None:
+            shard[f"values-{number}"], shard[f"realisations-{number}"] = kept.values, kept.realisations
+    return shard
+
+
+def pack_snr(counts: Counts) -> Arrays:
+    """Pack a shard of an S/N as arrays."""
+    shard = _pack_array("pixel", counts.pixel) | _pack_array("element", counts.element)
+    for name, far in counts.far.items():
+        shard |= _pack_counts(f"far-{name}", far.keys, far.counts)
+    return shard | {"clipped": counts.clipped, "n": np.array(counts.n)}
+
+
+class DetectionSums:
+    """Accumulator of the shards of a detection."""
+
+    def __init__(self, request: DetectRequest) -> None:
+        self._request = request
+        self._sums = [(Tally(plan.grids), plan.tails()) for plan, _ in request.plans]
+
+    def add(self, part: int, shard: Arrays) -> None:
+        """Add a shard of one part."""
+        tally, samples = self._sums[part]
+        sums = np.array([[int(value) for value in row] for row in shard["sums"]], object)
+        tally.merge(*_unpack_counts("counts", shard), sums, int(shard["n"]))
+        for number, far in enumerate(tally.far):
+            if f"far-{number}" in shard:
+                first, second, undefined = (int(value) for value in shard[f"far-{number}-sums"])
+                far.merge(FarCounts(*_unpack_counts(f"far-{number}", shard), first, second, undefined))
+        for number, kept in enumerate(samples):
+            if kept is not None:
+                kept.merge(shard[f"values-{number}"], shard[f"realisations-{number}"])
+
+    def answer(self) -> Detection:
+        """Return the result, once all shards are added."""
+        asked = self._request
+        detection = Detection.of(asked.hypotheses, asked.realisations, asked.tails, asked.seed)
+        for (plan, _), (tally, samples) in zip(asked.plans, self._sums, strict=True):
+            detection.collect(plan, tally, samples)
+        return detection
+
+
+class SnrSums:
+    """Accumulator of the shards of an S/N."""
+
+    def __init__(self, request: SnrRequest) -> None:
+        self._request, self._elements = request, elements(request.expectation)
+        self._counts = Counts(request.scene.n_pixel, len(self._elements))
+
+    def add(self, part: int, shard: Arrays) -> None:
+        """Add a shard."""
+        counts = self._counts
+        pixel, element = (
+            _unpack_array("pixel", shard, counts.pixel.shape),
+            _unpack_array("element", shard, counts.element.shape),
+        )
+        counts.add(pixel, element, shard["clipped"], int(shard["n"]))
+        for name, far in counts.far.items():
+            far.add(*_unpack_counts(f"far-{name}", shard))
+
+    def answer(self) -> SnrResult:
+        """Return the result, once all shards are added."""
+        x, scene = self._request.expectation, self._request.scene
+        return SnrResult(x, scene, observers(x, scene), self._elements, self._counts)
+
+
+def _pack_array(name: str, counts: NDArray[np.int64]) -> Arrays:
+    """Pack the filled bins of an array."""
+    where = np.flatnonzero(counts)
+    return _pack_counts(name, where, counts.ravel()[where])
+
+
+def _pack_counts(name: str, keys: NDArray[np.int64], counts: NDArray[np.int64]) -> Arrays:
+    """Pack counts of ascending keys as differences of keys, in the smallest integer types."""
+    steps = np.diff(keys)
+    return {f"{name}-first": keys[:1], f"{name}-steps": _smallest_type(steps), name: _smallest_type(counts)}
+
+
+def _unpack_counts(name: str, shard: Arrays) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Unpack keys and counts."""
+    first = shard[f"{name}-first"]
+    keys = np.cumsum(np.concatenate([first, shard[f"{name}-steps"].astype(np.int64)]), dtype=np.int64)
+    return keys, shard[name].astype(np.int64)
+
+
+def _smallest_type(values: NDArray[np.int64]) -> NDArray[np.unsignedinteger]:
+    return values.astype(np.min_scalar_type(int(values.max(initial=0))))
+
+
+def _unpack_array(name: str, shard: Arrays, shape: tuple[int, ...]) -> NDArray[np.int64]:
+    counts = np.zeros(int(np.prod(shape)), np.int64)
+    keys, values = _unpack_counts(name, shard)
+    counts[keys] = values
+    return counts.reshape(shape)

@@ -1,0 +1,431 @@
+"""Statistics that are weighted sums: matched filter, ultraviolet excess and user-defined statistics."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.detection.distributions import Form, Gaussian, Mixture, QuadraticForm
+from mauvecl.detection.nuisances import Nuisances, join_names, read_values
+from mauvecl.host.content_equality import ContentEquality
+from mauvecl.noise.comparison import NOISE_FREE, Comparison
+from mauvecl.noise.scene import FactorDistributions, changes_of
+from mauvecl.schema.calls import validated
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
+
+if TYPE_CHECKING:
+    from mauvecl.host.exposure.expectation import Expectation
+
+Float = NDArray[np.float64]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """Common input of the statistics of one detection."""
+
+    quiet: Expectation  # the quiescent star: the reference and the model of the variances
+    used: NDArray[np.bool_]  # pixels that statistics use, shape (n_pixel,)
+    comparison: Comparison = NOISE_FREE  # the subtracted reference and the choice of variances
+    flares: Sequence[Expectation] = ()  # possible templates
+    nuisances: Nuisances | None = None  # parameters that statistics marginalise over
+    drawn: FactorDistributions | None = (
+        None  # random factors over which closed forms of marginalised statistics integrate
+    )
+    _cache: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Keys of the cache hold identities of objects, which are valid in this process only.
+        return vars(self) | {"_cache": {}}
+
+    @property
+    def integrates(self) -> bool:
+        """Whether closed forms integrate over the drawn factors."""
+        return bool(self.nuisances and self.drawn and not self.comparison.exposures)
+
+    def cached(self, name: str, make: Callable[[], T]) -> T:
+        """Cache an expensive intermediate result."""
+        if name not in self._cache:
+            self._cache[name] = make()
+        return cast("T", self._cache[name])
+
+
+@dataclass(frozen=True, eq=False)
+class Tilt:
+    """Directions along which importance sampling shifts or stretches the noise."""
+
+    # Orthonormal in standard deviations of each pixel's difference, dense or sparse, shape (n_direction, n_pixel).
+    directions: Any
+    # Coefficients of squared standard normals along the directions in a quadratic statistic, shape (n_direction,).
+    square: Float | None = None
+    per_sigma: float = 1.0  # change of a linear statistic for one standard deviation along its direction
+
+
+@dataclass(frozen=True, eq=False)
+class DetectionForms:
+    """Distributions of a statistic without and with a flare for Gaussian noise, and its threshold."""
+
+    null: Form
+    flaring: Form
+    threshold: float
+
+    @property
+    def probability(self) -> float:
+        """Detection probability."""
+        return self.flaring.sf(self.threshold)
+
+
+@dataclass(frozen=True, eq=False)
+class Differences:
+    """Distribution of each pixel's difference from the quiescent star."""
+
+    mean: Float  # DN, shape (n_pixel,)
+    variance: Float  # true variance, DN^2, shape (n_pixel,)
+    estimated: bool = False  # whether a statistic divides by the true variances instead of the model's
+    # Standard deviations of normal amplitudes, DN, shape (k, n_pixel); None means the finite priors of the nuisances.
+    scatter: Float | None = None
+
+
+class Statistic(ABC):
+    """A detection statistic without data, so that one object serves every detection.
+
+    The argument `flare` of its methods is the template; statistics that are not `shaped` have none.
+    """
+
+    #: Name in studies, tables and flags.
+    name: str
+    #: Definition for users.
+    definition: ClassVar[str]
+    #: Label of axes in plots.
+    label: ClassVar[str]
+    #: Whether the statistic uses a flare as template, so that each flare has its own null distribution.
+    shaped: ClassVar[bool] = False
+    #: Whether the reference is always one noisy quiescent exposure.
+    paired: ClassVar[bool] = False
+    #: Name of the sum that kernels always compute (`layout.FIXED_STATISTICS`); None if the statistic has weights.
+    kernel_sum: ClassVar[str | None] = None
+    #: Whether the statistic uses sums over resolution elements instead of pixels.
+    by_element: ClassVar[bool] = False
+    #: Whether the statistic can be marginalised over nuisance parameters.
+    marginal: ClassVar[bool] = True
+
+    def added_variance(self, setting: Setting) -> float:
+        """Return the variance of the subtracted reference relative to that of one exposure."""
+        return 1.0 if self.paired else setting.comparison.added_variance
+
+    def variance(self, setting: Setting) -> Float:
+        """Return the variance of each pixel's difference without a flare, DN^2, shape (n_pixel,)."""
+        return np.asarray((1.0 + self.added_variance(setting)) * setting.quiet.variance_dn2)
+
+    def check(self, setting: Setting) -> None:
+        """Raise InputError if the statistic is undefined in this setting."""
+        if setting.nuisances and (setting.comparison.estimated or not self.marginal):
+            why = "with estimated variances" if self.marginal else "which compares with one noisy exposure"
+            raise InputError(
+                f"statistic {self.name!r} {why} cannot be marginalised over {join_names(setting.nuisances.names)}",
+                "no unknowns, or another statistic by the model's variances",
+                key="statistic",
+                value=self.name,
+            )
+
+    def closed_form(self, setting: Setting, observed: Expectation, flare: Expectation | None = None) -> Form:
+        """Return the distribution for Gaussian noise (METHODS section 6).
+
+        `observed` is the quiescent star for the null distribution, else a flare. Estimated variances are replaced by
+        the true ones, which they equal on average. Nuisance parameters scatter as they are drawn, and so do the
+        variances. Parameters that are not drawn scatter by their Gaussian priors, as do all parameters if noisy
+        exposures are subtracted, since these share the factors of a realisation.
+        """
+        delta = np.where(setting.used, observed.recorded_light_dn - setting.quiet.recorded_light_dn, 0.0)
+        true = observed.variance_dn2 + self.added_variance(setting) * setting.quiet.variance_dn2
+        return self.integrate_drawn(setting, observed, Differences(delta, true, setting.comparison.estimated), flare)
+
+    def detection_forms(self, setting: Setting, flare: Expectation, fap: float) -> DetectionForms:
+        """Return the closed forms without and with a flare, and the threshold at a false-alarm probability."""
+        template = flare if self.shaped else None
+
+        def null_and_threshold() -> tuple[Form, float]:
+            null = self.closed_form(setting, setting.quiet, template)
+            return null, null.isf(fap)
+
+        if self.shaped:
+            null, threshold = null_and_threshold()
+        else:
+            null, threshold = setting.cached(f"null of {self.name} at {fap!r}", null_and_threshold)
+        return DetectionForms(null, self.closed_form(setting, flare, template), threshold)
+
+    def integrate_drawn(
+        self,
+        setting: Setting,
+        observed: Expectation,
+        seen: Differences,
+        flare: Expectation | None,
+        *,
+        priors: bool = True,
+    ) -> Form:
+        """Return `form` integrated over those nuisance parameters that are drawn.
+
+        Without `priors`, nuisance parameters that are not drawn do not scatter.
+        """
+        if not setting.integrates:
+            return self.form(setting, seen if priors else replace(seen, scatter=np.zeros((0, seen.mean.size))), flare)
+        assert setting.nuisances
+        assert setting.drawn
+        nodes, rows = setting.drawn.nodes(observed, weighted=isinstance(self, LinearStatistic))
+        # Parameters that are not drawn keep their Gaussian priors.
+        others = setting.nuisances.without(tuple(setting.drawn.spreads))
+        if priors:
+            rows = np.vstack([rows, others.finite(others.spectra)])
+        means, variances = changes_of(observed)
+        amounts = np.array([node.amounts for node in nodes])
+        moved = Differences(seen.mean, seen.variance, scatter=rows)
+        parts = self.moved_forms(setting, moved, amounts, means * setting.used, variances, flare)
+        return parts[0] if len(parts) == 1 else Mixture(tuple(parts), np.array([node.probability for node in nodes]))
+
+    def moved_forms(
+        self,
+        setting: Setting,
+        seen: Differences,
+        amounts: Float,
+        means: Float,
+        variances: Float,
+        flare: Expectation | None,
+    ) -> Sequence[QuadraticForm | Gaussian]:
+        """Return `form` for several amounts of changes of the means and variances.
+
+        `amounts` has the shape (n, k), `means` and `variances` the shape (k, n_pixel).
+        """
+        moved = ((seen.mean + each @ means, seen.variance + each @ variances) for each in amounts)
+        return [self.form(setting, Differences(*one, scatter=seen.scatter), flare) for one in moved]
+
+    @abstractmethod
+    def dof(self, setting: Setting) -> int:
+        """Return the degrees of freedom without a flare."""
+
+    @abstractmethod
+    def form(self, setting: Setting, seen: Differences, flare: Expectation | None = None) -> QuadraticForm | Gaussian:
+        """Return the distribution for Gaussian differences."""
+
+    @abstractmethod
+    def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
+        """Compute the statistic of differences on the host, shape (n,).
+
+        `x` and `variance` are the differences, DN, and the variances by which they are divided, DN^2, both of shape
+        (n, n_pixel).
+        """
+
+    @abstractmethod
+    def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
+        """Return the directions of importance sampling."""
+
+
+class LinearStatistic(Statistic):
+    """A weighted sum of the differences, which is normal for Gaussian noise."""
+
+    #: Whether the weights are scaled to unit variance without a flare.
+    normalised: ClassVar[bool] = True
+
+    @abstractmethod
+    def plain_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
+        """Return the weights per DN without nuisance parameters, shape (n_pixel,); zero for unused pixels."""
+
+    def weights_per_dn(self, setting: Setting, flare: Expectation | None = None) -> Float:
+        """Return the weights per DN, shape (n_pixel,); zero for unused pixels.
+
+        Plain weights w search for the spectrum V w. Marginalised weights are C^-1 V w (generalised least squares),
+        which for the matched filter is C^-1 delta. Raises InputError if the nuisance spectra span V w.
+        """
+        # The cached value holds the flare, so that no other object can get its identity.
+        made = setting.cached(
+            f"weights of {self.name} for {id(flare)}", lambda: (flare, self._weights_per_dn(setting, flare))
+        )
+        return made[1]
+
+    def _weights_per_dn(self, setting: Setting, flare: Expectation | None) -> Float:
+        weights = self.plain_weights(setting, flare)
+        if not setting.nuisances:
+            return weights
+        variance = self.variance(setting) * setting.used
+        sought = variance * weights
+        rows = setting.nuisances.rows(variance, setting.nuisances.spectra * setting.used)
+        left = weights - (rows @ sought) @ rows
+        power = float(left @ sought)
+        if power <= 1e-10 * float(weights @ sought):
+            raise InputError(
+                f"statistic {self.name!r} cannot be distinguished from {join_names(setting.nuisances.names)}",
+                "fewer unknowns or smaller standard deviations",
+                key="statistic",
+                value=self.name,
+            )
+        return np.asarray(left / np.sqrt(power) if self.normalised else left)
+
+    def dof(self, setting: Setting) -> int:
+        return 1
+
+    def form(self, setting: Setting, seen: Differences, flare: Expectation | None = None) -> Gaussian:
+        none = np.zeros((0, seen.mean.size))
+        (found,) = self.moved_forms(setting, seen, np.zeros((1, 0)), none, none, flare)
+        return found
+
+    def moved_forms(
+        self,
+        setting: Setting,
+        seen: Differences,
+        amounts: Float,
+        means: Float,
+        variances: Float,
+        flare: Expectation | None,
+    ) -> Sequence[Gaussian]:
+        # The sums over pixels are linear in the amounts.
+        weights, scatter = self.weights_per_dn(setting, flare), seen.scatter
+        mean = weights @ seen.mean + amounts @ (means @ weights)
+        variance = weights**2 @ seen.variance + amounts @ (variances @ weights**2)
+        if scatter is None and setting.nuisances:
+            scatter = setting.nuisances.finite(setting.nuisances.spectra)
+        if scatter is not None:
+            variance += np.sum((scatter @ weights) ** 2)
+        spread = np.sqrt(variance)
+        if seen.estimated:
+            # In units of its standard deviation.
+            mean, spread = mean / spread, np.ones(mean.size)
+        return [Gaussian(*one) for one in zip(mean.tolist(), spread.tolist(), strict=True)]
+
+    def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
+        weights = self.weights_per_dn(setting, flare)
+        total = x @ weights
+        return np.asarray(total / np.sqrt(variance @ weights**2) if setting.comparison.estimated else total)
+
+    def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
+        along = self.weights_per_dn(setting, flare) * np.sqrt(self.variance(setting))
+        length = float(np.linalg.norm(along))
+        return Tilt((along / length)[None], per_sigma=1.0 if setting.comparison.estimated else length)
+
+
+class QuadraticStatistic(Statistic):
+    """A sum of squares of the differences, a generalised chi-squared variable for Gaussian noise."""
+
+    @abstractmethod
+    def square_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
+        """Return the coefficient of each pixel's squared difference, per DN^2, shape (n_pixel,)."""
+
+    def subtracted_rows(self, setting: Setting) -> Float:
+        """Return the weights per DN of the sums whose squares marginalisation subtracts, shape (k, n_pixel).
+
+        The weights apply to used pixels. They are equal within an element if the statistic is `by_element`.
+        """
+        return np.zeros((0, setting.used.size))
+
+
+#: Range of `uv_excess`, nm.
+UV_NM = (200.0, 360.0)
+
+
+class Matched(LinearStatistic):
+    """Matched filter with weights delta / v / sqrt(lambda), where delta is the flare and lambda = sum delta^2 / v.
+
+    The statistic has unit variance without a flare and mean sqrt(lambda) with it. The variance v of the difference
+    includes that of the subtracted reference.
+    """
+
+    name = "matched"
+    definition: ClassVar[str] = "weighted sum with the flare's own shape as template, in standard deviations"
+    label: ClassVar[str] = "matched filter (standard deviations)"
+    shaped: ClassVar[bool] = True
+
+    def plain_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
+        assert flare is not None
+        delta = np.where(setting.used, flare.recorded_light_dn - setting.quiet.recorded_light_dn, 0.0)
+        variance = self.variance(setting)
+        strength = float(np.sqrt(np.sum(delta**2 / variance)))
+        return np.asarray(delta / variance / (strength or 1.0))
+
+
+class UvExcess(LinearStatistic):
+    """Net counts in the ultraviolet divided by the noise of their sum."""
+
+    name = "uv_excess"
+    definition: ClassVar[str] = f"net counts from {UV_NM[0]:g} to {UV_NM[1]:g} nm, in standard deviations"
+    label: ClassVar[str] = "UV excess (standard deviations)"
+
+    def check(self, setting: Setting) -> None:
+        super().check(setting)
+        if not self._inside(setting).any():
+            raise InputError(
+                f"{setting.quiet.name} has no used pixel at {UV_NM[0]:g}-{UV_NM[1]:g} nm",
+                "used pixels there for the statistic 'uv_excess'",
+                key="statistic",
+                value="uv_excess",
+            )
+
+    def plain_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
+        inside = self._inside(setting)
+        return np.asarray(inside / (np.sqrt(np.sum(self.variance(setting)[inside])) or 1.0))
+
+    def _inside(self, setting: Setting) -> NDArray[np.bool_]:
+        wavelength = setting.quiet.wavelength_nm
+        return np.asarray(setting.used & (wavelength >= UV_NM[0]) & (wavelength <= UV_NM[1]))
+
+
+@validated
+@dataclass(frozen=True, eq=False)
+class Linear(ContentEquality, LinearStatistic):
+    """A user-defined statistic: the sum over pixels of weight times (observed - reference), DN of the exposure.
+
+    Attributes
+    ----------
+    name : str
+    weights : ndarray, shape (n_pixel,)
+        Weights per DN; pixels that saturate in the reference are not used.
+    """
+
+    name: str
+    weights: NDArray[np.float64]
+
+    definition: ClassVar[str] = "user-defined weighted sum"
+    label: ClassVar[str] = ""
+    normalised: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        weights = np.array(self.weights, np.float64)
+        object.__setattr__(self, "weights", weights)
+        if weights.ndim != 1 or not np.isfinite(weights).all() or not weights.any():
+            bad = int((~np.isfinite(weights)).sum())
+            raise InputError(
+                f"statistic {self.name!r} has weights of the shape {weights.shape}, {bad} of them not finite",
+                "one finite value per pixel, not all zero",
+                key="weights",
+                value=weights.shape,
+            )
+
+    def check(self, setting: Setting) -> None:
+        super().check(setting)
+        if self.weights.size != setting.used.size:
+            raise InputError(
+                f"statistic {self.name!r} has {self.weights.size} weights",
+                f"one for each of the {setting.used.size} pixels",
+                key="weights",
+                value=self.weights.size,
+            )
+        if not (self.weights * setting.used).any():
+            raise InputError(
+                f"statistic {self.name!r} weights only saturated pixels", "weights of other pixels", key="weights"
+            )
+
+    def plain_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
+        return np.asarray(self.weights * setting.used)
+
+
+def read_weights(name: str, path: Path, wavelength_nm: NDArray[np.float64]) -> Linear:
+    """Read a linear statistic from a file of wavelengths, nm, and weights per DN.
+
+    Weights are interpolated linearly and are 0 outside the file's range.
+    """
+    what = f"weights {shortened(path.name)} of {shortened(name)}"
+    return Linear(name, read_values(what, "weights", path, wavelength_nm))

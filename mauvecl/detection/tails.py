@@ -1,0 +1,497 @@
+"""Rare false alarms: thresholds by importance sampling, and probabilities of campaigns of many tests.
+
+Thresholds of false-alarm probabilities too small to count, by importance sampling of the engine's noise model.
+
+The normals behind each pixel are drawn from a distribution under which an alarm is common, and each realisation counts
+with the ratio of the two densities (exponential tilting; Siegmund 1976, doi 10.1214/aos/1176343541). Everything after
+the normals (skew of the dark, rounding, clipping, the statistic itself) is the engine's. Drawn unknowns
+follow their priors in one half of the realisations, and their distribution in alarms in the other half.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from mauvecl.detection.distributions import (
+    CONFIDENCE,
+    Form,
+    Interval,
+    Mixture,
+    QuadraticForm,
+    central_counts,
+    clopper_pearson,
+)
+from mauvecl.detection.fap_checks import check_atom
+from mauvecl.detection.statistics import Differences
+from mauvecl.noise import layout
+from mauvecl.noise.scene import quantile_at_score
+from mauvecl.noise.unknowns import ADDITIVE
+from mauvecl.schema.errors import InputError
+
+if TYPE_CHECKING:
+    from mauvecl.detection.requests import Hypotheses
+    from mauvecl.noise.scene import Scene
+
+#: Number of simulated campaigns with overlapping stacks.
+SIMULATIONS = 20_000
+#: Tests per simulated stretch of overlapping stacks; longer campaigns consist of several stretches.
+STRETCH = 4_096
+#: Smallest number of simulated maxima beyond a threshold.
+MIN_BEYOND = 100
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """False alarms of a whole campaign."""
+
+    tests: int
+    fap: float  # of one test
+    expected: float  # expected number of false alarms, for any dependence of the tests
+    at_most: float  # upper limit of the campaign's false-alarm probability (Bonferroni)
+    independent: float  # campaign's false-alarm probability for independent tests
+    overlapping: Interval | None  # the same for a normal statistic of overlapping stacks; None without overlap
+
+
+@dataclass(frozen=True)
+class PerTest:
+    """False-alarm probability of one test that gives a campaign a wanted false-alarm probability."""
+
+    tests: int
+    wanted: float  # probability of any false alarm in the campaign
+    at_least: float  # sufficient for any dependence of the tests (Bonferroni)
+    independent: float  # for independent tests; sufficient too for overlapping stacks of a linear statistic
+    # For a normal statistic of overlapping stacks; None without overlap or with too few simulated maxima beyond.
+    overlapping: Interval | None
+
+
+def per_test(wanted: float, frames: int, stack: int = 1, *, step: int | None = None, seed: int = 1) -> PerTest:
+    """Return the false-alarm probability per test for a wanted one of the campaign; the inverse of `campaign`.
+
+    Parameters
+    ----------
+    wanted : float
+        Probability of any false alarm in the whole campaign.
+    frames, stack, step, seed
+        As for `campaign`.
+
+    Examples
+    --------
+    >>> from mauvecl.detection.tails import campaign, per_test
+    >>> one = per_test(0.01, 17_280)
+    >>> f"{one.at_least:.3g} {one.independent:.3g}"
+    '5.79e-07 5.82e-07'
+    >>> round(campaign(one.independent, 17_280).independent, 6)
+    0.01
+    """
+    step = stack if step is None else step
+    tests = count_tests(frames, stack, step)
+    _check_probability("wanted campaign fap", wanted)
+    overlapping = None
+    if step < stack and tests > 1:
+        stretch = min(tests, STRETCH)
+        share = float(-np.expm1(stretch / tests * np.log1p(-wanted)))
+        if share * SIMULATIONS >= MIN_BEYOND:
+            maxima = np.sort(_maxima(stretch, stack, step, seed)) / np.sqrt(stack)
+            low, high = central_counts(SIMULATIONS, share)
+            counts = (round(share * SIMULATIONS), low, high)
+            overlapping = Interval(*(float(special.ndtr(-maxima[SIMULATIONS - k])) for k in counts))
+    return PerTest(tests, wanted, wanted / tests, float(-np.expm1(np.log1p(-wanted) / tests)), overlapping)
+
+
+def campaign(fap: float, frames: int, stack: int = 1, *, step: int | None = None, seed: int = 1) -> Campaign:
+    """Return the false-alarm probability of a search through consecutive frames.
+
+    Parameters
+    ----------
+    fap : float
+        False-alarm probability of one test.
+    frames : int
+        Number of searched frames; a day of 5 s frames has 17 280.
+    stack : int
+        Frames summed in one test.
+    step : int, optional
+        Frames from one stack to the next. The default is `stack`. Smaller steps make stacks overlap, so that
+        neighbouring tests are correlated by their fraction of common frames.
+    seed : int
+        Seed of the simulation of overlapping stacks.
+
+    Notes
+    -----
+    Sums of frames are nearly normal, so a linear statistic of overlapping stacks is a moving average of independent
+    normals. The probability that its maximum exceeds the threshold is simulated. The correlation of chi-squared
+    statistics is the square of this one, so their probability lies between `overlapping` and `independent`.
+
+    Examples
+    --------
+    >>> from mauvecl.detection.tails import campaign
+    >>> day = campaign(1e-5, 17_280)
+    >>> day.tests, round(day.at_most, 4), round(day.independent, 4)
+    (17280, 0.1728, 0.1587)
+    """
+    step = stack if step is None else step
+    tests = count_tests(frames, stack, step)
+    _check_probability("fap", fap)
+    overlapping = _overlapping(fap, tests, stack, step, seed) if step < stack and tests > 1 else None
+    return Campaign(
+        tests, fap, tests * fap, min(tests * fap, 1.0), float(-np.expm1(tests * np.log1p(-fap))), overlapping
+    )
+
+
+def _check_probability(what: str, value: float) -> None:
+    if not 0.0 < value < 1.0:
+        raise InputError.of(what, value, "a probability between 0 and 1")
+
+
+def count_tests(frames: int, stack: int, step: int) -> int:
+    """Return the number of stacks in a campaign."""
+    if not (1 <= stack <= frames and 1 <= step <= stack):
+        raise InputError(
+            f"a campaign of {frames} frames in stacks of {stack}, {step} apart",
+            "1 <= step <= stack <= frames",
+            key="step",
+            value=(frames, stack, step),
+        )
+    return (frames - stack) // step + 1
+
+
+def _overlapping(fap: float, tests: int, stack: int, step: int, seed: int) -> Interval:
+    """Simulate the probability of an alarm in a stretch, and combine stretches as if they were independent."""
+    stretch = min(tests, STRETCH)
+    cut = -special.ndtri(fap) * np.sqrt(stack)
+    alarms = int((_maxima(stretch, stack, step, seed) >= cut).sum())
+    chance = clopper_pearson(alarms, SIMULATIONS)
+    power = tests / stretch
+    return Interval(
+        *(float(-np.expm1(power * np.log1p(-min(p, 1 - 1e-16)))) for p in (chance.value, chance.low, chance.high))
+    )
+
+
+def _maxima(stretch: int, stack: int, step: int, seed: int) -> NDArray[np.float64]:
+    """Draw the largest sum of normals over a stretch of overlapping stacks, shape (SIMULATIONS,)."""
+    generator = np.random.default_rng(seed)
+    size = (stretch - 1) * step + stack
+    block = max(2**22 // size, 1)
+    parts = []
+    for start in range(0, SIMULATIONS, block):
+        sums = np.cumsum(generator.standard_normal((min(block, SIMULATIONS - start), size)), axis=1)
+        sums = np.pad(sums, ((0, 0), (1, 0)))
+        parts.append((sums[:, stack:] - sums[:, :-stack])[:, ::step].max(axis=1))
+    return np.concatenate(parts)
+
+
+Float = NDArray[np.float64]
+
+#: Initial and largest number of realisations, which is doubled in each step.
+FIRST_REALISATIONS, MAX_REALISATIONS = 8_000, 512_000
+#: Target relative standard error of the false-alarm probability.
+WANTED_ERROR = 0.02
+#: Realisations drawn at once, from one range of counters.
+BLOCK = 500
+#: Second half of the generator's key, which separates these draws from the engine's.
+TAIL_KEY = 0x7461696C
+#: Largest number of averaged quiescent exposures, since each is drawn on the host.
+MAX_AVERAGED = 30
+#: Smallest false-alarm probability for which the polynomial of the draw was tested.
+SMALLEST_FAP = 1e-10
+
+
+@dataclass(frozen=True)
+class Tail:
+    """A threshold from importance sampling."""
+
+    threshold: Interval
+    fap: float
+    relative_error: float  # of the false-alarm probability at the threshold
+    realisations: int  # number of tilted draws
+
+
+def tail(hypotheses: Hypotheses, fap: float, statistic: str, *, template: int = 0, seed: int) -> Tail:
+    """Find the threshold of a small false-alarm probability by importance sampling.
+
+    Parameters
+    ----------
+    hypotheses : Hypotheses
+        Only the scene and the quiescent star are used.
+    fap : float
+        1e-10 to 0.1.
+    statistic : str
+    template : int
+        Index of the flare that ``matched`` uses as template.
+    seed : int
+
+    Raises
+    ------
+    NoThresholdError
+        If no threshold has the probability.
+    InputError
+        If noise is not drawn jointly and in stacks, additive processes are drawn, priors are drawn that the statistics
+        are not marginalised over, more than 30 quiescent exposures are averaged, or the error remains too large.
+    """
+    if not SMALLEST_FAP <= fap <= 0.1:
+        raise InputError.of("fap", fap, f"{SMALLEST_FAP:g} to 0.1 for importance sampling")
+    _check(hypotheses)
+    how = _Tilt.for_alarms(fap, hypotheses, statistic, template)
+    values, logs = np.empty(0), np.empty(0)
+    goal = FIRST_REALISATIONS
+    while True:
+        more = _tilted(hypotheses, statistic, template, how, seed, values.size, goal)
+        values, logs = (np.concatenate(pair) for pair in zip((values, logs), more, strict=True))
+        cut, low, high, error = _threshold(values, logs, fap)
+        beyond, at = _probabilities_at(values, logs, cut)
+        check_atom(f"{statistic} of {hypotheses.quiet.name}", fap, beyond, at)
+        if error <= WANTED_ERROR:
+            return Tail(Interval(cut, low, high), fap, error, values.size)
+        if goal >= MAX_REALISATIONS:
+            raise InputError(
+                f"the threshold of {statistic} at fap = {fap:g} has a relative error of {error:.2g} after {goal}"
+                " tilted draws",
+                f"{WANTED_ERROR:g}",
+                key="fap",
+                value=fap,
+            )
+        goal *= 2
+
+
+def _check(hypotheses: Hypotheses) -> None:
+    scene, setting = hypotheses.scene, hypotheses.setting
+    reasons = {
+        "noise drawn apart": not scene.joint,
+        "frames drawn one by one": scene.frames,
+        **{ADDITIVE[name].label: True for name in scene.additive},
+        "priors that statistics are not marginalised over": bool(scene.modulations) and not setting.integrates,
+        f"{scene.comparison.exposures} averaged exposures": scene.comparison.exposures > MAX_AVERAGED,
+    }
+    for reason, holds in reasons.items():
+        if holds:
+            raise InputError(
+                f"importance sampling with {reason}",
+                f"stacks of joint draws and at most {MAX_AVERAGED} averaged exposures: draw enough realisations",
+                key="tails",
+                value=reason,
+            )
+
+
+def _threshold(values: Float, logs: Float, fap: float) -> tuple[float, float, float, float]:
+    """Return the value with a weighted fraction `fap` at or above, its interval, and the fraction's relative error."""
+    order = np.argsort(-values, kind="stable")
+    ordered, weight = values[order], np.exp(logs[order])
+    above = np.cumsum(weight) / values.size
+    # Variance of the mean weight of the draws that exceed each value.
+    variance = np.maximum(np.cumsum(weight**2) / values.size - above**2, 0.0) / values.size
+    error = np.sqrt(variance)
+    if above[-1] < fap:
+        return float("nan"), float("nan"), float("nan"), float("inf")
+    at = int(np.searchsorted(above, fap))
+    relative = float(error[at] / above[at])
+    # The fraction at the ends differs by its error at the threshold.
+    reach = float(special.ndtri(0.5 + CONFIDENCE / 2)) * relative
+    ends = np.searchsorted(above, (fap * (1.0 + reach), fap * (1.0 - reach)))
+    low, high = (float(ordered[min(int(end), values.size - 1)]) for end in ends)
+    return float(ordered[at]), low, high, relative
+
+
+def _probabilities_at(values: Float, logs: Float, cut: float) -> tuple[float, float]:
+    """Return the probability of values above a threshold, and a lower limit of that of the threshold itself."""
+    weight, n = np.exp(logs), values.size
+    same = weight[values == cut]
+    mean = float(same.sum() / n)
+    error = math.sqrt(max(float(same @ same) / n - mean**2, 0.0) / n)
+    return float(weight[values > cut].sum() / n), mean - 4.0 * error
+
+
+@dataclass(frozen=True, eq=False)
+class _Tilt:
+    """Change of the distribution of draws that makes alarms common: a shift along one direction, or a stretch."""
+
+    # Orthonormal in standard deviations of each pixel's difference, dense or sparse, shape (n_direction, n_pixel).
+    directions: Any
+    stretch: Float  # factor on the spread along each direction, shape (n_direction,)
+    shift: float = 0.0  # along the first direction
+    # Mean and standard deviation of the normal scores of factors on light, sky and dark in alarms.
+    scores: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+    @classmethod
+    def for_alarms(cls, fap: float, hypotheses: Hypotheses, statistic: str, template: int) -> _Tilt:
+        """Choose a tilt that makes alarms of a given probability common."""
+        one, setting, flare = hypotheses.statistic(statistic), hypotheses.setting, hypotheses.shape(statistic, template)
+        tilt = one.tilt(setting, flare)
+        nothing = Differences(np.zeros(setting.used.size), one.variance(setting), setting.comparison.estimated)
+        # Nuisance parameters that are not drawn do not scatter.
+        null = one.integrate_drawn(setting, hypotheses.quiet, nothing, flare, priors=False)
+        goal = null.isf(fap)
+        parts, chance, scores = null.parts if isinstance(null, Mixture) else (null,), np.ones(1), {}
+        if isinstance(null, Mixture):
+            assert setting.drawn
+            # Posterior probability of the factors given an alarm.
+            chance = null.weights * [part.sf(goal) for part in parts]
+            chance = chance / chance.sum()
+            nodes = setting.drawn.nodes(hypotheses.quiet, weighted=tilt.square is None)[0]
+            for name in nodes[0].scores:
+                score = np.array([node.scores[name] for node in nodes])
+                mean = float(chance @ score)
+                scores[name] = mean, max(float(np.sqrt(chance @ (score - mean) ** 2)), 1.0)
+        if tilt.square is None:
+            # Linear statistic: shift the mean along its direction, by the mean in alarms.
+            moves = [_hazard((goal - part.mean) / part.std) for part in parts] if scores else [goal / tilt.per_sigma]
+            return cls(tilt.directions, np.ones(1), float(chance @ moves), scores)
+        if setting.nuisances:
+            # Account for squares that marginalisation subtracts and factors add.
+            goal = float(tilt.square.sum() * (chance @ [_growth(part, goal) for part in parts]))
+        # Quadratic statistic: exponential tilting of each independent square increases the spread.
+        return cls(tilt.directions, _stretch(tilt.square, goal), scores=scores)
+
+    def apply(self, difference: Float) -> tuple[Float, Float]:
+        """Return the change of differences, shape (n, n_pixel), and the logarithms of the draws' weights."""
+        along = difference @ self.directions.T
+        if self.shift:
+            there = along + self.shift
+            return self.shift * self.directions[0], self.shift**2 / 2 - self.shift * there[:, 0]
+        there = along * self.stretch
+        # Ratio of standard normal densities to those of spread `stretch`.
+        logs = np.log(self.stretch).sum() - 0.5 * there**2 @ (1.0 - 1.0 / self.stretch**2)
+        return (there - along) @ self.directions, np.asarray(logs)
+
+
+def _hazard(z: float) -> float:
+    """Return the mean of a standard normal variable given that it exceeds z."""
+    return float(np.exp(-(z**2) / 2 - special.log_ndtr(-z)) / np.sqrt(2 * np.pi))
+
+
+def _growth(form: Form, goal: float) -> float:
+    """Return the factor, at least one, on central squares that makes the mean of a sum of squares equal to `goal`."""
+    assert isinstance(form, QuadraticForm)
+    return max((goal - float(form.weight @ form.shift**2)) / float(form.weight.sum()), 1.0)
+
+
+def _stretch(square: Float, goal: float) -> Float:
+    """Return the spreads of normals whose weighted squares have a sum of mean `goal`."""
+    from scipy.optimize import brentq
+
+    most = float(square.max())
+
+    def excess(x: float) -> float:
+        return float(np.sum(square / (1.0 - x * square / most))) - goal
+
+    x = 0.0 if excess(0.0) >= 0 else float(brentq(excess, 0.0, 1.0 - 1e-12))
+    return np.asarray(1.0 / np.sqrt(1.0 - x * square / most))
+
+
+def _tilted(
+    hypotheses: Hypotheses, statistic: str, template: int, tilt: _Tilt, seed: int, start: int, stop: int
+) -> tuple[Float, Float]:
+    """Return the values of tilted draws `start` to `stop - 1`, whole blocks, and the logarithms of their weights."""
+    parts = [_block(hypotheses, statistic, template, tilt, seed, b) for b in range(start // BLOCK, stop // BLOCK)]
+    values, logs = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return values, logs
+
+
+def _block(
+    hypotheses: Hypotheses, statistic: str, template: int, tilt: _Tilt, seed: int, block: int
+) -> tuple[Float, Float]:
+    scene = hypotheses.scene
+    one = hypotheses.statistic(statistic)
+    exposures = 1 if one.paired else scene.comparison.exposures
+    z, *others = (_normals(scene.n_pixel, seed, block, exposure) for exposure in range(1 + exposures))
+    added = one.added_variance(hypotheses.setting)
+    # Only the difference is tilted; orthogonal combinations remain as drawn.
+    root = np.sqrt(1.0 + added)
+    difference = (z - added * sum(others)) / root
+    move, logs = tilt.apply(difference)
+    if scene.modulations:
+        factors, more = _factors(scene, tilt.scores, seed, block)
+        excess, logs = _responding(scene, z + move / root, factors), logs + more
+    else:
+        excess = _excess(scene, z + move / root)
+    subtracted = [_excess(scene, other - added * move / root) for other in others]
+    mean = added * np.sum(subtracted, axis=0) if subtracted else np.zeros_like(excess)
+    return _value(hypotheses, statistic, template, excess, mean), logs
+
+
+def _value(hypotheses: Hypotheses, statistic: str, template: int, excess: Float, mean: Float) -> Float:
+    """Return the statistic of draws from observed and subtracted counts, DN above the reference, shape (n, n_pixel)."""
+    scene, one = hypotheses.scene, hypotheses.statistic(statistic)
+    x, added = excess - mean, one.added_variance(hypotheses.setting)
+    variance = np.broadcast_to(one.variance(hypotheses.setting), x.shape)
+    if scene.comparison.estimated:
+        variance = _estimated(scene, excess) + added * _estimated(scene, mean)
+    return one.values(hypotheses.setting, x, variance, hypotheses.shape(statistic, template))
+
+
+def _estimated(scene: Scene, excess: Float) -> Float:
+    """Return the variances that an observer estimates, DN^2, shape (n, n_pixel)."""
+    estimate = scene.estimates[0, : scene.n_pixel]
+    net = excess - scene.fraction[0, : scene.n_pixel] + estimate["net_offset"]
+    return np.asarray(np.maximum(net, 0.0) * estimate["gain"] + estimate["variance"])
+
+
+def _normals(n_pixel: int, seed: int, block: int, exposure: int, purpose: int = 0) -> Float:
+    """Return the normals of a block of draws, shape (BLOCK, n_pixel), addressed by counter (Philox4x64, Box-Muller)."""
+    counter = [0, purpose, exposure, block]
+    words = np.random.Philox(key=[seed, TAIL_KEY], counter=counter).random_raw(BLOCK * (n_pixel + 1))
+    uniform = ((words >> np.uint64(11)) + 0.5) * 2.0**-53
+    half = uniform.size // 2
+    radius, angle = np.sqrt(-2.0 * np.log(uniform[:half])), 2.0 * np.pi * uniform[half : 2 * half]
+    both = np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])
+    return np.asarray(both[: BLOCK * n_pixel].reshape(BLOCK, n_pixel))
+
+
+def _factors(
+    scene: Scene, towards: dict[str, tuple[float, float]], seed: int, block: int
+) -> tuple[dict[str, Float], Float]:
+    """Draw factors on light, sky and dark, each minus one, shape (BLOCK, 1), and the logarithms of their weights."""
+    factors = {name: np.ones((BLOCK, 1)) for name in ("light", "sky", "dark")}
+    kinds = [factor for _, factor in scene.modulations]
+    # The scores of every second realisation are moved, which limits weights to two.
+    moved = np.arange(BLOCK)[:, None] % 2 == 1
+    ratio = np.zeros(BLOCK)
+    for row, ((name, factor), table) in enumerate(zip(scene.modulations, scene.priors, strict=True)):
+        score = _normals(scene.n_frames if name == "jitter" else 1, seed, block, row, purpose=1)
+        if name != "jitter" and kinds.count(factor) == 1 and factor in towards:
+            mean, sd = towards[factor]
+            score = np.where(moved, mean + sd * score, score)
+            # Ratio of the moved density to the prior's.
+            ratio += (score[:, 0] ** 2 - ((score[:, 0] - mean) / sd) ** 2) / 2 - np.log(sd)
+        factors[factor] *= 1.0 + quantile_at_score(table, score).mean(axis=1, keepdims=True)
+    return {name: values - 1.0 for name, values in factors.items()}, np.log(2.0) - np.logaddexp(0.0, ratio)
+
+
+def _responding(scene: Scene, z: Float, factors: dict[str, Float]) -> Float:
+    """Return `_excess` with drawn factors, by the expansion of `analogue` in kernels/detector.cl.mako."""
+    n = scene.n_pixel
+    r = {name: scene.responses[name][0, :n].astype(np.float64) for name in scene.responses.dtype.names or ()}
+    sky = factors["sky"] * r["sky_share"]
+    more, warmer = factors["light"] + sky + factors["light"] * sky, factors["dark"]
+    light, dark = more + 1.0, warmer + 1.0
+    variance = light * r["light_variance"] + dark * r["dark_variance"] + r["other_variance"]
+    third, fourth, fifth = (light * r[f"light_{k}"] + dark * r[f"dark_{k}"] for k in ("third", "fourth", "fifth"))
+    sd, skew = np.sqrt(variance), third / variance
+    v = z * sd + skew * (z**2 - 1) / 6 + (fourth * (z**3 - 3 * z) / 24 - third * skew * (2 * z**3 - 5 * z) / 36) / sd**3
+    if scene.quartic:
+        even = fifth * (z**4 - 6 * z**2 + 3) / 120 - skew * fourth * (z**4 - 5 * z**2 + 2) / 24
+        v += (even + skew**2 * third * (12 * z**4 - 53 * z**2 + 17) / 324) / variance**2
+    return _digitised(scene, v + scene.levels["c0"][0, :n] + more * r["light"] + warmer * r["dark"])
+
+
+def _excess(scene: Scene, z: Float) -> Float:
+    """Return the observed counts minus the reference, DN, for the quiescent scenario."""
+    n = scene.n_pixel
+    level = scene.levels[0, :n]
+    drawn = level["c4"].astype(np.float64) if scene.quartic else np.zeros(n)
+    for name in ("c3", "c2", "c1", "c0"):
+        drawn = drawn * z + level[name]
+    return _digitised(scene, drawn)
+
+
+def _digitised(scene: Scene, drawn: Float) -> Float:
+    """Digitise counts above the base and subtract the reference."""
+    n, edge = scene.n_pixel, scene.edges[0, : scene.n_pixel]
+    counts = np.rint(drawn)
+    if scene.clip:
+        counts = np.clip(counts, edge["low"] - layout.MAGIC, edge["high"] - layout.MAGIC)
+    return np.asarray(counts + edge["whole"] + scene.fraction[0, :n])

@@ -1,0 +1,1 @@
+"""Fits of flares to spectra and their sums, by profile likelihoods."""

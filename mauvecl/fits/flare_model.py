@@ -1,0 +1,779 @@
+"""Model of the light that a flare adds to a frame, and the weighted sums that are sufficient for its fits.
+
+Model of the light that a flare adds to a frame: its temperature, and amplitudes in which it is linear.
+
+A model is a blackbody, whose spectrum depends on one temperature, and components of fixed shape next to it: a Balmer
+continuum, and emission lines. Everything but the temperature is linear, so that a fit searches in one dimension.
+
+Unknown factor on all light of an exposure, which dims a flare as it dims the star.
+
+A fit of weighted sums finds the flare as it is recorded. Quantities of the flare itself are those of the recorded one
+over the factor, so that their profile intervals at a given temperature are those of a ratio of two normal estimates
+(Fieller 1954, doi 10.1111/j.2517-6161.1954.tb00159.x).
+
+Reduction of frames to a few weighted sums that are sufficient for fits of flares.
+
+The whitened spectra of flares of all temperatures span about seven directions to one part in 10^9. A fit needs only the
+sums along these directions, and chi-squared of the residual. The weights marginalise over unknown amplitudes of known
+spectra (generalised least squares).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from mauvecl.detection.nuisances import Nuisances, join_names
+from mauvecl.detection.statistics import Linear
+from mauvecl.host.exposure.response import Order, response_matrix
+from mauvecl.host.stars.bands import photons
+from mauvecl.host.stars.blackbody import blackbody
+from mauvecl.host.stars.flare_spectra import (
+    BALMER_EDGE_NM,
+    ELECTRON_TEMPERATURE_K,
+    PARSEC_CM,
+    STEFAN_BOLTZMANN,
+    SUN_CM,
+    BalmerFlare,
+    EmissionLine,
+    balmer_continuum,
+)
+from mauvecl.schema.calls import validated
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import range_of
+from mauvecl.schema.physical import Distance, Radius, Temperature, Wavelength
+
+if TYPE_CHECKING:
+    from mauvecl.host.exposure.expectation import Expectation
+    from mauvecl.host.instrument.instrument import Instrument
+    from mauvecl.host.stars.source import Source
+
+Float = NDArray[np.float64]
+
+#: Range of fitted temperatures, K: that of flares, without cool ones that emit no ultraviolet light.
+TEMPERATURES_K = (3_000.0, float(range_of(Temperature).high))
+#: Number of temperatures at which spectra are computed, evenly spaced in log T; splines interpolate between them.
+NODES = 225
+#: Grid of the spectra, nm: it exceeds the instrument's range by the line spread, with steps far below the resolution.
+GRID_NM = np.linspace(170.0, 760.0, 2361)
+#: Bands in which light is reported by default, nm.
+BANDS_NM = ((200.0, 320.0), (200.0, 700.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Derived:
+    """Quantity that follows from temperature and amplitudes."""
+
+    name: str
+    unit: str
+    description: str
+    # Shape (n_node, n_linear); the quantity is the sum of these times the amplitudes; None for the
+    # temperature and for a ratio.
+    factors: Float | None = None
+    # Shape (n_node,); the quantity is `offset` plus amplitude 1 over amplitude 0 times this.
+    ratio: Float | None = None
+    offset: float = 1.0
+
+    @property
+    def bound(self) -> float:
+        """Smallest value, for amplitudes of zero."""
+        return self.offset if self.ratio is not None else 0.0 if self.factors is not None else -np.inf
+
+
+@validated
+@dataclass(frozen=True, eq=False)
+class FlareModel:
+    """Mean counts that a flare adds to an exposure.
+
+    Attributes
+    ----------
+    log_k : ndarray, shape (n_node,)
+        Natural logarithms of temperatures, ascending and evenly spaced.
+    hot : ndarray, shape (n_node, n_pixel)
+        DN of the exposure for a blackbody of amplitude 1.
+    fixed : ndarray, shape (n_linear - 1, n_pixel)
+        DN of the exposure for the other components: a Balmer continuum of 1 erg s-1 cm-2 A-1 at its edge, and lines of
+        1 erg s-1 cm-2.
+    linear : tuple of str
+        Names of the amplitudes, the blackbody's first.
+    derived : tuple of Derived
+        Quantities that fits report, the temperature first.
+    """
+
+    log_k: Float
+    hot: Float
+    fixed: Float
+    linear: tuple[str, ...]
+    derived: tuple[Derived, ...]
+
+    @classmethod
+    def of(
+        cls,
+        star: Source,
+        instrument: Instrument,
+        quiet: Expectation,
+        *,
+        jump: bool = False,
+        lines: Sequence[str] = (),
+        band: str = "Kepler",
+        electron_temperature_k: Temperature = ELECTRON_TEMPERATURE_K,
+        distance_pc: Distance | None = None,
+        radius_rsun: Radius | None = None,
+        bands_nm: Sequence[tuple[Wavelength, Wavelength]] = BANDS_NM,
+        order: Order = "paper",
+    ) -> Self:
+        """Build the model of a blackbody at a star, optionally with a Balmer continuum and lines.
+
+        Parameters
+        ----------
+        star : Source
+            The quiescent star at its magnitude.
+        instrument : Instrument
+        quiet : Expectation
+            One exposure of the quiescent star.
+        jump : bool
+            Whether a Balmer jump is fitted.
+        lines : sequence of str
+            Lines whose fluxes are fitted; names as in `FlareWithLines`, or vacuum wavelengths in nm.
+        band : str
+            Band in which the amplitude is the relative rise of the photons.
+        electron_temperature_k : float
+            Electron temperature of the Balmer continuum.
+        distance_pc, radius_rsun : float, optional
+            Distance and radius of the star. Areas, luminosities and energies require the distance, the filling factor
+            both. Isotropic emission is assumed.
+        bands_nm : sequence of tuple
+            Wavelength ranges in which the light is reported.
+        order : {"paper", "physical"}
+            As in `expect`.
+
+        Raises
+        ------
+        InputError
+            For an unknown name, an impossible value, or a spectrum that does not cover the band.
+        """
+        chosen = [EmissionLine.named(name) for name in lines]
+        for low, high in bands_nm:
+            if not GRID_NM[0] <= low < high <= GRID_NM[-1]:
+                raise InputError.of(
+                    "bands_nm", (low, high), f"ascending wavelengths within {GRID_NM[0]:g}-{GRID_NM[-1]:g}"
+                )
+        kelvin = np.geomspace(*TEMPERATURES_K, NODES)
+        edge = BalmerFlare().nodes_nm
+        ends = np.ravel(bands_nm)
+        grid = np.unique(np.concatenate([GRID_NM, edge, ends, *(line.nodes_nm for line in chosen)]))
+        bodies = np.array([blackbody(grid, float(k)) for k in kelvin])
+        nm = star.wavelength_nm
+        light = photons(nm, star.flux_flam, band)
+        if not light > 0.0:
+            raise InputError(
+                f"the star has no light in the band {band}", "a star with light in the band", key="band", value=band
+            )
+        # Ratio of the flux at the telescope to that at the flare's surface, for an amplitude of one.
+        scale = np.array([light / photons(nm, blackbody(nm, float(k)), band) for k in kelvin])
+        extra = ([balmer_continuum(grid, electron_temperature_k)] if jump else []) + [
+            one.profile(grid) for one in chosen
+        ]
+        names = ("amplitude", *(["balmer"] if jump else []), *(f"line {one.name}" for one in chosen))
+        matrix = response_matrix(instrument, grid, order)
+        dn = quiet.exposure_s * instrument.per_pixel("response", 1.0) * quiet.gain_dn_per_electron
+        fluxes = np.vstack([scale[:, None] * bodies, *extra]) if extra else scale[:, None] * bodies
+        counts = np.asarray((matrix @ fluxes.T).T) * dn
+        # Flux of each component in each range, and over all wavelengths, for an amplitude of one.
+        parts = np.array([_between(grid, fluxes, low, high) for low, high in bands_nm]).reshape(-1, len(fluxes))
+        balmer = BalmerFlare(10_000.0, 2.0, electron_temperature_k)
+        whole = [(balmer.bolometric_flux() - STEFAN_BOLTZMANN * 1e16) / float(balmer.edge_flux)] if jump else []
+        every = np.concatenate([scale * STEFAN_BOLTZMANN * kelvin**4, whole, np.ones(len(chosen))])
+        derived = _derived(
+            kelvin, scale, names, parts, every, list(bands_nm), quiet.exposure_s, distance_pc, radius_rsun
+        )
+        log_k = np.log(kelvin)
+        while np.exp(log_k[-1]) > TEMPERATURES_K[1]:
+            # The exponential of the last node is a temperature that is accepted.
+            log_k[-1] = np.nextafter(log_k[-1], 0.0)
+        return cls(log_k, counts[:NODES], counts[NODES:], names, derived)
+
+    def stacked(self, n: int, light: float = 1.0) -> Self:
+        """Return the model of exposures that are n times as long, with a known factor on all light.
+
+        Parameters
+        ----------
+        n : int
+        light : float
+            Mean share of the flare's light that reaches the detector.
+        """
+        derived = tuple(
+            replace(one, factors=n * one.factors) if one.name.startswith("energy") and one.factors is not None else one
+            for one in self.derived
+        )
+        return replace(self, hot=n * light * self.hot, fixed=n * light * self.fixed, derived=derived)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the reported quantities."""
+        return tuple(one.name for one in self.derived)
+
+    @property
+    def bounds(self) -> tuple[float, ...]:
+        """Smallest possible values of the reported quantities."""
+        return tuple(one.bound for one in self.derived)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the reported quantities."""
+        return tuple(one.unit for one in self.derived)
+
+    @cached_property
+    def hot_spline(self) -> scipy.interpolate.CubicSpline:
+        """Counts of the blackbody over log temperature."""
+        return scipy.interpolate.CubicSpline(self.log_k, self.hot)
+
+    @cached_property
+    def splines(self) -> tuple[scipy.interpolate.CubicSpline | None, ...]:
+        """Splines over log temperature from which derived quantities are computed."""
+        values = [one.factors if one.ratio is None else one.ratio for one in self.derived]
+        return tuple(None if value is None else scipy.interpolate.CubicSpline(self.log_k, value) for value in values)
+
+    @cached_property
+    def multiples(self) -> tuple[tuple[int, float], ...]:
+        """For each derived quantity, the first one that it is a constant multiple of, maybe itself, and the multiple.
+
+        A luminosity is a multiple of a flux, so that their intervals are computed once.
+        """
+        found: list[tuple[int, float]] = []
+        for k, one in enumerate(self.derived):
+            found.append((k, 1.0))
+            for first, other in enumerate(self.derived[:k]):
+                if one.factors is None or other.factors is None or found[first][0] != first:
+                    continue
+                times = float(np.sum(one.factors * other.factors) / np.sum(other.factors**2))
+                if times > 0.0 and np.allclose(one.factors, times * other.factors, rtol=1e-12, atol=0.0):
+                    found[k] = first, times
+        return tuple(found)
+
+    @cached_property
+    def sums(self) -> tuple[NDArray[np.bool_], scipy.interpolate.CubicSpline]:
+        """Which derived quantities are sums of amplitudes, and the spline of their factors, (n_sums, n_linear)."""
+        factors = [one.factors for one in self.derived]
+        which = np.array([one is not None for one in factors])
+        stacked = np.stack([one for one in factors if one is not None], axis=1)
+        return which, scipy.interpolate.CubicSpline(self.log_k, stacked)
+
+    def counts(self, temperature_k: Temperature, amplitudes: Sequence[float] | Float) -> Float:
+        """Return the mean DN that a flare adds to each pixel of the exposure, shape (n_pixel,)."""
+        linear = self._checked(temperature_k, amplitudes)
+        return np.asarray(linear[0] * self.hot_spline(np.log(temperature_k)) + linear[1:] @ self.fixed)
+
+    def values(self, temperature_k: Temperature, amplitudes: Sequence[float] | Float) -> dict[str, float]:
+        """Return the reported quantities of a flare, by name."""
+        linear = self._checked(temperature_k, amplitudes)
+        values = derived_values(self, np.array([np.log(temperature_k)]), linear[None])[0]
+        return dict(zip(self.names, values.tolist(), strict=True))
+
+    def amplitudes(
+        self, temperature_k: Temperature, amplitude: float, *, jump: float = 1.0, lines: Sequence[float] = ()
+    ) -> Float:
+        """Return the model's amplitudes, shape (n_linear,), for a Balmer jump ratio and line fluxes, erg s-1 cm-2."""
+        ratio = next(
+            (spline for spline, one in zip(self.splines, self.derived, strict=True) if one.ratio is not None), None
+        )
+        if ratio is None and jump != 1.0:
+            raise InputError(f"jump = {jump:g} of a model without a Balmer continuum", "1", key="jump", value=jump)
+        own = [] if ratio is None else [(jump - 1.0) * amplitude / float(ratio(np.log(temperature_k)))]
+        given = np.array([amplitude, *own, *lines], np.float64)
+        return self._checked(temperature_k, given)
+
+    def _checked(self, temperature_k: float, amplitudes: Sequence[float] | Float) -> Float:
+        low, high = np.exp(self.log_k[[0, -1]])
+        if not low * (1 - 1e-9) <= temperature_k <= high * (1 + 1e-9):
+            raise InputError.of("temperature_k", temperature_k, f"{low:g} to {high:g}")
+        linear = np.asarray(amplitudes, np.float64)
+        if linear.shape != (len(self.linear),) or not np.isfinite(linear).all():
+            raise InputError(
+                f"amplitudes of the shape {linear.shape}",
+                f"finite ones of {', '.join(self.linear)}",
+                key="amplitudes",
+                value=linear.shape,
+            )
+        return linear
+
+
+def derived_values(model: FlareModel, log_k: Float, linear: Float) -> Float:
+    """Return the reported quantities, shape (n, n_derived), of temperatures (n,) and amplitudes (n, n_linear)."""
+    values = np.empty((log_k.size, len(model.derived)))
+    which, spline = model.sums
+    values[:, which] = np.einsum("nql,nl->nq", spline(log_k), linear)
+    for q in np.flatnonzero(~which):
+        one, ratio = model.derived[q], model.splines[q]
+        values[:, q] = np.exp(log_k)
+        if ratio is not None:
+            positive = linear[:, 0] > 0.0
+            over = np.divide(linear[:, 1], linear[:, 0], out=np.full(log_k.size, np.nan), where=positive)
+            values[:, q] = one.offset + ratio(log_k) * over
+    return values
+
+
+def _between(grid: Float, fluxes: Float, low: float, high: float) -> Float:
+    inside = (grid >= low) & (grid <= high)
+    return np.asarray(10.0 * np.trapezoid(fluxes[:, inside], grid[inside], axis=1))
+
+
+def _derived(
+    kelvin: Float,
+    scale: Float,
+    names: tuple[str, ...],
+    parts: Float,
+    every: Float,
+    bands_nm: list[tuple[float, float]],
+    exposure_s: float,
+    distance_pc: float | None,
+    radius_rsun: float | None,
+) -> tuple[Derived, ...]:
+    """Return the quantities of a model; `parts` and `every` hold fluxes per amplitude, those of blackbodies first."""
+    n, m = kelvin.size, len(names)
+
+    def summed(fluxes: Float) -> Float:
+        return np.column_stack([fluxes[:n], np.tile(fluxes[n:], (n, 1))])
+
+    def single(column: int, values: Float | float) -> Float:
+        factors = np.zeros((n, m))
+        factors[:, column] = values
+        return factors
+
+    derived = [Derived("temperature", "K", "temperature of the flare's blackbody")]
+    derived.append(Derived("amplitude", "", "relative rise of the band's photons by the blackbody", single(0, 1.0)))
+    if "balmer" in names:
+        edge = np.array([float(blackbody(np.array([BALMER_EDGE_NM]), float(k))[0]) for k in kelvin])
+        derived.append(
+            Derived("jump", "", "flux just below the Balmer edge over that just above", ratio=1.0 / (scale * edge))
+        )
+    for column, name in enumerate(names):
+        if name.startswith("line "):
+            what = f"flux of the line {name[5:]} at the telescope"
+            derived.append(Derived(name, "erg / (cm2 s)", what, single(column, 1.0)))
+    light = [(f"{low:g}-{high:g} nm", flux) for (low, high), flux in zip(bands_nm, parts, strict=True)]
+    light.append(("bolometric", every))
+    for where, flux in light:
+        derived.append(Derived(f"flux {where}", "erg / (cm2 s)", f"flux at the telescope, {where}", summed(flux)))
+    if distance_pc is not None:
+        far = distance_pc * PARSEC_CM
+        area = single(0, np.pi * far**2 * scale)
+        derived.append(Derived("area", "cm2", "projected area of the blackbody", area))
+        if radius_rsun is not None:
+            share = area / (np.pi * (radius_rsun * SUN_CM) ** 2)
+            derived.append(Derived("filling factor", "", "share of the star's disc that the blackbody covers", share))
+        for where, flux in light:
+            total = summed(flux) * 4 * np.pi * far**2
+            derived.append(Derived(f"luminosity {where}", "erg / s", f"luminosity, {where}", total))
+            energy = total * exposure_s
+            derived.append(Derived(f"energy {where}", "erg", f"energy within the exposure, {where}", energy))
+    return tuple(derived)
+
+
+#: Shares of a prior in the variance of a ratio at which thresholds are computed, and steps of their bisection.
+SHARES, HALVINGS = np.linspace(0.0, 1.0, 65), 40
+
+
+@lru_cache(maxsize=16)
+def _thresholds(prior: bytes, allowed: float) -> Float:
+    """Return squared thresholds at `SHARES` that deviations exceed as often as normal ones exceed `allowed`."""
+    deviation, weight = np.frombuffer(prior).reshape(2, -1)
+    # A small normal part keeps the distribution continuous.
+    normal = np.sqrt(np.maximum(1.0 - SHARES, 1e-4))[:, None]
+    moved = np.sqrt(SHARES)[:, None] * deviation
+    level = 2.0 * scipy.special.ndtr(np.sqrt(allowed)) - 1.0
+    low, high = np.zeros(SHARES.size), np.full(SHARES.size, 10.0)
+    for _ in range(HALVINGS):
+        middle = ((low + high) / 2.0)[:, None]
+        inside = scipy.special.ndtr((middle - moved) / normal) - scipy.special.ndtr((-middle - moved) / normal)
+        enough = inside @ weight >= level
+        low, high = np.where(enough, low, middle[:, 0]), np.where(enough, middle[:, 0], high)
+    return np.asarray(((low + high) / 2.0) ** 2)
+
+
+@dataclass(frozen=True, eq=False)
+class LightFactor:
+    """Weighted sum of an exposure that estimates the factor on its light, and its means for the flares of a model.
+
+    Attributes
+    ----------
+    weights : ndarray, shape (n_pixel,)
+        Weights per DN; the sum has unit variance if the flare is known.
+    scale : float
+        Change of the sum for a change of the factor by one.
+    expected : float
+        Factor for which the mean of the sum is zero without a flare.
+    log_k, hot : ndarray, shape (n_node,)
+        Temperatures of the model, and mean sums for a blackbody of amplitude 1.
+    fixed : ndarray, shape (n_linear - 1,)
+        Mean sums of the other components for unit amplitude.
+    prior_share : float
+        Share of the prior in the information on the factor if the flare is known.
+    prior : ndarray, shape (2, n)
+        Deviations of the prior in standard deviations, and their probabilities; empty if it is normal.
+    """
+
+    weights: Float
+    scale: float
+    expected: float
+    log_k: Float
+    hot: Float
+    fixed: Float
+    prior_share: float
+    prior: Float
+
+    @cached_property
+    def spline(self) -> scipy.interpolate.CubicSpline:
+        """Mean sum of the blackbody over log temperature."""
+        return scipy.interpolate.CubicSpline(self.log_k, self.hot)
+
+    def with_second(self, log_k: float, end: int) -> Self:
+        """Return the factor next to a blackbody of a second temperature, as another component of fixed shape."""
+        fixed = np.concatenate([[float(self.spline(log_k))], self.fixed])
+        return replace(self, log_k=self.log_k[:end], hot=self.hot[:end], fixed=fixed)
+
+    def change(self, value: Float, factor: Float, width: Float, allowed: float) -> Float:
+        """Return how far the thresholds of quantities are from `allowed`, since the prior is not normal, shape (n,).
+
+        The part of a quantity's scatter that comes from the prior has the distribution of the prior.
+
+        Parameters
+        ----------
+        value, factor : ndarray, shape (n,)
+            Quantity, and the best factor on light.
+        width : ndarray, shape (n,)
+            Width of the quantity's interval for a rise of chi-squared by `allowed`.
+        """
+        share = np.zeros_like(value)
+        known = np.isfinite(value) & np.isfinite(width) & (width > 0.0) & (factor > 0.0)
+        by_prior = value[known] * np.sqrt(self.prior_share) / (self.scale * factor[known])
+        share[known] = np.clip(4.0 * allowed * (by_prior / width[known]) ** 2, 0.0, 1.0)
+        return np.asarray(np.interp(share, SHARES, _thresholds(self.prior.tobytes(), allowed)) - allowed)
+
+    def estimate(self, sums: Float, log_k: Float, linear: Float) -> Float:
+        """Return the best factor, (n, ...), for sums (n,), temperatures (n, ...) and amplitudes (n, ..., n_linear)."""
+        flare = linear[..., 0] * self.spline(log_k) + linear[..., 1:] @ self.fixed
+        own = sums.reshape(sums.shape + (1,) * (log_k.ndim - 1))
+        return np.asarray(self.expected + (own - flare) / self.scale)
+
+    def weights_of(self, log_k: Float) -> Float:
+        """Return the decrease of the best factor per unit of each amplitude, shape (..., n_linear)."""
+        hot = self.spline(log_k)[..., None]
+        return np.asarray(np.concatenate([hot, np.broadcast_to(self.fixed, (*log_k.shape, self.fixed.size))], -1)
+                          / self.scale)  # fmt: skip
+
+
+def undimmed(values: Float, factor: Float) -> Float:
+    """Return light (n, k) over the factor by which it was dimmed, (n,); infinite where the factor is not above zero."""
+    lost = (factor <= 0.0)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(
+            np.where(values == 0.0, 0.0, np.where(lost, np.copysign(np.inf, values), values / factor[:, None]))
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Ratio:
+    """Ratio of two normal estimates, such as a flux as it is recorded and the factor on the light."""
+
+    top: Float
+    bottom: Float
+    # Variances of both, and their covariance.
+    top_variance: Float
+    bottom_variance: Float
+    covariance: Float
+
+    @property
+    def value(self) -> Float:
+        """Ratio of the estimates; that of a bottom of at most zero is undefined."""
+        return np.divide(self.top, self.bottom, out=np.full_like(self.top, np.nan), where=self.bottom > 0.0)
+
+    def variance_at(self, ratio: Float) -> Float:
+        """Return the variance of top - ratio x bottom."""
+        return self.top_variance - 2.0 * ratio * self.covariance + ratio**2 * self.bottom_variance
+
+    def end(self, left: Float, sign: float) -> Float:
+        """Return the end of the set of ratios that raise chi-squared by at most `left`, with a positive bottom.
+
+        The end is infinite if the bottom may be zero, and of the other sign, no end, if it cannot be positive.
+        """
+        left = np.maximum(left, 0.0)
+        a = self.bottom**2 - left * self.bottom_variance
+        b = self.top * self.bottom - left * self.covariance
+        c = self.top**2 - left * self.top_variance
+        root = np.sqrt(np.maximum(b**2 - a * c, 0.0))
+        positive = self.bottom > 0.0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            closed = (b + sign * root) / a
+            # Where the bottom may be zero, the ratio ends only on the side of zero, if the top is not zero.
+            open_end = np.where((c > 0.0) & (sign * self.top < 0.0), c / (b - sign * root), sign * np.inf)
+        return np.asarray(np.where(a > 0.0, np.where(positive, closed, -sign * np.inf), open_end))
+
+
+Ranges = Sequence[tuple[float, float]]
+
+#: The spectra of every `EVERY`-th node of the model span the directions.
+EVERY = 4
+#: Directions with eigenvalues below this share of the largest are due to rounding.
+LEAST = 1e-11
+#: Pixels within this many standard deviations of saturation in a frame are not used.
+NEAR_SIGMA = 5.0
+#: Number of frames per block, small enough for a processor's cache.
+FRAMES_AT_ONCE = 64
+#: Smallest share of S/N^2 that must remain after marginalisation over the unknowns.
+LEAST_KEPT = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class MeanSums:
+    """Response of weighted sums with unit covariance to the flares of a model."""
+
+    hot: Float  # shape (n_node, n_sum); mean sums for a blackbody of amplitude 1, at each of the model's temperatures
+    fixed: Float  # shape (n_linear - 1, n_sum); mean sums of the other components for unit amplitude
+    log_k: Float  # shape (n_node,); evenly spaced, to a few percent of a step
+    light: LightFactor | None = field(default=None, kw_only=True)  # factor on all light, if it is unknown
+
+    @cached_property
+    def basis(self) -> tuple[Float, Float]:
+        """Orthonormal directions of the fixed components, (n_linear - 1, n_sum), and their inverted triangle."""
+        if not len(self.fixed):
+            return np.zeros((0, self.hot.shape[1])), np.zeros((0, 0))
+        q, r = np.linalg.qr(self.fixed.T)
+        return q.T, np.linalg.inv(r)
+
+    @cached_property
+    def directions(self) -> tuple[Float, Float]:
+        """Unit vectors of blackbodies less their projections on the fixed components, and their cubics over log_k.
+
+        Shapes (n_node, n_sum) and, of the spline's coefficients, (n_node - 1, 4, n_sum).
+        """
+        basis, _ = self.basis
+        free = self.hot - (self.hot @ basis.T) @ basis
+        units = free / np.linalg.norm(free, axis=1)[:, None]
+        return units, np.moveaxis(scipy.interpolate.CubicSpline(self.log_k, units).c, 0, 1).copy()
+
+    @cached_property
+    def spline(self) -> scipy.interpolate.CubicSpline:
+        """Sums of the blackbody over log temperature."""
+        return scipy.interpolate.CubicSpline(self.log_k, self.hot)
+
+
+@dataclass(frozen=True, eq=False)
+class Reduction(MeanSums):
+    """Weights of sums, and the mean sums of a model's flares.
+
+    Attributes
+    ----------
+    variance : ndarray, shape (n_pixel,)
+        Variance of the exposure, zero in pixels that are not used.
+    weights : ndarray, shape (n_sum, n_pixel)
+        Weights per DN, for which the sums have unit covariance.
+    rows : ndarray, shape (k, n_pixel)
+        Weights of the sums whose squares marginalisation subtracts from chi-squared.
+    n_free : int
+        Number of unknowns that are projected out.
+    """
+
+    variance: Float
+    weights: Float
+    rows: Float
+    n_free: int
+
+    @classmethod
+    def of(
+        cls,
+        model: FlareModel,
+        quiet: Expectation,
+        added_dn: Float | None = None,
+        nuisances: Nuisances | None = None,
+        skipped_nm: Ranges = (),
+        *,
+        highest_dn: Float | None = None,
+        clipped: NDArray[np.bool_] | None = None,
+    ) -> Self:
+        """Compute the reduction for exposures with the variance of a given flare.
+
+        Raises InputError if too few pixels can be used, or the flare is degenerate with the unknowns.
+
+        Parameters
+        ----------
+        added_dn : ndarray, shape (n_pixel,), optional
+            Mean DN of the flare as it is recorded; none by default.
+        skipped_nm : sequence of tuple
+            Wavelength ranges of pixels that are not used, in addition to saturated ones.
+        highest_dn : ndarray, shape (n_pixel,), optional
+            Largest mean DN of the flares of the exposures, which decides on saturation; `added_dn` by default.
+        clipped : ndarray of bool, shape (n_pixel,), optional
+            Other pixels that are not used.
+        """
+        added = np.zeros(quiet.wavelength_nm.size) if added_dn is None else added_dn
+        variance, used = usable_variance(quiet, added, skipped_nm, nuisances, highest_dn)
+        if clipped is not None:
+            used = used & ~clipped
+            variance = np.where(used, variance, 0.0)
+        free = nuisances.free if nuisances else 0
+        check_enough(quiet, used, len(model.linear) + 1 + free)
+        inverse = np.divide(1.0, variance, out=np.zeros_like(variance), where=used)
+        unknown = nuisances.around(added) if nuisances else None
+        rows = unknown.rows(variance, unknown.spectra * used) if unknown else np.zeros((0, variance.size))
+        spanning = np.vstack([model.hot[::EVERY], model.fixed]) * used
+        plain = spanning * inverse
+        optimal = plain - (spanning @ rows.T) @ rows
+        gram = optimal @ spanning.T
+        power = np.diag(gram)
+        check_distinct(power, np.einsum("tp,tp->t", plain, spanning), nuisances)
+        length = np.sqrt(power)
+        values, vectors = np.linalg.eigh(gram / np.outer(length, length))
+        kept = values > LEAST * values[-1]
+        weights = (vectors[:, kept] / length[:, None] / np.sqrt(values[kept])).T @ optimal
+        hot, fixed = model.hot @ weights.T, model.fixed @ weights.T
+        light = light_factor(model, unknown, rows)
+        return cls(hot, fixed, model.log_k, variance, weights, rows, free, light=light)
+
+    def rest(self, excess_dn: Float, sums: Float) -> Float:
+        """Return chi-squared of the residuals of frames less the quiescent mean, shape (n,)."""
+        used = self.variance > 0.0
+        inverse = np.divide(1.0, self.variance, out=np.zeros_like(self.variance), where=used)
+        unknown = excess_dn @ self.rows.T
+        explained = np.einsum("nk,nk->n", unknown, unknown) + np.einsum("nk,nk->n", sums, sums)
+        return np.asarray(excess_dn**2 @ inverse - explained)
+
+    @property
+    def statistics(self) -> tuple[Linear, ...]:
+        """User-defined statistics equal to the sums, which a device draws by pixel; see `drawn_sums`."""
+        return tuple(Linear(f"sum {k}", weights) for k, weights in enumerate(self.weights))
+
+    @property
+    def n_used(self) -> int:
+        """Number of used pixels."""
+        return int((self.variance > 0.0).sum())
+
+
+def light_factor(model: FlareModel, unknown: Nuisances | None, rows: Float) -> LightFactor | None:
+    """Return the factor on all light if it is among the unknowns, from `Nuisances.around` and its `rows`."""
+    if unknown is None or not unknown.has_factor:
+        return None
+    # The last row of the Cholesky factor's inverse depends on the factor alone, given the other unknowns.
+    row, precision = rows[-1], float(unknown.sd[-1]) ** -2.0
+    own = float(row @ unknown.spectra[-1])
+    scale = (own + np.sqrt(own**2 + 4.0 * precision)) / 2.0
+    return LightFactor(
+        row, scale, 1.0 + float(unknown.mean[-1]), model.log_k, model.hot @ row, model.fixed @ row,
+        precision / scale**2, unknown.factor_prior,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Exposures:
+    """Raw frames, shape (n, n_pixel), and the quiescent mean; sums are taken block by block, without a copy of all."""
+
+    raw: NDArray[Any]
+    mean_dn: Float
+
+    def sums(self, reduction: Reduction, rows: NDArray[np.intp]) -> Float:
+        """Return the sums of some frames, shape (n, n_sum)."""
+        return np.concatenate([excess @ reduction.weights.T for excess in self._excess(rows)])
+
+    def sums_and_rest(self, reduction: Reduction, rows: NDArray[np.intp]) -> tuple[Float, Float, Float | None]:
+        """Return the sums of some frames, chi-squared of the residuals, and sums of the factor on light, (n,) each."""
+        parts, light = [], reduction.light
+        for excess in self._excess(rows):
+            sums = excess @ reduction.weights.T
+            own = np.zeros(0) if light is None else excess @ light.weights
+            parts.append((sums, reduction.rest(excess, sums), own))
+        sums, rest, own = (np.concatenate(one) for one in zip(*parts, strict=True))
+        return sums, rest, None if light is None else own
+
+    def _excess(self, rows: NDArray[np.intp]) -> Iterator[Float]:
+        for start in range(0, rows.size, FRAMES_AT_ONCE):
+            yield self.raw[rows[start : start + FRAMES_AT_ONCE]] - self.mean_dn
+
+
+def drawn_sums(values: NDArray[np.float32], reduction: Reduction) -> Float:
+    """Return the sums of drawn exposures, (n, n_sum), from the result of `Engine.statistic_values` for one flare."""
+    return np.ascontiguousarray(values[-len(reduction.weights) :].T, np.float64)
+
+
+def variance_of(
+    quiet: Expectation, added_dn: Float | None = None, highest_dn: Float | None = None
+) -> tuple[Float, NDArray[np.bool_]]:
+    """Return the variance of an exposure with a flare, DN^2, zero in saturated pixels, and which pixels are used.
+
+    Pixels saturate with the light `highest_dn` of a flare, by default the mean `added_dn`.
+    """
+    added = np.zeros(quiet.wavelength_nm.size) if added_dn is None else added_dn
+    constant = quiet.unsaturated_variance_dn2 - quiet.gain_dn_per_electron * quiet.light_dn
+
+    def variance_with(added: Float) -> tuple[Float, Float]:
+        light = np.maximum(quiet.light_dn + added, 0.0)
+        return light, constant + quiet.gain_dn_per_electron * light
+
+    variance = variance_with(added)[1]
+    light, scatter = variance_with(added if highest_dn is None else highest_dn)
+    # Frames of a pixel near saturation are occasionally clipped, so that the pixel is not reliable.
+    raw = light / quiet.n_frames + quiet.dark_dn + quiet.bias_dn
+    used = raw + NEAR_SIGMA * np.sqrt(scatter / quiet.n_frames) < quiet.ceiling_dn
+    return np.where(used, variance, 0.0), used
+
+
+def usable_variance(
+    quiet: Expectation,
+    added_dn: Float | None = None,
+    skipped_nm: Ranges = (),
+    nuisances: Nuisances | None = None,
+    highest_dn: Float | None = None,
+) -> tuple[Float, NDArray[np.bool_]]:
+    """Return `variance_of` without skipped pixels, at the unknowns' means; raises InputError without a pixel."""
+    if nuisances and nuisances.mean_dn.any():
+        added_dn = np.zeros(quiet.wavelength_nm.size) if added_dn is None else added_dn
+        # A frame may have more light than the mean exposure, up to what the expectation has.
+        highest_dn = added_dn if highest_dn is None else highest_dn
+        added_dn = added_dn + nuisances.mean_dn
+    variance, used = variance_of(quiet, added_dn, highest_dn)
+    used = used & ~skipped_pixels(quiet, skipped_nm)
+    check_enough(quiet, used, 0)
+    return np.where(used, variance, 0.0), used
+
+
+def check_enough(quiet: Expectation, used: NDArray[np.bool_], parameters: int) -> None:
+    """Raise InputError unless more pixels are used than parameters are fitted."""
+    count = int(used.sum())
+    if count <= parameters:
+        fault = f"{count} of {used.size} pixels of {quiet.name} can be used, since others saturate or are left out"
+        expected = f"more than the {parameters} parameters of the fit"
+        if not count:
+            fault, expected = f"every pixel of {quiet.name} saturates or is left out", "some that count"
+        raise InputError(fault, expected, key="skipped_nm", value=count)
+
+
+def skipped_pixels(quiet: Expectation, skipped_nm: Ranges) -> NDArray[np.bool_]:
+    """Return which pixels lie in wavelength ranges that are not used, shape (n_pixel,)."""
+    nm = quiet.wavelength_nm
+    skipped = np.zeros(nm.size, np.bool_)
+    for low, high in skipped_nm:
+        skipped |= (nm >= low) & (nm <= high)
+    return skipped
+
+
+def check_distinct(kept: Float, whole: Float, nuisances: Nuisances | None) -> None:
+    """Raise InputError if marginalisation over nuisances removes the S/N^2 of a component."""
+    if not (whole > 0.0).all():
+        raise InputError(
+            "a component of the flare has no light in the pixels that neither saturate nor are left out",
+            "a model whose components have light there",
+            key="model",
+        )
+    if not (kept > LEAST_KEPT * whole).all():
+        unknown = join_names(nuisances.names) if nuisances else "nothing"
+        raise InputError(
+            f"the light of a flare cannot be distinguished from {unknown}",
+            "fewer unknowns",
+            key="nuisances",
+            value=unknown,
+        )

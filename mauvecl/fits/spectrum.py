@@ -1,0 +1,820 @@
+"""Fits of flares with one or two temperatures to observed frames, and forecasts of their errors.
+
+Fits of flares with two free temperatures.
+
+At each second temperature, one of the model's, the flare is one blackbody with another component of fixed shape, so
+that the rest is a fit of `results.measurements.nonnegative`. The second temperature is the higher one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike, NDArray
+
+from mauvecl.detection.nuisances import Nuisances
+from mauvecl.fits.flare_model import (
+    NEAR_SIGMA,
+    Derived,
+    Exposures,
+    FlareModel,
+    Ranges,
+    Reduction,
+    check_distinct,
+    check_enough,
+    derived_values,
+    light_factor,
+    undimmed,
+    usable_variance,
+)
+from mauvecl.fits.profile import (
+    BestFit,
+    BoundedProfile,
+    Profile,
+    bounded_intervals,
+    covariance,
+    covariance_of,
+    intervals,
+    with_bounds,
+)
+from mauvecl.schema.calls import validated
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import Probability, Temperature, Wavelength
+from mauvecl.schema.tables import Column, table_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from astropy.table import Table
+
+    from mauvecl.host.exposure.expectation import Expectation
+
+Float = NDArray[np.float64]
+
+#: Probabilities of the intervals: one and two standard deviations of a normal variable, about.
+LEVELS = (0.6827, 0.95)
+#: Number of fits after the first; each uses the variance of the previously fitted flare.
+REFITS = 2
+#: Frames share a variance if the changes of its logarithm agree to this step in each of some ranges of pixels.
+VARIANCE_STEP, VARIANCE_RANGES = 0.03, 12
+#: Frames that are fitted together, which bounds the memory.
+BATCH = 2048
+#: Fits more of exposures with pixels near saturation; the logarithmic step of the number of such pixels of those that
+#: share the others in the first fit, and the least share of their pixels that all must be able to use there.
+SATURATED_REFITS, SATURATED_STEP, LEAST_SHARED = 4, 0.05, 0.5
+#: Pixels on both sides of one near saturation that are not used.
+NEIGHBOURS = 4
+#: Factor by which the largest flare of a group may exceed the mean one.
+NEAR_GROUP = 1.1
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """Fitted flares of n frames; quantities are those of the model, in its order."""
+
+    #: Names of the quantities, in the order of the last axis of estimates and intervals.
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    #: Smallest possible values: 1 of a jump, 0 of light.
+    bounds: tuple[float, ...]
+    #: Maximum-likelihood estimates, shape (n, n_derived).
+    estimates: Float
+    #: Covariance from the Fisher information at the fit, shape (n, n_derived, n_derived).
+    covariance: Float
+    #: Nominal coverage of the intervals.
+    levels: tuple[float, ...]
+    #: Lower ends of the intervals, shape (n_level, n, n_derived); if infinite or a bound, `high` is an upper limit.
+    low: Float
+    #: Upper ends of the intervals, shape (n_level, n, n_derived); if infinite, `low` is a lower limit.
+    high: Float
+    #: Goodness of fit, shape (n,).
+    chi2: Float
+    #: Probability of a larger chi-squared if the model is correct, shape (n,).
+    p_value: Float
+    dof: int
+    #: Root of the decrease of chi-squared by the flare, shape (n,).
+    snr: Float
+    #: Natural logarithm of the temperature, shape (n,), or (n, 2) of two temperatures.
+    log_k: Float
+    #: Parameters of the model's `counts`, shape (n, n_linear), for the light before it is dimmed by `factor`.
+    amplitudes: Float
+    #: Factor on all light, shape (n,); 1 if it is known.
+    factor: Float
+
+    @property
+    def errors(self) -> Float:
+        """Standard errors from the Fisher information, shape (n, n_derived)."""
+        return np.asarray(np.sqrt(np.einsum("nqq->nq", self.covariance)))
+
+    @property
+    def one_sided(self) -> NDArray[np.bool_]:
+        """True for one-sided intervals, shape (n_level, n, n_derived); their other end is infinite or a bound."""
+        return np.asarray((self.low <= self.bounds) != np.isinf(self.high))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """Return the measurements of several batches of frames as one."""
+        values: dict[str, Any] = {one.name: getattr(parts[0], one.name) for one in fields(cls)}
+        for name, value in values.items():
+            if isinstance(value, np.ndarray):
+                axis = 1 if name in ("low", "high") else 0
+                values[name] = np.concatenate([getattr(part, name) for part in parts], axis)
+        return cls(**values)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return all arrays that depend on the frames, for files; the inverse of `of_arrays`."""
+        values = {one.name: np.asarray(getattr(self, one.name)) for one in fields(self)}
+        return {name: value for name, value in values.items() if name not in ("names", "units", "bounds", "levels")}
+
+    @classmethod
+    def of_arrays(
+        cls,
+        arrays: Mapping[str, NDArray[Any]],
+        levels: Sequence[float],
+        *,
+        names: tuple[str, ...],
+        units: tuple[str, ...],
+        bounds: tuple[float, ...],
+    ) -> Self:
+        """Return a measurement from its `arrays`, levels of intervals, and the quantities that were measured."""
+        given: dict[str, Any] = {**arrays, "dof": int(arrays["dof"])}
+        return cls(names, units, bounds, levels=tuple(levels), **given)
+
+    def rows(self, which: NDArray[Any]) -> Self:
+        """Return the measurements of some frames, by number or mask."""
+        kept: dict[str, Any] = {}
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if isinstance(value, np.ndarray):
+                kept[one.name] = value[:, which] if one.name in ("low", "high") else value[which]
+        return replace(self, **kept)
+
+    def column(self, name: str) -> int:
+        """Return the index of a quantity.
+
+        Raises
+        ------
+        InputError
+            For an unknown name.
+        """
+        if name not in self.names:
+            raise InputError.of("name", name, f"one of {', '.join(self.names)}")
+        return self.names.index(name)
+
+    def table(self, frame: int = 0) -> Table:
+        """Return the estimates and intervals of one frame, one row per quantity."""
+        values = [
+            Column("quantity", lambda _: list(self.names), description="what is measured"),
+            Column("unit", lambda _: list(self.units), description="of estimate, error and interval"),
+            Column("estimate", self.estimates.__getitem__, description="estimate"),
+            Column("error", self.errors.__getitem__, description="standard error"),
+        ]
+        for level, low, high in zip(self.levels, self.low, self.high, strict=True):
+            share = f"{100 * level:.4g}"
+            for end, bound in (("low", low), ("high", high)):
+                text = f"{share} % interval, {'lower' if end == 'low' else 'upper'} end"
+                values.append(Column(f"{end}_{share}", bound.__getitem__, description=text))
+        chi2, p_value = float(self.chi2[frame]), float(self.p_value[frame])
+        table = table_of(values, [frame], chi2=chi2, dof=self.dof, p_value=p_value)
+        for name in table.colnames[2:]:
+            table[name].info.format = ".4g"
+        return table
+
+
+@validated
+def fit(
+    frames: ArrayLike,
+    expectation: Expectation,
+    model: FlareModel,
+    nuisances: Nuisances | None = None,
+    *,
+    levels: Sequence[Probability] = LEVELS,
+    skipped_nm: Sequence[tuple[Wavelength, Wavelength]] = (),
+) -> Measurement:
+    """Fit one flare to each exposure.
+
+    The likelihood is Gaussian with the variance of the fitted flare and star. Intervals are from the profile likelihood
+    with Wilks' thresholds, or simulated ones where a quantity bends within the error of the temperature. Light is at
+    least 0 and a jump at least 1. An interval that reaches this bound, or an end of the model's temperatures, is a
+    one-sided limit.
+
+    Parameters
+    ----------
+    frames : array_like, shape (n, n_pixel)
+        Raw DN of the exposures, as returned by `Engine.realise`.
+    expectation : Expectation
+        The exposure of the quiescent star.
+    model : FlareModel
+    nuisances : Nuisances, optional
+        Unknown amplitudes of known spectra, over which the fit marginalises. A factor on all light, such as ``light``
+        of `Nuisances.of`, dims the flare as it dims the star.
+    levels : sequence of float
+        Nominal coverage of the intervals.
+    skipped_nm : sequence of tuple
+        Wavelength ranges of pixels that are not used, such as gaps of an observation.
+
+    Raises
+    ------
+    InputError
+        If frames have another shape, the flare is degenerate with the unknowns, or fewer pixels than parameters are
+        neither saturated nor left out.
+
+    Examples
+    --------
+    >>> from mauvecl import Instrument, Source, expect
+    >>> from mauvecl.fits.flare_model import FlareModel
+    >>> from mauvecl.fits.spectrum import fit
+    >>> star, mauve = Source.from_library("M3V").at_magnitude(9), Instrument.load("mauve")
+    >>> quiet, flare = (expect(s, mauve, exposure=50.0) for s in (star, star.flaring(0.5, 9000)))
+    >>> model = FlareModel.of(star, mauve, quiet)
+    >>> found = fit(flare.recorded_dn, quiet, model)
+    >>> [round(float(x), 2) for x in found.estimates[0, :2]]
+    [9000.0, 0.5]
+    """
+    exposures = checked_exposures(frames, expectation, levels, nuisances)
+
+    def reduction_of(added_dn: Float | None, **how: Any) -> Reduction:
+        return Reduction.of(model, expectation, added_dn, nuisances, skipped_nm, **how)
+
+    log_k, linear, cut = _pilot(exposures, expectation, model, reduction_of)
+    every = np.arange(len(exposures.raw))
+    # Exposures with saturated pixels start far from the flare, which decides on the pixels that saturate.
+    saturated = [np.flatnonzero(cut)] * (SATURATED_REFITS if cut.any() else 0)
+    for rows in [*saturated, *[every] * (REFITS - 1)]:
+        some_of = replace(exposures, raw=exposures.raw[rows]) if cut.any() else None
+        groups = variance_groups(expectation, model, log_k[rows], linear[rows], reduction_of, nuisances, some_of)
+        for some, reduction in groups:
+            own = rows[some]
+            for start in range(0, own.size, BATCH):
+                batch = own[start : start + BATCH]
+                best = _estimated(exposures, batch, reduction)
+                log_k[batch], linear[batch] = best.log_k, best.linear
+    parts: list[tuple[NDArray[np.intp], dict[str, Any]]] = []
+    near = exposures if cut.any() else None
+    for some, reduction in variance_groups(expectation, model, log_k, linear, reduction_of, nuisances, near):
+        for start in range(0, some.size, BATCH):
+            batch = some[start : start + BATCH]
+            parts.append((batch, _fitted(exposures, batch, model, reduction, levels)))
+    order = np.argsort(np.concatenate([rows for rows, _ in parts]))
+    along = {"low": 1, "high": 1}
+    joined = {
+        name: np.take(np.concatenate([one[name] for _, one in parts], along.get(name, 0)), order, along.get(name, 0))
+        for name in parts[0][1]
+    }
+    dof = joined.pop("dof")
+    joined["p_value"] = np.asarray(scipy.stats.chi2.sf(joined["chi2"], dof))
+    return Measurement(model.names, model.units, model.bounds, levels=tuple(levels), dof=int(dof.min()), **joined)
+
+
+def checked_exposures(
+    frames: ArrayLike, expectation: Expectation, levels: Sequence[float], nuisances: Nuisances | None
+) -> Exposures:
+    """Return exposures less their mean without a flare; raises InputError as `fit` does."""
+    raw = np.atleast_2d(np.asarray(frames))
+    if raw.ndim != 2 or not len(raw) or raw.shape[1] != expectation.wavelength_nm.size:
+        raise InputError(
+            f"frames of the shape {raw.shape}",
+            f"(n, {expectation.wavelength_nm.size})",
+            key="frames",
+            value=raw.shape,
+        )
+    if raw.dtype.kind not in "iuf" or not np.isfinite(raw).all():
+        raise InputError("frames hold undefined values", "finite numbers", key="frames")
+    if not levels:
+        raise InputError.of("levels", levels, "at least one probability")
+    mean = expectation.recorded_dn if nuisances is None else expectation.recorded_dn + nuisances.mean_dn
+    return Exposures(raw, mean)
+
+
+def _pilot(
+    exposures: Exposures, quiet: Expectation, model: FlareModel, reduction_of: Callable[..., Reduction]
+) -> tuple[Float, Float, NDArray[np.bool_]]:
+    """Fit all frames with the variance of the quiescent star, and return which have saturated pixels as well.
+
+    Pixels that are near saturation in a frame are not used.
+    """
+    n = len(exposures.raw)
+    log_k, linear, counts = np.empty(n), np.empty((n, len(model.linear))), np.zeros(n, np.intp)
+    usual = reduction_of(None)
+    used = usual.variance > 0.0
+    ceiling = _highest_usable(quiet)
+    for start in range(0, n, BATCH):
+        raw = exposures.raw[start : start + BATCH]
+        if (raw.max(axis=0) > ceiling)[used].any():
+            counts[start : start + BATCH] = (raw > ceiling)[:, used].sum(axis=1)
+
+    def best(rows: NDArray[np.intp], reduction: Reduction) -> None:
+        for start in range(0, rows.size, BATCH):
+            some = rows[start : start + BATCH]
+            found = Profile(reduction, exposures.sums(reduction, some)).best()
+            log_k[some], linear[some] = found.log_k, found.linear
+
+    best(np.flatnonzero(counts == 0), usual)
+    # Frames with about as many saturated pixels share the pixels that none of them saturates.
+    alike = np.rint(np.log(np.maximum(counts, 1)) / SATURATED_STEP).astype(np.intp)
+    for key in np.unique(alike[counts > 0]):
+        rows = np.flatnonzero((alike == key) & (counts > 0))
+        for start in range(0, rows.size, BATCH):
+            some = rows[start : start + BATCH]
+            shared = clipped_pixels(exposures, quiet, some)
+            if (~shared & used).sum() >= LEAST_SHARED * (used.sum() - counts[some].max()):
+                best(some, reduction_of(None, clipped=shared))
+                continue
+            for row in some:
+                best(np.array([row]), reduction_of(None, clipped=clipped_pixels(exposures, quiet, np.array([row]))))
+    return log_k, linear, counts > 0
+
+
+def clipped_pixels(exposures: Exposures, quiet: Expectation, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Return which pixels are near saturation in any of some exposures, and their neighbours, shape (n_pixel,).
+
+    Neighbours are left out so that the noise of single pixels does not select the pixels of a fit.
+    """
+    clipped = (exposures.raw[rows] > _highest_usable(quiet)).any(axis=0)
+    return np.convolve(clipped, np.ones(2 * NEIGHBOURS + 1), "same") > 0.5
+
+
+def _highest_usable(quiet: Expectation) -> Float:
+    """Return the raw DN of the exposure above which a pixel is near saturation, shape (n_pixel,)."""
+    constant = quiet.unsaturated_variance_dn2 - quiet.gain_dn_per_electron * quiet.light_dn
+    light = quiet.n_frames * np.maximum(quiet.ceiling_dn - quiet.dark_dn - quiet.bias_dn, 0.0)
+    sd = np.sqrt((constant + quiet.gain_dn_per_electron * light) / quiet.n_frames)
+    return np.asarray(quiet.n_frames * (quiet.ceiling_dn - NEAR_SIGMA * sd))
+
+
+def variance_groups(
+    quiet: Expectation,
+    model: FlareModel,
+    log_k: Float,
+    linear: Float,
+    reduction_of: Callable[..., Reduction],
+    nuisances: Nuisances | None,
+    exposures: Exposures | None,
+) -> Iterator[tuple[NDArray[np.intp], Reduction]]:
+    """Yield groups of frames whose fitted flares have nearly the same variance, with their reduction.
+
+    The exposures are needed if pixels are near saturation in some of them.
+    """
+    n_pixel = quiet.wavelength_nm.size
+    edges = np.linspace(0, n_pixel, VARIANCE_RANGES + 1).astype(np.intp)[:-1]
+    ceiling = _highest_usable(quiet)
+    # Pixels that saturate in every frame have no say.
+    seen = True if exposures is None else exposures.raw.min(axis=0) <= ceiling
+    relative = seen * quiet.gain_dn_per_electron / quiet.unsaturated_variance_dn2
+    averaged = np.diff(np.append(edges, n_pixel))
+    hot = np.add.reduceat(model.hot * relative, edges, axis=1) / averaged
+    fixed = np.add.reduceat(model.fixed * relative, edges, axis=1) / averaged
+    node = np.rint(np.interp(log_k, model.log_k, np.arange(model.log_k.size))).astype(np.intp)
+    added = linear[:, :1] * hot[node] + linear[:, 1:] @ fixed
+    keys = np.rint(np.log1p(np.maximum(added, -0.9)) / VARIANCE_STEP).astype(np.int64)
+    _, number, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(number, kind="stable")
+    # Single frames may have all the light that an exposure loses on average.
+    undimmed = 1.0 / min(1.0, nuisances.mean_factor) if nuisances else 1.0
+    for rows in np.split(order, np.cumsum(counts)[:-1]):
+        middle = np.mean(log_k[rows])
+        mean = linear[rows, 0].mean() * model.hot_spline(middle) + linear[rows, 1:].mean(axis=0) @ model.fixed
+        highest = undimmed * mean
+        if (quiet.n_frames * quiet.mean_raw_dn + NEAR_GROUP * highest > ceiling).any():
+            each = (linear[k, 0] * model.hot_spline(log_k[k]) + linear[k, 1:] @ model.fixed for k in rows)
+            highest = undimmed * np.max(list(each), axis=0) if rows.size <= BATCH else NEAR_GROUP * highest
+        clipped = None
+        if exposures is not None and (exposures.raw[rows].max(axis=0) > ceiling).any():
+            clipped = clipped_pixels(exposures, quiet, rows)
+        yield rows, reduction_of(mean, highest_dn=highest, clipped=clipped)
+
+
+def _estimated(exposures: Exposures, rows: NDArray[np.intp], reduction: Reduction) -> BestFit:
+    """Return the best fits of some frames of one variance."""
+    profile = Profile(reduction, exposures.sums(reduction, rows))
+    return with_bounds(reduction, profile.sums, profile.best())
+
+
+def _fitted(
+    exposures: Exposures, rows: NDArray[np.intp], model: FlareModel, reduction: Reduction, levels: Sequence[float]
+) -> dict[str, Any]:
+    """Return the attributes of `Measurement` for some frames of one variance."""
+    sums, rest, light = exposures.sums_and_rest(reduction, rows)
+    profile = Profile(reduction, sums, light)
+    at_nodes = profile.gain_at_nodes()
+    best = profile.best(at_nodes)
+    allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
+    ends = [intervals(model, profile, best, at_nodes, one) for one in allowed]
+    low, high = (np.stack([one[side] for one in ends]) for side in (0, 1))
+    # Intervals differ from unbounded ones only if they reach a bound.
+    reaches = (low <= np.array(model.bounds)) & np.isfinite(model.bounds)
+    near = np.flatnonzero(reaches.any(axis=(0, 2)) | (best.linear < 0.0).any(axis=1))
+    if near.size:
+        bounded = BoundedProfile(reduction, sums[near], None if light is None else light[near])
+        nodes = bounded.gain_at_nodes()
+        there = bounded.best(nodes)
+        for k, one in enumerate(allowed):
+            low[k, near], high[k, near] = bounded_intervals(model, bounded, there, nodes, one)
+        best = best.replaced(near, there)
+    left = np.einsum("nk,nk->n", sums, sums) - best.gain
+    n_fitted = len(model.linear) + 1
+    factor = profile.factor(best.log_k, best.linear)
+    estimates = derived_values(model, best.log_k, best.linear)
+    which, _ = model.sums
+    estimates[:, which] = undimmed(estimates[:, which], factor)
+    return {
+        "log_k": best.log_k,
+        "amplitudes": undimmed(best.linear, factor),
+        "factor": factor,
+        "estimates": estimates,
+        "covariance": covariance(model, profile, best),
+        "low": low,
+        "high": high,
+        "chi2": rest + left,
+        "dof": np.full(len(sums), reduction.n_used - reduction.n_free - n_fitted),
+        "snr": np.sqrt(best.gain),
+    }
+
+
+def fit_sums(sums: Float, model: FlareModel, reduction: Reduction) -> tuple[Float, Float]:
+    """Fit the sums of exposures, without intervals; a processor core fits about 3e5 exposures per second.
+
+    Parameters
+    ----------
+    sums : ndarray, shape (n, n_sum)
+    model : FlareModel
+    reduction : Reduction
+        Its variance is assumed for every exposure.
+
+    Returns
+    -------
+    estimates : ndarray, shape (n, n_derived)
+        Quantities of the model.
+    covariance : ndarray, shape (n, n_derived, n_derived)
+        Covariance from the Fisher information at the fit.
+    """
+    estimates, spreads = [], []
+    for start in range(0, len(sums), BATCH):
+        profile = Profile(reduction, sums[start : start + BATCH])
+        best = with_bounds(reduction, profile.sums, profile.best())
+        estimates.append(derived_values(model, best.log_k, best.linear))
+        spreads.append(covariance(model, profile, best))
+    return np.concatenate(estimates), np.concatenate(spreads)
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """Expected errors of a measurement, from the Fisher information."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    #: Quantities of the flare, shape (n_derived,).
+    values: Float
+    #: Standard errors, shape (n_derived,).
+    errors: Float
+    #: Covariance of the estimates, shape (n_derived, n_derived).
+    covariance: Float
+    #: S/N of the flare.
+    snr: float
+
+    @property
+    def correlation(self) -> Float:
+        """Correlation of the estimates, shape (n_derived, n_derived)."""
+        return np.asarray(self.covariance / np.outer(self.errors, self.errors))
+
+
+@validated
+def forecast(
+    expectation: Expectation,
+    model: FlareModel,
+    temperature_k: Temperature,
+    amplitudes: Sequence[float] | Float,
+    nuisances: Nuisances | None = None,
+    *,
+    skipped_nm: Sequence[tuple[Wavelength, Wavelength]] = (),
+) -> Forecast:
+    """Forecast the errors of the measurement of a flare from the Fisher information of one exposure.
+
+    Parameters
+    ----------
+    expectation : Expectation
+        The exposure of the quiescent star.
+    model : FlareModel
+    temperature_k, amplitudes
+        Flare, as for `FlareModel.counts`.
+    nuisances : Nuisances, optional
+        Unknown amplitudes of known spectra.
+    skipped_nm : sequence of tuple
+        Wavelength ranges of pixels that are not used.
+
+    Raises
+    ------
+    InputError
+        If the model cannot describe the flare, or the flare is degenerate with the unknowns.
+    """
+    factor = nuisances.mean_factor if nuisances else 1.0
+    # The flare as it is recorded.
+    counts = factor * model.counts(temperature_k, amplitudes)
+    log_k, linear = np.array([np.log(temperature_k)]), factor * np.asarray(amplitudes, np.float64)[None]
+    variance, used = usable_variance(expectation, counts, skipped_nm, nuisances, counts / min(1.0, factor))
+    check_enough(expectation, used, len(model.linear) + 1 + (nuisances.free if nuisances else 0))
+    slope = linear[0, 0] * model.hot_spline(log_k[0], 1)
+    rows = np.vstack([model.hot_spline(log_k[0]), model.fixed, slope, counts]) * used
+    plain = np.divide(rows, variance, out=np.zeros_like(rows), where=used) @ rows.T
+    unknown = nuisances.around(counts) if nuisances else None
+    weights = unknown.rows(variance, unknown.spectra * used) if unknown else np.zeros((0, used.size))
+    lost = weights @ rows.T
+    information = plain - lost.T @ lost
+    check_distinct(np.diag(information)[:-2], np.diag(plain)[:-2], nuisances)
+    light = light_factor(model, unknown, weights)
+    spread = covariance_of(model, log_k, linear, information[None, :-1, :-1], light, factor)[0]
+    values = derived_values(model, log_k, linear / factor)[0]
+    snr = float(np.sqrt(max(information[-1, -1], 0.0)))
+    return Forecast(model.names, model.units, values, np.sqrt(np.diag(spread)), spread, snr)
+
+
+#: Number of second temperatures per node of the model, in steps of 0.6 %.
+PER_NODE = 3
+#: Steps between the temperatures that are tried first, and number of those in and next to an interval.
+COARSE, TRIES = 36, 20
+#: Smallest number of nodes between the two temperatures; closer temperatures cannot be distinguished.
+APART = 4
+
+
+@dataclass(frozen=True, eq=False)
+class TwoTemperatures:
+    """Mean counts of a flare of two blackbodies with free temperatures."""
+
+    single: FlareModel  # model of one blackbody, optionally with lines
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the reported quantities."""
+        return (*self.single.names, "second temperature", "second area")
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the reported quantities."""
+        return (*self.single.units, "K", "")
+
+    @property
+    def bounds(self) -> tuple[float, ...]:
+        """Smallest possible values of the reported quantities."""
+        return (*self.single.bounds, -np.inf, 0.0)
+
+    def counts(self, temperatures_k: Float, amplitudes: Sequence[float] | Float) -> Float:
+        """Return the mean DN that a flare adds to each pixel, of the lower and the second temperature, (n_pixel,)."""
+        lower, second = np.asarray(temperatures_k, np.float64)
+        return with_second(self.single, float(np.log(second))).counts(float(lower), amplitudes)
+
+
+@validated
+def fit_two_temperatures(
+    frames: ArrayLike,
+    expectation: Expectation,
+    model: FlareModel,
+    nuisances: Nuisances | None = None,
+    *,
+    levels: Sequence[Probability] = LEVELS,
+    skipped_nm: Sequence[tuple[Wavelength, Wavelength]] = (),
+) -> Measurement:
+    """Fit a flare of two blackbodies with free temperatures to each exposure.
+
+    Parameters
+    ----------
+    frames, expectation, nuisances, levels, skipped_nm
+        As for `fit`.
+    model : FlareModel
+        Model of one blackbody, optionally with lines.
+
+    Returns
+    -------
+    Measurement
+        As for `fit`, with the lower temperature, and with amplitude, fluxes and areas of both blackbodies. The second
+        temperature and the ratio of its area to that of the first follow. Errors from the curvature are undefined if
+        a single blackbody fits best.
+
+    Raises
+    ------
+    InputError
+        For a model with a Balmer jump, and as for `fit`.
+    """
+    if any(one.ratio is not None for one in model.derived):
+        raise InputError("a model with a Balmer jump", "blackbodies, with lines or without", key="model")
+    single = fit(frames, expectation, model, nuisances, levels=levels, skipped_nm=skipped_nm)
+    exposures = checked_exposures(frames, expectation, levels, nuisances)
+
+    def reduction_of(added_dn: Float | None, **how: Any) -> Reduction:
+        return Reduction.of(model, expectation, added_dn, nuisances, skipped_nm, **how)
+
+    allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
+    parts, order, whole = [], [], TwoTemperatures(model)
+    recorded = single.amplitudes * single.factor[:, None]
+    groups = variance_groups(expectation, model, single.log_k, recorded, reduction_of, nuisances, exposures)
+    for rows, reduction in groups:
+        sums, rest, light = exposures.sums_and_rest(reduction, rows)
+        found = _Search(model, reduction, sums, allowed, light).measured()
+        best, low, high, second, estimates, factor = found
+        chi2 = rest + np.einsum("nk,nk->n", sums, sums) - best.gain
+        dof = reduction.n_used - reduction.n_free - len(model.linear) - 3
+        check_enough(expectation, reduction.variance > 0.0, len(model.linear) + 3 + reduction.n_free)
+        covariance = _covariance(model, reduction, best, second, estimates, factor)
+        parts.append(
+            Measurement(
+                whole.names, whole.units, whole.bounds, estimates, covariance, tuple(levels), low, high, chi2,
+                np.asarray(scipy.stats.chi2.sf(chi2, dof)), dof, np.sqrt(best.gain),
+                np.column_stack([best.log_k, second]), undimmed(best.linear, factor), factor,
+            )
+        )  # fmt: skip
+        order.append(rows)
+    return Measurement.joined(parts).rows(np.argsort(np.concatenate(order)))
+
+
+def forecast_two_temperatures(
+    expectation: Expectation,
+    model: FlareModel,
+    temperatures_k: Float,
+    amplitudes: Float,
+    nuisances: Nuisances | None = None,
+    skipped_nm: Ranges = (),
+) -> Forecast:
+    """Return the errors with which a flare of two temperatures will be measured, as `forecast`.
+
+    Undefined where one of the blackbodies adds no light.
+    """
+    factor = nuisances.mean_factor if nuisances else 1.0
+    whole, log_k, linear = TwoTemperatures(model), np.log(temperatures_k), factor * np.asarray(amplitudes)[None]
+    counts = whole.counts(temperatures_k, linear[0])
+    reduction = Reduction.of(model, expectation, counts, nuisances, skipped_nm, highest_dn=counts / min(1.0, factor))
+    values = derived_values(with_second(model, float(log_k[1])), log_k[:1], linear / factor)
+    values = np.insert(values, -1, temperatures_k[1], axis=1)
+    sums = linear[0] @ np.vstack([reduction.spline(log_k), reduction.fixed])
+    best = BestFit(log_k[:1], linear, np.array([sums @ sums]))
+    spread = _covariance(model, reduction, best, log_k[1:], values, np.array([factor]))[0]
+    errors = np.sqrt(np.diag(spread))
+    return Forecast(whole.names, whole.units, values[0], errors, spread, float(np.linalg.norm(sums)))
+
+
+def with_second(model: FlareModel, log_k: float) -> FlareModel:
+    """Return a model of lower temperatures with a blackbody of a second temperature as another component."""
+    end = _lower(model.log_k, log_k)
+    bolometric = model.splines[model.names.index("flux bolometric")]
+    assert bolometric is not None
+
+    def area(x: Float | float) -> Float:
+        # The ratio of the flux at the telescope to that at the surface is proportional to the area.
+        return np.asarray(bolometric(x)[..., 0] / np.exp(4 * x))
+
+    def both(one: Derived, spline: scipy.interpolate.CubicSpline | None) -> Derived:
+        if one.factors is None or spline is None:
+            return one
+        return replace(one, factors=np.insert(one.factors[:end], 1, spline(log_k)[0], axis=1))
+
+    share = Derived("second area", "", "area at the second temperature over that at the first",
+                    ratio=area(log_k) / area(model.log_k[:end]), offset=0.0)  # fmt: skip
+    return FlareModel(
+        model.log_k[:end], model.hot[:end], np.vstack([model.hot_spline(log_k), model.fixed]),
+        (model.linear[0], "second", *model.linear[1:]),
+        (*map(both, model.derived, model.splines), share),
+    )  # fmt: skip
+
+
+def _lower(nodes: Float, log_k: float) -> int:
+    """Return the number of nodes that are at least `APART` nodes below a temperature."""
+    return int(np.searchsorted(nodes, log_k - APART * (nodes[1] - nodes[0]) + 1e-9))
+
+
+class _Search:
+    """Fit of exposures with a common variance over second temperatures."""
+
+    def __init__(
+        self, model: FlareModel, reduction: Reduction, sums: Float, allowed: list[float], light: Float | None
+    ) -> None:
+        self._model, self._reduction, self._sums, self._allowed = model, reduction, sums, allowed
+        self._light = light
+        first, last = model.log_k[2 * APART], model.log_k[-1]
+        #: Second log temperatures that may be tried.
+        self._grid = np.linspace(first, last, PER_NODE * (model.log_k.size - 1 - 2 * APART) + 1)
+        self._gain = np.full((len(sums), self._grid.size), -np.inf)
+
+    def _profile(self, node: int, rows: NDArray[np.intp]) -> BoundedProfile:
+        r, end = self._reduction, _lower(self._reduction.log_k, self._grid[node])
+        second = float(self._grid[node])
+        fixed = np.vstack([r.spline(second), r.fixed])
+        factor = None if r.light is None else r.light.with_second(second, end)
+        own = replace(r, hot=r.hot[:end], fixed=fixed, log_k=r.log_k[:end], light=factor)
+        return BoundedProfile(own, self._sums[rows], None if self._light is None else self._light[rows])
+
+    def _evaluate(self, wanted: NDArray[np.bool_]) -> None:
+        """Compute the largest gain at second temperatures, (n, n_node)."""
+        for node in np.flatnonzero(wanted.any(axis=0)):
+            rows = np.flatnonzero(wanted[:, node] & np.isinf(self._gain[:, node]))
+            if rows.size:
+                self._gain[rows, node] = self._profile(int(node), rows).best().gain
+
+    def measured(self) -> tuple[BestFit, Float, Float, Float, Float, Float]:
+        """Return best fits, intervals (n_level, n, n_derived), second log temperatures, estimates, and factors."""
+        n, nodes = self._gain.shape
+        coarse = np.zeros((n, nodes), np.bool_)
+        coarse[:, ::COARSE] = True
+        self._evaluate(coarse)
+        # Twice, since the first interval may be a single temperature.
+        for margin in (COARSE, COARSE // 4):
+            inside = self._gain >= self._gain.max(axis=1)[:, None] - max(self._allowed)
+            low = np.maximum(inside.argmax(axis=1) - margin, 0)
+            high = np.minimum(nodes - 1 - inside[:, ::-1].argmax(axis=1) + margin, nodes - 1)
+            fine = np.zeros((n, nodes), np.bool_)
+            for share in np.linspace(0.0, 1.0, TRIES + 1):
+                fine[np.arange(n), np.rint(low + share * (high - low)).astype(np.intp)] = True
+            self._evaluate(fine)
+        best_node = self._gain.argmax(axis=1)
+        gain = self._gain.max(axis=1)
+        q = len(self._model.derived) + 2
+        lows, highs = np.full((len(self._allowed), n, q), np.inf), np.full((len(self._allowed), n, q), -np.inf)
+        log_k, linear = np.empty(n), np.empty((n, len(self._model.linear) + 1))
+        estimates, factor = np.empty((n, q)), np.ones(n)
+        for node in np.flatnonzero((self._gain >= gain[:, None] - max(self._allowed)).any(axis=0)):
+            rows = np.flatnonzero(self._gain[:, node] >= gain - max(self._allowed))
+            profile, model = self._profile(int(node), rows), with_second(self._model, float(self._grid[node]))
+            at_nodes = profile.gain_at_nodes()
+            own = profile.best(at_nodes)
+            here = np.flatnonzero(best_node[rows] == node)
+            log_k[rows[here]], linear[rows[here]] = own.log_k[here], own.linear[here]
+            values = derived_values(model, own.log_k[here], own.linear[here])
+            factor[rows[here]] = profile.factor(own.log_k, own.linear)[here]
+            values[:, model.sums[0]] = undimmed(values[:, model.sums[0]], factor[rows[here]])
+            estimates[rows[here]] = np.insert(values, q - 2, np.exp(self._grid[node]), axis=1)
+            for k, one in enumerate(self._allowed):
+                there = np.flatnonzero(own.gain >= gain[rows] - one)
+                if not there.size:
+                    continue
+                some = self._profile(int(node), rows[there])
+                limit = BestFit(own.log_k[there], own.linear[there], gain[rows[there]])
+                ends = bounded_intervals(model, some, limit, at_nodes[there], one)
+                for found, end, which in ((lows, ends[0], np.minimum), (highs, ends[1], np.maximum)):
+                    columns = np.delete(np.arange(q), q - 2)
+                    found[k][np.ix_(rows[there], columns)] = which(found[k][np.ix_(rows[there], columns)], end)
+        for k, one in enumerate(self._allowed):
+            lows[k, :, q - 2], highs[k, :, q - 2] = self._second_ends(gain, one)
+        best = BestFit(log_k, linear, gain)
+        return best, lows, highs, self._grid[best_node], estimates, factor
+
+    def _second_ends(self, gain: Float, allowed: float) -> tuple[Float, Float]:
+        """Return the ends of the second temperature's interval, interpolated between the tried nodes."""
+        low, high = np.full(gain.size, -np.inf), np.full(gain.size, np.inf)
+        for k in range(gain.size):
+            tried = np.flatnonzero(np.isfinite(self._gain[k]))
+            root = np.sqrt(np.maximum(gain[k] - self._gain[k, tried], 0.0)) - np.sqrt(allowed)
+            inside = np.flatnonzero(root <= 0)
+            x = self._grid[tried]
+            a, b = inside[0], inside[-1]
+            if a > 0:
+                low[k] = np.exp(np.interp(0.0, [root[a], root[a - 1]], [x[a], x[a - 1]]))
+            if b < tried.size - 1:
+                high[k] = np.exp(np.interp(0.0, [root[b], root[b + 1]], [x[b], x[b + 1]]))
+        return low, high
+
+
+def _covariance(
+    model: FlareModel, reduction: Reduction, best: BestFit, second: Float, estimates: Float, factor: Float
+) -> Float:
+    """Return the covariance of quantities, (n, n_derived + 2, n_derived + 2), from the Fisher information."""
+    n, m = best.linear.shape
+    a, b = best.linear[:, 0], best.linear[:, 1]
+    columns = [reduction.spline(best.log_k), reduction.spline(second)]
+    columns += [np.tile(row, (n, 1)) for row in reduction.fixed]
+    columns += [a[:, None] * reduction.spline(best.log_k, 1), b[:, None] * reduction.spline(second, 1)]
+    jacobian = np.stack(columns, axis=1)
+    over = np.where(factor > 0.0, factor, np.nan)
+    gradient, by_factor = np.zeros((n, len(model.derived) + 2, m + 2)), np.zeros((n, len(model.derived) + 2))
+    for q, (one, spline) in enumerate(zip(model.derived, model.splines, strict=True)):
+        if spline is None or one.factors is None:
+            gradient[:, q, m] = np.exp(best.log_k)
+            continue
+        here, there = spline(best.log_k), spline(second)
+        gradient[:, q, 0], gradient[:, q, 1], gradient[:, q, 2:m] = here[:, 0], there[:, 0], here[:, 1:]
+        gradient[:, q, m] = spline(best.log_k, 1)[:, 0] * a
+        gradient[:, q, m + 1] = spline(second, 1)[:, 0] * b
+        gradient[:, q] /= over[:, None]
+        by_factor[:, q] = -estimates[:, q] / over
+    gradient[:, -2, m + 1] = np.exp(second)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        areas = estimates[:, -1]
+        bolometric = model.splines[model.names.index("flux bolometric")]
+        assert bolometric is not None
+        slopes = [4.0 - bolometric(x, 1)[:, 0] / bolometric(x)[:, 0] for x in (best.log_k, second)]
+        gradient[:, -1, 0], gradient[:, -1, 1] = -areas / a, areas / b
+        gradient[:, -1, m], gradient[:, -1, m + 1] = areas * slopes[0], -areas * slopes[1]
+    own = np.zeros((n, by_factor.shape[1], by_factor.shape[1]))
+    if reduction.light is not None:
+        light = reduction.light
+        weights = [light.spline(best.log_k), light.spline(second), *(np.full(n, one) for one in light.fixed)]
+        weights += [a * light.spline(best.log_k, 1), b * light.spline(second, 1)]
+        gradient -= by_factor[:, :, None] * np.stack(weights, axis=1)[:, None, :] / light.scale
+        own = by_factor[:, :, None] * by_factor[:, None, :] / light.scale**2
+    information = np.einsum("nik,njk->nij", jacobian, jacobian)
+    good = (best.linear > 0).all(axis=1)
+    information[~good] = np.eye(m + 2)
+    inverse = np.linalg.pinv(information, rcond=1e-14, hermitian=True)
+    inverse[~good] = np.nan
+    spread = np.einsum("nqi,nij,nrj->nqr", np.nan_to_num(gradient), inverse, np.nan_to_num(gradient))
+    return np.asarray(spread + np.nan_to_num(own))

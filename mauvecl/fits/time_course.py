@@ -1,0 +1,876 @@
+"""Fits of flares along a stare: in bins of frames, and with a temperature that falls.
+
+Joint fit of a flare's shape and spectrum along a stare, with a temperature that falls.
+
+Frames are reduced to weighted sums that are sufficient for spectra of all temperatures (`results.measurements`). The
+model of their means is one `Event` with `Cooling`. Their covariances depend on the fitted flare, so that each fit is
+repeated with the covariances of the previous one. Unknown levels that are constant over the stare, and the unknown
+changes and jitters of the stare, are marginalised over. Those of all light change that of the flare as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache, cached_property, lru_cache
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike, NDArray
+
+from mauvecl.detection.nuisances import Nuisances, spectrum_of
+from mauvecl.fits.flare_model import EVERY, Exposures, Ranges, Reduction
+from mauvecl.fits.spectrum import LEVELS, Measurement, clipped_pixels, fit
+from mauvecl.flares.cooling import Cooling
+from mauvecl.flares.events import Event
+from mauvecl.flares.frames import Components
+from mauvecl.flares.shapes import Shape, shape_of
+from mauvecl.flares.stare import Stare
+from mauvecl.noise.unknowns import CHANGING, Changing
+from mauvecl.schema.calls import validated
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Range
+from mauvecl.schema.physical import Duration, Moment, Probability, Wavelength
+from mauvecl.schema.tables import Column, table_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from astropy.table import QTable
+
+    from mauvecl.fits.flare_model import FlareModel
+    from mauvecl.host.exposure.expectation import Expectation
+
+Float = NDArray[np.float64]
+
+#: Bins span at most this many frames, which bounds the time that the search for them takes.
+MOST_FRAMES_PER_BIN = 4096
+#: Every n-th temperature of the model is tried for the filter that chooses the bins.
+BINS_EVERY = 8
+#: Bins whose known conditions agree to this many digits are fitted together.
+DIGITS = 6
+
+
+#: Heading, format and heading of the error of quantities in printed tables.
+SHOWN = {
+    "temperature": ("temperature (K)", ".0f", "error"),
+    "flux_bolometric": ("bolometric flux (erg/s/cm2)", ".3g", ""),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredBins:
+    """Flares measured in bins of consecutive frames.
+
+    Attributes
+    ----------
+    first, count : ndarray of int, shape (n_bin,)
+        First frame of each bin, and number of frames in it.
+    start_s, end_s : ndarray, shape (n_bin,)
+    found : Measurement
+        One row per bin. Amplitudes, fluxes and luminosities are means over the bin; energies are those within it.
+    """
+
+    first: NDArray[np.intp]
+    count: NDArray[np.intp]
+    start_s: Float
+    end_s: Float
+    found: Measurement
+
+    def table(self) -> QTable:
+        """Return times, estimates, errors and intervals, one row per bin."""
+        return table_of(self.columns, [self])
+
+    @property
+    def columns(self) -> list[Column]:
+        """Columns of the table; those of the quantities depend on the model."""
+        found = self.found
+        return [
+            Column("start", "start_s", "s", "start of the bin, from the start of the stare", "from (s)", "g"),
+            Column("end", "end_s", "s", "end of the bin", "to (s)", "g"),
+            Column("frames", "count", "", "frames of the bin"),
+            Column("snr", "found.snr", "", "S/N of the flare in the bin", "S/N", ".1f"),
+            *(column for q in range(len(found.names)) for column in self._quantity(q)),
+            Column("chi2", "found.chi2", "", f"chi-squared of the fit, of {found.dof} degrees of freedom"),
+            Column("p_value", "found.p_value", "",
+                   "probability of a chi-squared at least as large if the model is correct", "p-value", ".2g"),
+        ]  # fmt: skip
+
+    def _quantity(self, q: int) -> list[Column]:
+        """Return the columns of a quantity's estimates, errors and intervals."""
+        from astropy import units
+
+        found, name = self.found, self.found.names[q]
+        column, unit = name.replace(" ", "_"), str(units.Unit(found.units[q]))
+        heading, spec, error = SHOWN.get(column, ("", "", ""))
+        columns = [
+            Column(column, lambda bins: bins.found.estimates[:, q], unit, f"{name} of the flare", heading, spec),
+            Column(f"{column}_error", lambda bins: bins.found.errors[:, q], unit, "its standard error", error, spec),
+        ]
+        for k, level in enumerate(found.levels):
+            text = f"end of its {100 * level:.4g} % interval; infinite where there is none"
+            columns += [
+                Column(f"{column}_low_{100 * level:.0f}", self._end("low", k, q), unit, f"lower {text}"),
+                Column(f"{column}_high_{100 * level:.0f}", self._end("high", k, q), unit, f"higher {text}"),
+            ]
+        return columns
+
+    @staticmethod
+    def _end(side: str, level: int, q: int) -> Callable[[MeasuredBins], Float]:
+        return lambda bins: np.asarray(getattr(bins.found, side)[level][:, q])
+
+
+@validated
+def measure_along(
+    frames: ArrayLike,
+    quiet: Expectation,
+    model: FlareModel,
+    nuisances: Nuisances | None = None,
+    *,
+    snr_per_bin: Annotated[float, Range(0, open_low=True)] = 20.0,
+    stare: Stare | None = None,
+    levels: Sequence[Probability] = LEVELS,
+    skipped_nm: Sequence[tuple[Wavelength, Wavelength]] = (),
+) -> MeasuredBins:
+    """Measure a flare against time, in bins of consecutive frames in which it reaches an S/N.
+
+    Each bin is the shortest run of frames after the previous bin in which a matched filter reaches `snr_per_bin`; its
+    frames are added up and fitted as one exposure (`fit`). Frames without enough light before, between and after
+    flares are not in any bin. The filter has the temperature that fits the brightest part of the stare. Since noise
+    also decides where a bin ends, amplitudes are biased high by about one standard error over `snr_per_bin`; below an
+    S/N of 8, noise alone occasionally produces bins.
+
+    Parameters
+    ----------
+    frames : array_like, shape (n_frame, n_pixel)
+        Raw DN of single frames.
+    quiet : Expectation
+        One frame of the quiescent star.
+    model : FlareModel
+        Model of one frame.
+    nuisances : Nuisances, optional
+        Unknown amplitudes of known spectra, for one frame; each bin has its own constant amplitudes.
+    snr_per_bin : float
+    stare : Stare, optional
+        Times, known conditions and unknown changes of the frames; frames without gaps and changes by default. An
+        unknown change of the stare has its prior in each bin, unless `nuisances` has one of the same name. Bins do
+        not extend over gaps.
+    levels : sequence of float
+        Nominal coverage of the intervals.
+    skipped_nm : sequence of tuple
+        Wavelength ranges of pixels that are not used.
+
+    Raises
+    ------
+    InputError
+        If the frames have another shape, the expectation has several frames, or no bin reaches the S/N.
+    """
+    raw, stare = checked_frames(frames, quiet, stare)
+    if not 0.0 < snr_per_bin < np.inf:
+        raise InputError.of("snr_per_bin", snr_per_bin, "a number above 0")
+    bins = _bins(raw, quiet, model, nuisances, known_strengths(stare, quiet), stare, snr_per_bin, skipped_nm)
+    if not bins:
+        raise InputError.of("snr_per_bin", snr_per_bin, "an S/N that a bin of the stare reaches")
+    first, end = np.array(bins).T
+    return fit_bins(raw, quiet, model, nuisances, stare, first, end - first, levels, skipped_nm)
+
+
+def checked_frames(frames: ArrayLike, quiet: Expectation, stare: Stare | None) -> tuple[Float, Stare]:
+    """Return raw frames of a stare and the stare; raises InputError unless they and the expectation agree."""
+    raw = np.asarray(frames, np.float64)
+    if raw.ndim != 2:
+        raise InputError(
+            f"frames of the shape {raw.shape}", "two dimensions: frames and pixels", key="frames", value=raw.shape
+        )
+    if stare is None:
+        here = quiet.conditions["temperature_c"]
+        stare = Stare.of(max(len(raw), 1) * quiet.frame_s, frame_s=quiet.frame_s, temperature_c=here)
+    n_pixel = quiet.wavelength_nm.size
+    if raw.shape != (stare.n_frames, n_pixel):
+        raise InputError(
+            f"frames of the shape {raw.shape}", f"{(stare.n_frames, n_pixel)}", key="frames", value=raw.shape
+        )
+    if not np.isfinite(raw).all():
+        raise InputError("frames hold undefined values", "finite numbers", key="frames")
+    if quiet.n_frames != 1:
+        raise InputError.of("n_frames", quiet.n_frames, "one frame of the quiescent star")
+    return raw, stare
+
+
+def fit_bins(
+    raw: Float,
+    quiet: Expectation,
+    model: FlareModel,
+    nuisances: Nuisances | None,
+    stare: Stare,
+    first: NDArray[np.intp],
+    count: NDArray[np.intp],
+    levels: Sequence[float] = LEVELS,
+    skipped_nm: Ranges = (),
+) -> MeasuredBins:
+    """Fit bins of frames; parameters as for `measure_along`, with the first frames of bins and their numbers."""
+    known, end = known_strengths(stare, quiet), first + count
+    alike: dict[tuple[float, ...], list[int]] = {}
+    for k, (a, b) in enumerate(zip(first, end, strict=True)):
+        mean = [*known[a:b].mean(axis=0), *spreads_of(stare, a, b).values()]
+        alike.setdefault((float(b - a), *np.round(mean, DIGITS).tolist()), []).append(k)
+    parts = []
+    for (length, star, sky, dark, light, *spreads), rows in alike.items():
+        n = int(length)
+        stacked = replace(
+            quiet, n_frames=n, source_electrons=star * quiet.source_electrons,
+            sky_electrons=sky * quiet.sky_electrons, dark_dn=dark * quiet.dark_dn,
+            neighbour_electrons=light * quiet.neighbour_electrons,
+        )  # fmt: skip
+        unknown = Nuisances.of(stacked, {}) if nuisances is None else replace(nuisances, spectra=n * nuisances.spectra)
+        for of, sd in zip(CHANGING, spreads, strict=True):
+            unknown = _with_change(unknown, stacked, of, sd)
+        added = np.array([raw[first[k] : end[k]].sum(axis=0) for k in rows])
+        own = unknown if unknown.names else None
+        parts.append(fit(added, stacked, model.stacked(n, light), own, levels=levels, skipped_nm=skipped_nm))
+    order = np.argsort(np.concatenate(list(alike.values())))
+    found = Measurement.joined(parts).rows(order)
+    return MeasuredBins(first, count, stare.start_s[first], stare.start_s[end - 1] + stare.frame_s, found)
+
+
+def spreads_of(stare: Stare, first: int, end: int) -> dict[Changing, float]:
+    """Return the standard deviations of the unknown changes of a stare, averaged over some frames."""
+    found = {of: sd**2 / (end - first) for of, sd in stare.jitters.items()} | {"star": 0.0}
+    for one in stare.unknowns:
+        found[one.of] += (one.sd * float(one.curve[first:end].mean())) ** 2
+    if stare.pointing is not None:
+        found["light"] += stare.pointing.depth**2
+    return {of: float(np.sqrt(found[of])) for of in CHANGING}
+
+
+def _with_change(unknown: Nuisances, quiet: Expectation, of: Changing, sd: float) -> Nuisances:
+    """Return nuisance parameters with an unknown change of a stare, unless they have one of the same kind."""
+    name = {"temperature": "dark"}.get(of, of)
+    if not sd > 0.0 or name in unknown.names:
+        return unknown
+    if name == "star":
+        return unknown.with_spectrum(name, quiet.net_source_dn, sd)
+    return unknown.joined(Nuisances.of(quiet, {name: sd})) if spectrum_of(name, quiet).any() else unknown
+
+
+def known_strengths(stare: Stare, quiet: Expectation) -> Float:
+    """Return known strengths of star, sky, dark, and flare and neighbours in each frame, shape (n_frame, 4)."""
+    return np.column_stack([stare.light * stare.star, stare.light * stare.sky, stare.dark_factor(quiet), stare.light])
+
+
+def less_known(raw: Float, quiet: Expectation, known: Float, weights: Float) -> Float:
+    """Return weighted sums, (n_frame, n_sum), of frames less their means without a flare for `known_strengths`."""
+    means = np.vstack([quiet.net_source_dn, quiet.sky_dn, quiet.dark_dn, quiet.neighbour_dn, quiet.bias_dn])
+    strengths = np.column_stack([known, np.ones(len(known))])
+    return np.asarray(raw @ weights.T - strengths @ (means @ weights.T))
+
+
+def _bins(
+    raw: Float,
+    quiet: Expectation,
+    model: FlareModel,
+    nuisances: Nuisances | None,
+    known: Float,
+    stare: Stare,
+    snr: float,
+    skipped_nm: Ranges,
+) -> list[tuple[int, int]]:
+    """Return first frames and ends of the shortest runs of frames in which a matched filter reaches an S/N."""
+    reduction = Reduction.of(model, quiet, None, nuisances, skipped_nm)
+    sums = less_known(raw, quiet, known, reduction.weights)
+    total = np.vstack([np.zeros(sums.shape[1]), np.cumsum(sums, axis=0)])
+    shapes = reduction.hot[::BINS_EVERY] / np.linalg.norm(reduction.hot[::BINS_EVERY], axis=1)[:, None]
+    widths = 2 ** np.arange(int(np.log2(len(raw))) + 1)
+    best = [((total[w:] - total[:-w]) @ shapes.T).max(axis=0) / np.sqrt(w) for w in widths]
+    node = int(np.argmax(np.max(best, axis=0)))
+    light = model.hot[::BINS_EVERY][node]
+    weights = shapes[node] @ reduction.weights
+    # The variance of a frame's value is one plus that of the flare's photons, which is proportional to its light.
+    per_value = float(weights**2 @ (quiet.gain_dn_per_electron * light) / (weights @ light))
+    value = total @ shapes[node]
+    bins = []
+    gaps = np.flatnonzero(np.diff(stare.numbers) > 1) + 1
+    for begin, stop in zip([0, *gaps], [*gaps, len(raw)], strict=True):
+        start = int(begin)
+        for end in range(int(begin) + 1, int(stop) + 1):
+            earliest = max(start, end - MOST_FRAMES_PER_BIN)
+            gain = value[end] - value[earliest:end]
+            variance = np.arange(end - earliest, 0, -1) + per_value * np.maximum(gain, 0.0)
+            reached = np.flatnonzero(gain >= snr * np.sqrt(variance))
+            if reached.size:
+                bins.append((earliest + int(reached[-1]), end))
+                start = end
+    return bins
+
+
+Pair = tuple[Float, Float]
+
+#: Parameters, all but the first as logarithms; the temperature at the end is relative to that at the peak.
+PARAMETERS = ("peak time", "half width", "amplitude", "temperature", "end temperature", "cooling time")
+#: Number of fits after the first, each with the covariances of the previous fit.
+REFITS = 3
+#: Reach of the search for the end of an interval, in standard errors.
+REACH = 12.0
+#: Smallest standard error, relative or in s, of a parameter that the frames constrain.
+NO_STEP = 1e-9
+#: Largest number of Newton's steps to the end of an interval, their largest length and that of the last one, relative
+#: to the rise of chi-squared, and the largest condition number of the scaled information.
+NEWTON_STEPS, LONGEST, CONVERGED, WORST_CONDITION = 20, 1.5, 1e-6, 1e10
+
+
+def _remembering(function: Callable[[Float], Pair]) -> Callable[[Float], Pair]:
+    """Return a function that keeps its last results, since it is asked at the same parameters in turn."""
+
+    @lru_cache(maxsize=2)
+    def of_bytes(theta: bytes) -> Pair:
+        return function(np.frombuffer(theta))
+
+    return lambda theta: of_bytes(theta.tobytes())
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """Unknown amplitude of known changes of the frames."""
+
+    sd: float  # of its prior
+    sums: Float  # change of the frames without a flare for unit amplitude, shape (n_frame, n_sum)
+    curve: Float  # change of the flare's light, shape (n_frame,); zero if it does not change
+    # Sums of a blackbody of amplitude 1 for a curve of 1, over log temperature.
+    flare: scipy.interpolate.CubicSpline
+
+    def around(self, flare: Pair | None) -> Float:
+        """Return the changes for unit amplitude next to a flare of known strengths, shape (n_frame, n_sum)."""
+        if flare is None or not self.curve.any():
+            return self.sums
+        rise, log_k = flare
+        return np.asarray(self.sums + (self.curve * rise)[:, None] * self.flare(log_k))
+
+
+@dataclass(frozen=True, eq=False)
+class _Data:
+    """Sums of frames less their known means, and their covariances."""
+
+    sums: Float  # shape (n_frame, n_sum)
+    edges: Float  # starts and ends of frames, s, shape (n_frame, 2)
+    light: Float  # known factors on the light of the flare, shape (n_frame,)
+    quiet_covariance: Float  # shape (n_frame, n_sum, n_sum)
+    unknown: tuple[_Level, ...]  # levels of the stare
+    jitters: tuple[_Level, ...]  # levels that differ from frame to frame
+    reduction: Reduction
+    model: FlareModel
+    gain: Float
+    shape: Shape
+
+    def intrinsic(self, values: Float) -> Float:
+        """Return values of the frames that are proportional to the light, before the known losses of it."""
+        return np.asarray(values / np.where(self.light > 0, self.light, 1.0))
+
+    @cached_property
+    def spread(self) -> scipy.interpolate.CubicSpline:
+        """Covariance that a blackbody of amplitude 1 adds, over log temperature."""
+        weights = self.reduction.weights
+        added = np.einsum("ip,jp,tp->tij", weights, weights, self.model.hot * self.gain, optimize=True)
+        return scipy.interpolate.CubicSpline(self.model.log_k, added)
+
+    @cached_property
+    def _middle(self) -> Float:
+        """Middle of each frame, s."""
+        return np.asarray(self.edges.mean(axis=1))
+
+    @cached_property
+    def strengths(self) -> Callable[[Float], Pair]:
+        """Function of the parameters that returns the amplitude and log temperature of each frame."""
+        return _remembering(self._strengths)
+
+    @cached_property
+    def slopes(self) -> Callable[[Float], Pair]:
+        """Function that returns the derivatives of `strengths` by the parameters, each of shape (6, n_frame)."""
+        return _remembering(self._slopes)
+
+    def _strengths(self, theta: Float) -> Pair:
+        rise = np.exp(theta[2]) * self.light * self.shape.mean_over(self.edges, theta[0], np.exp(theta[1]))
+        log_k = theta[3] + np.log(self._cooled(theta)[0])
+        return rise, np.clip(log_k, self.model.log_k[0], self.model.log_k[-1])
+
+    def _cooled(self, theta: Float) -> tuple[Float, Float, float]:
+        """Return temperatures over that at the peak, as in `Cooling`, times since the peak, and the end."""
+        since = np.maximum(self._middle - theta[0], 0.0)
+        end = min(float(np.exp(theta[4])), 1.0)
+        return end + (1.0 - end) * np.exp(-since / np.exp(theta[5])), since, end
+
+    def _slopes(self, theta: Float) -> Pair:
+        rise, log_k = self.strengths(theta)
+        width, amplitude, fold = np.exp(theta[[1, 2, 5]])
+        tau, span = (self.edges - theta[0]) / width, np.diff(self.edges, axis=1)[:, 0]
+        at, factor = self.shape.at(tau), amplitude * self.light / span
+        of_rise, of_log_k = np.zeros((2, len(PARAMETERS), rise.size))
+        of_rise[0], of_rise[1] = factor * (at[:, 0] - at[:, 1]), rise - factor * width * np.diff(at * tau, axis=1)[:, 0]
+        of_rise[2] = rise
+        cooled, since, end = self._cooled(theta)
+        falling = (cooled - end) / cooled
+        of_log_k[0], of_log_k[3], of_log_k[5] = (since > 0.0) * falling / fold, 1.0, falling * since / fold
+        if theta[4] < 0.0:
+            of_log_k[4] = end / cooled * (1.0 - (cooled - end) / (1.0 - end))
+        inside = (log_k > self.model.log_k[0]) & (log_k < self.model.log_k[-1])
+        return of_rise, of_log_k * inside
+
+    def whitening(self, theta: Float | None, *, none: bool = False) -> _Whitening:
+        """Return the whitening of residuals for the covariances of a flare, or of frames without one.
+
+        With `none`, the unknown levels are those of frames without a flare, whose residuals are then compared.
+        """
+        covariance, flare = self.quiet_covariance, None
+        if theta is not None:
+            flare = self.strengths(theta)
+            covariance = covariance + flare[0][:, None, None] * self.spread(flare[1])
+        for one in self.jitters:
+            changes = one.sd * one.around(flare)
+            covariance = covariance + changes[:, :, None] * changes[:, None, :]
+        inverse = np.linalg.inv(np.linalg.cholesky(covariance))
+        if not self.unknown:
+            return _Whitening(inverse, np.zeros((0, self.sums.size)), np.zeros(0))
+        changes = np.array([one.around(None if none else flare) for one in self.unknown])
+        spectra = np.einsum("tij,utj->tiu", inverse, changes).reshape(self.sums.size, -1)
+        # The prior acts as one more datum, which is not among the residuals because its mean is zero.
+        scale = np.linalg.cholesky(spectra.T @ spectra + np.diag([one.sd**-2.0 for one in self.unknown]))
+        basis = np.linalg.solve(scale, spectra.T)
+        # I - B^T B = (I - B^T K B)^2, with K from the eigenvalues of B B^T.
+        values, vectors = np.linalg.eigh(basis @ basis.T)
+        kept = values > 1e-12
+        directions = vectors[:, kept].T @ basis / np.sqrt(values[kept])[:, None]
+        return _Whitening(inverse, directions, 1.0 - np.sqrt(np.maximum(1.0 - values[kept], 0.0)))
+
+    def residuals(self, theta: Float, whitening: _Whitening) -> Float:
+        """Return residuals whose squares add up to chi-squared with the unknown levels marginalised over."""
+        rise, log_k = self.strengths(theta)
+        return np.asarray(whitening.of((self.sums - rise[:, None] * self.reduction.spline(log_k))[None])[0])
+
+    def jacobian(self, theta: Float, whitening: _Whitening) -> Float:
+        """Return the derivatives of `residuals` with respect to the parameters, shape (n, 6)."""
+        (rise, log_k), (of_rise, of_log_k) = self.strengths(theta), self.slopes(theta)
+        hot, slope = self.reduction.spline(log_k), self.reduction.spline(log_k, 1)
+        return np.asarray(-whitening.of(of_rise[..., None] * hot + (rise * of_log_k)[..., None] * slope).T)
+
+
+@dataclass(frozen=True, eq=False)
+class _Whitening:
+    """Inverse Cholesky factors of the frames' covariances, and how much directions of unknown levels shrink."""
+
+    inverse: Float  # shape (n_frame, n_sum, n_sum)
+    directions: Float  # orthonormal, shape (n_unknown, n_frame n_sum)
+    shrink: Float
+
+    def of(self, values: Float) -> Float:
+        """Return whitened sums, shape (n, n_frame n_sum), of sums (n, n_frame, n_sum)."""
+        plain = (self.inverse @ values.transpose(1, 2, 0)).transpose(2, 0, 1).reshape(len(values), -1)
+        return np.asarray(plain - (self.shrink * (plain @ self.directions.T)) @ self.directions)
+
+
+@dataclass(frozen=True)
+class _Quantity:
+    """Quantity that a joint fit reports."""
+
+    name: str
+    unit: str
+    place: int  # parameter that is varied to hold the quantity fixed: its own, or the amplitude
+    spline: scipy.interpolate.CubicSpline | None = None  # light per amplitude over log temperature
+    factor: float = 1.0
+
+    def value(self, theta: Float, data: _Data) -> float:
+        """Return the quantity of some parameters."""
+        if self.spline is not None:
+            rise, log_k = data.strengths(theta)
+            return self.factor * float(np.sum(data.intrinsic(rise) * self.spline(log_k)[:, 0]))
+        if self.place == 0:
+            return float(theta[0])
+        # The temperature at the end is relative to that at the peak.
+        return float(np.exp(theta[self.place] + (theta[3] if self.place == 4 else 0.0)))
+
+    def slope(self, theta: Float, data: _Data) -> Float:
+        """Return the derivatives of the quantity's logarithm, or of the peak time, shape (6,)."""
+        if self.spline is None:
+            found = np.zeros(len(PARAMETERS))
+            found[[self.place, 3] if self.place == 4 else self.place] = 1.0
+            return found
+        (rise, log_k), (of_rise, of_log_k) = data.strengths(theta), data.slopes(theta)
+        light, change = self.spline(log_k)[:, 0], self.spline(log_k, 1)[:, 0]
+        total = float(np.sum(data.intrinsic(rise) * light))
+        return np.asarray(data.intrinsic(of_rise * light + rise * of_log_k * change).sum(axis=1) / total)
+
+
+class CoolingCourse(NamedTuple):
+    """A flare in the quantities of a fit, and frame by frame, added up over the pixels that are used."""
+
+    values: Float  # shape (n_derived,)
+    drawn_dn: Float  # of the frames less their known mean without a flare, shape (n_frame,)
+    mean_dn: Float  # of the flare
+    kelvin: Float
+
+
+@validated
+def fit_cooling(
+    frames: ArrayLike,
+    quiet: Expectation,
+    model: FlareModel,
+    nuisances: Nuisances | None = None,
+    *,
+    peak_s: Moment,
+    half_width_s: Duration,
+    shape: Shape | str = "davenport2014",
+    cooling: bool = True,
+    stare: Stare | None = None,
+    levels: Sequence[Probability] = LEVELS,
+    skipped_nm: Sequence[tuple[Wavelength, Wavelength]] = (),
+) -> Measurement:
+    """Fit the shape of one flare and a blackbody whose temperature falls to all frames of a stare together.
+
+    Parameters
+    ----------
+    frames : array_like, shape (n_frame, n_pixel)
+        Raw DN of single frames.
+    quiet : Expectation
+        One frame of the quiescent star.
+    model : FlareModel
+        A blackbody, of one frame.
+    nuisances : Nuisances, optional
+        Unknown amplitudes of known spectra, for one frame; they are constant over the stare.
+    peak_s, half_width_s : float
+        Starting point of the fit, such as the result of a search.
+    shape : Shape or str
+    cooling : bool
+        Whether the temperature falls after the peak, as in `Cooling`; constant otherwise.
+    stare : Stare, optional
+        Times, known conditions and unknown changes of the frames; frames without gaps and changes by default.
+    levels : sequence of float
+        Nominal coverage of the intervals, by profile likelihood.
+    skipped_nm : sequence of tuple
+        Wavelength ranges of pixels that are not used.
+
+    Returns
+    -------
+    Measurement
+        One row with peak time, half-width, amplitude, and temperature at the peak; with `cooling`, also the final
+        temperature and the cooling time; fluences within the frames, and energies if the model has a distance.
+        Chi-squared is that of the frames' sums.
+
+    Raises
+    ------
+    InputError
+        If the frames have another shape, the model has a jump or lines, the stare contains no light of the flare, or
+        every pixel is near saturation in a frame.
+    """
+    if len(model.linear) > 1:
+        raise InputError(f"a model of {', '.join(model.linear)}", "a blackbody alone", key="model", value=model.linear)
+    raw, stare = checked_frames(frames, quiet, stare)
+    data = _data(raw, quiet, model, nuisances, stare, shape_of(shape), skipped_nm)
+    free = np.arange(len(PARAMETERS) if cooling else 4)
+    low, high = _limits(model, stare)
+    whitening = data.whitening(None)
+    theta = np.clip(_start(data, whitening, peak_s, half_width_s, cooling), low, high)
+    for _ in range(REFITS):
+        theta = _solve(data, whitening, theta, free, low, high)
+        whitening = data.whitening(theta)
+    theta = _solve(data, whitening, theta, free, low, high)
+
+    best = float(np.sum(data.residuals(theta, whitening) ** 2))
+    jacobian = data.jacobian(theta, whitening)[:, free]
+    covariance = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
+    quantities = _quantities(data, stare, cooling)
+    estimates = np.array([one.value(theta, data) for one in quantities])
+    scale = np.array([1.0 if one.place == 0 else value for one, value in zip(quantities, estimates, strict=True)])
+    slopes = scale[:, None] * np.array([one.slope(theta, data) for one in quantities])[:, free]
+    spread = slopes @ covariance @ slopes.T
+    ends = np.full((2, len(levels), len(quantities)), np.nan)
+    names = [one.name for one in quantities]
+    rises = [float(scipy.stats.chi2.ppf(level, 1)) for level in levels]
+    for q, one in enumerate(quantities):
+        if one.name.startswith("energy"):
+            fluence = names.index(one.name.replace("energy", "fluence"))
+            ends[:, :, q] = estimates[q] / estimates[fluence] * ends[:, :, fluence]
+            continue
+        for side, sign in enumerate((-1.0, 1.0)):
+            for k, rise in enumerate(rises):
+                limit = best + rise
+                end = _newton_end(data, whitening, theta, free, (low, high), one, sign, best, limit)
+                if end is None:
+                    step = sign * float(np.sqrt(spread[q, q])) / max(abs(scale[q]), 1e-300)
+                    end = _end(data, whitening, theta, free, (low, high), one, step, limit)
+                ends[side, k, q] = end
+    dof = data.sums.size - free.size - sum(np.isinf(one.sd) for one in data.unknown)
+    empty = np.full(theta.shape, -np.inf)
+    without = data.whitening(theta, none=True)
+    none = float(np.sum(data.residuals(np.where(np.arange(theta.size) == 2, empty, theta), without) ** 2))
+    return Measurement(
+        tuple(names), tuple(one.unit for one in quantities), (-np.inf,) + (0.0,) * (len(quantities) - 1),
+        estimates[None], spread[None], tuple(levels), ends[0][:, None], ends[1][:, None], np.array([best]),
+        np.array([float(scipy.stats.chi2.sf(best, dof))]), dof, np.array([np.sqrt(max(none - best, 0.0))]),
+        theta[3:4], np.exp(theta[2:3])[None], np.ones(1),
+    )  # fmt: skip
+
+
+def cooling_course(
+    event: Event,
+    found: Measurement,
+    frames: Float,
+    quiet: Expectation,
+    model: FlareModel,
+    stare: Stare,
+    skipped_nm: Ranges = (),
+) -> CoolingCourse:
+    """Return a flare in the quantities of a fit and in each frame; parameters as for `fit_cooling`."""
+    data = _data(frames, quiet, model, None, stare, event.form, skipped_nm)
+    cooling = event.temperature
+    if not isinstance(cooling, Cooling):
+        cooling = Cooling(cooling, cooling, stare.frame_s)
+    logs = np.log([event.half_width_s, event.amplitude, cooling.peak_k, cooling.end_k / cooling.peak_k, cooling.fold_s])
+    theta = np.array([event.peak_s, *logs])
+    values = {one.name: one.value(theta, data) for one in _quantities(data, stare, cooling=True)}
+    rise, log_k = data.strengths(theta)
+    used = (data.reduction.variance > 0).astype(np.float64)
+    return CoolingCourse(
+        np.array([values[name] for name in found.names]),
+        less_known(frames, quiet, known_strengths(stare, quiet), used[None])[:, 0],
+        rise * (model.hot_spline(log_k) @ used),
+        np.exp(log_k),
+    )
+
+
+def cooling_event(found: Measurement, shape: Shape) -> Event:
+    """Return the flare that `fit_cooling` found."""
+    best = dict(zip(found.names, found.estimates[0].tolist(), strict=True))
+    kelvin: float | Cooling = best["temperature"]
+    if "cooling time" in best:
+        kelvin = Cooling(best["temperature"], min(best["end temperature"], best["temperature"]), best["cooling time"])
+    return Event(best["peak time"], best["half width"], best["amplitude"], kelvin, shape)
+
+
+def _data(
+    raw: Float,
+    quiet: Expectation,
+    model: FlareModel,
+    nuisances: Nuisances | None,
+    stare: Stare,
+    shape: Shape,
+    skipped_nm: Ranges,
+) -> _Data:
+    # The unknowns are parameters of the stare, so the weights of single frames do not remove them.
+    clipped = clipped_pixels(Exposures(raw, quiet.recorded_dn), quiet, np.arange(len(raw)))
+    reduction = Reduction.of(model, quiet, skipped_nm=skipped_nm, clipped=clipped)
+    weights, strengths = reduction.weights, known_strengths(stare, quiet)
+    sums = less_known(raw, quiet, strengths, weights)
+    constant, each = Components(quiet, np.zeros((0, weights.shape[1])), weights).sum_cumulants(2)
+    covariance = constant + np.tensordot(strengths, each, 1)
+    edges = np.column_stack([stare.start_s, stare.start_s + stare.frame_s])
+    gain = np.asarray(quiet.gain_dn_per_electron) * np.ones(weights.shape[1])
+    unknown, jitters = _levels_of_stare(quiet, reduction, stare, strengths)
+    light = strengths[:, 3]
+    if nuisances is not None:
+        unknown = (*_constant_levels(nuisances, model, weights, len(sums)), *unknown)
+        sums, light = sums - weights @ nuisances.mean_dn, nuisances.mean_factor * light
+    return _Data(sums, edges, light, covariance, unknown, jitters, reduction, model, gain, shape)
+
+
+def _constant_levels(nuisances: Nuisances, model: FlareModel, weights: Float, n_frames: int) -> tuple[_Level, ...]:
+    """Return unknown levels that are constant over a stare."""
+    found = []
+    for sd, spectrum, of_flare in zip(nuisances.sd, nuisances.spectra, nuisances.of_flare, strict=True):
+        sums = np.tile(weights @ spectrum, (n_frames, 1))
+        spline = scipy.interpolate.CubicSpline(model.log_k, (model.hot * of_flare) @ weights.T)
+        found.append(_Level(float(sd), sums, np.full(n_frames, float(of_flare.any())), spline))
+    return tuple(found)
+
+
+def _levels_of_stare(
+    quiet: Expectation, reduction: Reduction, stare: Stare, strengths: Float
+) -> tuple[tuple[_Level, ...], tuple[_Level, ...]]:
+    """Return the unknown changes of a stare, and its jitters."""
+    star, sky, dark, near = (
+        part[:, None] * (reduction.weights @ mean)
+        for part, mean in zip(
+            strengths.T, (quiet.net_source_dn, quiet.sky_dn, quiet.dark_dn, quiet.neighbour_dn), strict=True
+        )
+    )
+    slope = quiet.conditions["dark_slope_per_c"]
+    changes = {"star": star, "light": star + sky + near, "sky": sky, "temperature": slope * dark}
+
+    def level(of: Changing, sd: float, curve: Float) -> _Level:
+        of_flare = curve if of == "light" else np.zeros_like(curve)
+        return _Level(sd, curve[:, None] * changes[of], of_flare, reduction.spline)
+
+    ones, jitters = np.ones(len(strengths)), dict(stare.jitters)
+    if stare.pointing is not None:
+        jitters["light"] = float(np.hypot(jitters["light"], stare.pointing.depth))
+    return (
+        tuple(level(one.of, one.sd, one.curve) for one in stare.unknowns),
+        tuple(level(of, sd, ones) for of, sd in jitters.items() if sd > 0.0),
+    )
+
+
+def _start(data: _Data, whitening: _Whitening, peak_s: float, half_width_s: float, cooling: bool) -> Float:
+    """Return starting parameters: the best amplitude and temperature at the given peak and half-width."""
+    rise = data.light * data.shape.mean_over(data.edges, peak_s, half_width_s)
+    if not rise.any():
+        raise InputError.of("peak_s", peak_s, "the peak of a flare with light in the stare")
+    nodes = slice(None, None, EVERY)
+    templates = whitening.of(rise[:, None] * data.reduction.hot[nodes, None])
+    power, along = np.sum(templates**2, axis=1), templates @ whitening.of(data.sums[None])[0]
+    best = int(np.argmax(np.maximum(along, 0.0) ** 2 / power))
+    amplitude, log_k = max(float(along[best] / power[best]), 1e-6), data.reduction.log_k[nodes][best]
+    # Somewhat hotter at the peak than on average, if it cools.
+    first, last = (0.1, -0.3) if cooling else (0.0, 0.0)
+    return np.array([peak_s, np.log(half_width_s), np.log(amplitude), log_k + first, last, np.log(2.0 * half_width_s)])
+
+
+def _limits(model: FlareModel, stare: Stare) -> tuple[Float, Float]:
+    frame, whole = stare.frame_s, float(stare.start_s[-1] - stare.start_s[0]) + stare.frame_s
+    first = float(stare.start_s[0])
+    coolest, hottest = float(model.log_k[0]), float(model.log_k[-1])
+    low = np.array([first - whole, np.log(0.1 * frame), np.log(1e-9), coolest + 1e-9, coolest - hottest, np.log(frame)])
+    high = np.array([first + 2 * whole, np.log(whole), np.log(1e9), hottest - 1e-9, 0.0, np.log(100 * whole)])
+    return low, high
+
+
+def _solve(data: _Data, whitening: _Whitening, theta: Float, free: NDArray[np.intp], low: Float, high: Float) -> Float:
+    """Return the least-squares parameters; fixed ones are unchanged."""
+    scale = np.where(free == 0, np.exp(theta[1]), 1.0)
+
+    def with_free(values: Float) -> Float:
+        there = theta.copy()
+        there[free] = values
+        return there
+
+    def residuals(values: Float) -> Float:
+        return data.residuals(with_free(values), whitening)
+
+    def jacobian(values: Float) -> Float:
+        return data.jacobian(with_free(values), whitening)[:, free]
+
+    found = scipy.optimize.least_squares(
+        residuals,
+        np.clip(theta[free], low[free] + 1e-9, high[free] - 1e-9),
+        jacobian,
+        bounds=(low[free], high[free]),
+        x_scale=scale,
+    )
+    return with_free(found.x)
+
+
+def _quantities(data: _Data, stare: Stare, cooling: bool) -> list[_Quantity]:
+    """Return the quantities that a fit reports."""
+    found = [
+        _Quantity("peak time", "s", 0), _Quantity("half width", "s", 1), _Quantity("amplitude", "", 2),
+        _Quantity("temperature", "K", 3),
+    ]  # fmt: skip
+    if cooling:
+        found += [_Quantity("end temperature", "K", 4), _Quantity("cooling time", "s", 5)]
+    for one, spline in zip(data.model.derived, data.model.splines, strict=True):
+        kind, _, band = one.name.partition(" ")
+        if kind == "flux":
+            found.append(_Quantity(f"fluence {band}", "erg / cm2", 2, spline, stare.frame_s))
+        elif kind == "energy":
+            found.append(_Quantity(one.name, one.unit, 2, spline))
+    return found
+
+
+def _newton_end(
+    data: _Data,
+    whitening: _Whitening,
+    theta: Float,
+    free: NDArray[np.intp],
+    limits: tuple[Float, Float],
+    quantity: _Quantity,
+    sign: float,
+    best: float,
+    allowed: float,
+) -> float | None:
+    """Return the end of a profile interval on one side, or None if Newton's steps do not find it within the limits.
+
+    Each step goes to where the quantity is extreme on the surface of equal chi-squared, of linearised residuals.
+    """
+    there = theta.copy()
+    for _ in range(NEWTON_STEPS):
+        residuals, jacobian = data.residuals(there, whitening), data.jacobian(there, whitening)[:, free]
+        information, slope = jacobian.T @ jacobian, quantity.slope(there, data)[free]
+        scale = np.sqrt(np.diag(information))
+        # A flare that does not cool leaves the cooling time without any effect.
+        if not ((scale > 0.0) & (scale < np.inf)).all():
+            return None
+        if not np.linalg.cond(information / np.outer(scale, scale)) < WORST_CONDITION:
+            return None
+        back, along = np.linalg.solve(information, np.column_stack([-(residuals @ jacobian), slope])).T
+        room = allowed - float(residuals @ residuals + residuals @ jacobian @ back)
+        step = back + sign * np.sqrt(max(room, 0.0) / (slope @ along)) * along
+        moved = float(np.sum((jacobian @ step) ** 2)) / (allowed - best)
+        there[free] += step * min(1.0, LONGEST / np.sqrt(moved))
+        if not ((limits[0] <= there) & (there <= limits[1]))[free].all():
+            return None
+        if moved < CONVERGED:
+            return quantity.value(there, data)
+    return None
+
+
+def _end(
+    data: _Data,
+    whitening: _Whitening,
+    theta: Float,
+    free: NDArray[np.intp],
+    limits: tuple[Float, Float],
+    quantity: _Quantity,
+    step: float,
+    allowed: float,
+) -> float:
+    """Return the end of a profile interval on one side; infinite if chi-squared does not rise that far."""
+    place = quantity.place
+    rest = free[free != place]
+    centre, there = quantity.value(theta, data), theta
+
+    def held(log_factor: float, theta: Float) -> Float:
+        """Return parameters with a changed quantity: by a difference for the peak, otherwise by a factor."""
+        moved = theta.copy()
+        if place == 0:
+            moved[0] = centre + log_factor
+        elif place == 4:
+            moved[4] = np.log(centre) + log_factor - moved[3]
+        else:
+            moved[place] += np.log(centre / quantity.value(moved, data)) + log_factor
+        return moved
+
+    @cache  # a root is between values that have different signs, though refits start elsewhere
+    def rise(log_factor: float) -> float:
+        nonlocal there
+
+        def with_rest(values: Float) -> Float:
+            trial = there.copy()
+            trial[rest] = values
+            trial = held(log_factor, trial)
+            trial[4] = min(trial[4], 0.0)
+            return trial
+
+        def residuals(values: Float) -> Float:
+            return data.residuals(with_rest(values), whitening)
+
+        def jacobian(values: Float) -> Float:
+            trial = with_rest(values)
+            each, slope = data.jacobian(trial, whitening), quantity.slope(trial, data)
+            return np.asarray(each[:, rest] - np.outer(each[:, place], slope[rest] / slope[place]))
+
+        low, high = limits[0][rest], limits[1][rest]
+        start = np.clip(there[rest], low + 1e-9, high - 1e-9)
+        scale = np.where(rest == 0, np.exp(theta[1]), 1.0)
+        found = scipy.optimize.least_squares(
+            residuals, start, jacobian, bounds=(low, high), x_scale=scale, xtol=1e-6, ftol=1e-8
+        )
+        there = there.copy()
+        there[rest] = found.x
+        return float(2 * found.cost - allowed)
+
+    inner, outer = 0.0, step
+    if abs(step) < NO_STEP:
+        return float(np.copysign(np.inf, step))
+    while rise(outer) < 0.0:
+        inner, outer = outer, 1.7 * outer
+        if abs(outer) > REACH * abs(step) or not limits[0][place] <= held(outer, theta)[place] <= limits[1][place]:
+            return float(np.copysign(np.inf, step))
+    there = theta
+    found = scipy.optimize.brentq(rise, inner, outer, xtol=1e-3 * abs(step), rtol=1e-6)
+    return float(centre + found if place == 0 else centre * np.exp(found))

@@ -1,0 +1,1 @@
+"""Flares in time: shapes, energies, rates and stares."""

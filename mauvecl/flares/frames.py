@@ -1,0 +1,393 @@
+"""Frames of a stare as sums of components, their light curves and spectra.
+
+Components of the frames of a stare: a few spectra, so that no frame needs its own expectation.
+
+Counts are sums of independent components: the star, the sky, the dark current, neighbours of the star, and flares of
+several temperatures. The spectrum of a component is the same in all frames, and only its strength, its coefficient,
+changes. The mean and all higher cumulants of a pixel, and of a weighted sum of pixels, are therefore linear in the
+coefficients of a frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.schema.errors import InputError
+
+if TYPE_CHECKING:
+    from mauvecl.flares.stare import Stare
+    from mauvecl.host.exposure.expectation import Expectation
+
+Float = NDArray[np.float64]
+
+#: Components of every frame; one flare component per temperature follows.
+STEADY = ("star", "sky", "dark", "neighbours")
+#: Largest number of flare temperatures, and of weighted sums.
+MOST_FLARES, MOST_STATISTICS = 8, 8
+#: Fourth cumulant of the rounding error, DN^4; its variance is 1/12.
+ROUNDING_FOURTH = -1.0 / 120.0
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """Spectra of a stare's frames, and weights of the sums that are computed for each frame.
+
+    The statistics of a frame are y_k = sum_p weights_kp (raw_p - mean_raw_p), with the mean raw counts of the quiescent
+    star at the conditions of its expectation.
+
+    Attributes
+    ----------
+    quiet : Expectation
+        A single frame of the quiescent star, for which the coefficients are one.
+    flare_electrons : ndarray, shape (n_flare, n_pixel)
+        Mean electrons per frame of flares of unit amplitude, one per temperature; at most `MOST_FLARES`.
+    weights : ndarray, shape (n_statistic, n_pixel)
+        Linearly independent, and zero in pixels that saturate.
+    """
+
+    quiet: Expectation
+    flare_electrons: Float
+    weights: Float
+
+    def __post_init__(self) -> None:
+        n_pixel = self.quiet.wavelength_nm.size
+        if self.quiet.n_frames != 1:
+            raise InputError.of("n_frames", self.quiet.n_frames, "one frame of the stare")
+        for name, what, least in (("flare_electrons", "flare spectra", 0), ("weights", "spectral weights", 1)):
+            kept = np.array(getattr(self, name), np.float64)
+            if kept.ndim != 2 or kept.shape[1] != n_pixel or len(kept) < least:
+                raise InputError(f"{what} have the shape {kept.shape}", f"(n, {n_pixel})", key=name, value=kept.shape)
+            if not np.isfinite(kept).all():
+                raise InputError(
+                    f"{what} of pixel {int(np.argmin(np.isfinite(kept).all(axis=0)))} are not finite",
+                    "finite numbers",
+                    key=name,
+                )
+            kept.setflags(write=False)
+            object.__setattr__(self, name, kept)
+        if (self.flare_electrons < 0).any():
+            pixel = int(np.argmax((self.flare_electrons < 0).any(axis=0)))
+            raise InputError(
+                f"a flare takes light from pixel {pixel}",
+                "flare spectra of 0 and above",
+                key="flare_electrons",
+                value=pixel,
+            )
+        if len(self.flare_electrons) > MOST_FLARES:
+            raise InputError.of("flare_electrons", len(self.flare_electrons), f"at most {MOST_FLARES} spectra")
+        unusable = self.quiet.saturated & (self.weights != 0).any(axis=0)
+        if unusable.any():
+            raise InputError(
+                f"pixel {int(np.argmax(unusable))} saturates and has a weight",
+                "0 there",
+                key="weights",
+                value=int(np.argmax(unusable)),
+            )
+
+    @classmethod
+    def of(cls, quiet: Expectation, flares: Sequence[Expectation], weights: Float) -> Self:
+        """Return the components from a frame of the quiescent star and frames with flares of unit amplitude."""
+        more = [flare.source_electrons - quiet.source_electrons for flare in flares]
+        return cls(quiet, np.reshape(more, (len(flares), quiet.wavelength_nm.size)), weights)
+
+    @property
+    def n_statistics(self) -> int:
+        """Number of sums per frame."""
+        return len(self.weights)
+
+    @property
+    def n_flares(self) -> int:
+        """Number of flare temperatures."""
+        return len(self.flare_electrons)
+
+    @cached_property
+    def mean_dn(self) -> Float:
+        """Mean of each component at a coefficient of one, DN, shape (4 + n_flare, n_pixel); rows as `STEADY`."""
+        x = self.quiet
+        steady = [x.source_electrons, x.sky_electrons, np.zeros_like(x.dark_dn), x.neighbour_electrons]
+        light = np.vstack([*steady, self.flare_electrons])
+        light *= x.gain_dn_per_electron
+        light[2] = x.dark_dn
+        return light
+
+    def pixel_cumulants(self, order: int) -> tuple[Float, Float]:
+        """Return the cumulants of each pixel's count, of order 1 to 5.
+
+        Returns
+        -------
+        constant : ndarray, shape (n_pixel,)
+            Read noise and rounding.
+        each : ndarray, shape (4 + n_flare, n_pixel)
+            Each component at a coefficient of one.
+        """
+        x = self.quiet
+        photon = x.gain_dn_per_electron ** (order - 1)
+        if order > 2 and x.photon_noise == "gaussian":
+            photon = np.zeros_like(photon)
+        each = self.mean_dn * photon
+        each[2] = x.dark_step_dn ** (order - 1) * x.dark_dn
+        constant = np.zeros_like(photon)
+        if order == 2:
+            constant += x.read_noise_dn**2 + 1 / 12
+        elif order == 4:
+            constant += ROUNDING_FOURTH
+        return constant, each
+
+    def sum_cumulants(self, order: int) -> tuple[Float, Float]:
+        """Return the joint cumulants of the weighted sums.
+
+        Returns
+        -------
+        constant : ndarray, shape (n_statistic,) * order
+        each : ndarray, shape (4 + n_flare,) + (n_statistic,) * order
+        """
+        constant, each = self.pixel_cumulants(order)
+        rows = np.vstack([constant, each])
+        letters = "ijklm"[:order]
+        sums = np.einsum(
+            ",".join(f"{a}p" for a in letters) + f",cp->c{letters}", *[self.weights] * order, rows, optimize=True
+        )
+        return sums[0], sums[1:]
+
+    @cached_property
+    def _sums(self) -> dict[int, tuple[Float, Float]]:
+        return {order: self.sum_cumulants(order) for order in (1, 2, 3, 4)}
+
+    def coefficients(self, stare: Stare, flare: Float | None = None) -> Float:
+        """Return the known coefficients of each frame.
+
+        Parameters
+        ----------
+        stare : Stare
+        flare : ndarray, shape (n_frame, n_flare), optional
+            Amplitude of each flare spectrum in each frame.
+
+        Returns
+        -------
+        ndarray, shape (n_frame, 4 + n_flare)
+            Coefficients of star, sky, dark, neighbours and flares.
+        """
+        factors = np.zeros((stare.n_frames, len(STEADY) + self.n_flares))
+        factors[:, 0], factors[:, 1] = stare.light * stare.star, stare.light * stare.sky
+        factors[:, 2], factors[:, 3] = stare.dark_factor(self.quiet), stare.light
+        if flare is not None:
+            if np.shape(flare) != (stare.n_frames, self.n_flares):
+                raise InputError(
+                    f"flare coefficients have the shape {np.shape(flare)}",
+                    f"{(stare.n_frames, self.n_flares)}",
+                    key="flare",
+                    value=np.shape(flare),
+                )
+            factors[:, len(STEADY) :] = stare.light[:, None] * flare
+        return factors
+
+    def means(self, coefficients: Float) -> Float:
+        """Return the mean statistics, (..., n_statistic), for coefficients of shape (..., 4 + n_flare)."""
+        reference = np.zeros(len(STEADY) + self.n_flares)
+        reference[: len(STEADY)] = 1.0
+        return np.asarray((coefficients - reference) @ self._sums[1][1])
+
+    def covariance(self, coefficients: Float) -> Float:
+        """Return the covariances of the statistics of frames, shape (..., n_statistic, n_statistic)."""
+        return self._of(2, coefficients)
+
+    def third(self, coefficients: Float) -> Float:
+        """Return the joint third cumulants of the statistics, shape (..., n_statistic, n_statistic, n_statistic)."""
+        return self._of(3, coefficients)
+
+    def fourth(self, coefficients: Float) -> Float:
+        """Return the joint fourth cumulants of the statistics, with one axis more than those of `third`."""
+        return self._of(4, coefficients)
+
+    def _of(self, order: int, coefficients: Float) -> Float:
+        constant, each = self._sums[order]
+        return np.asarray(constant + np.tensordot(coefficients, each, 1))
+
+    def directions(self, coefficients: Float) -> dict[str, Float]:
+        """Return the derivatives of the mean statistics, each of shape (..., n_statistic).
+
+        They are with respect to relative changes of the star, of all light and of the sky, and to the temperature.
+        """
+        mean = self._sums[1][1]
+        light = np.delete(coefficients, 2, axis=-1) @ np.delete(mean, 2, axis=0)
+        slope = self.quiet.conditions["dark_slope_per_c"]
+        return {
+            "star": coefficients[..., :1] * mean[0],
+            "light": light,
+            "sky": coefficients[..., 1:2] * mean[1],
+            "temperature": slope * coefficients[..., 2:3] * mean[2],
+        }
+
+
+#: Draws the sums of a stare's frames, shape (n_frame, n_statistic), for some components.
+Draw = Callable[[Components], NDArray[Any]]
+
+#: Number of frames per block of computations by pixel.
+BLOCK = 4096
+#: Quality of a frame in which the mean of a pixel reaches saturation.
+SATURATED = 1
+
+
+@dataclass(frozen=True, eq=False)
+class StareExpectation:
+    """Expectation of a stare at a star with flares."""
+
+    quiet: Expectation  # one frame without a flare
+    stare: Stare
+    flare_electrons: Float  # electrons per frame at unit amplitude, one row per temperature, shape (n_flare, n_pixel)
+    flare: Float  # mean amplitudes in each frame, shape (n_frame, n_flare)
+
+    def components(self, weights: Float) -> Components:
+        """Return the components of its frames, for weighted sums over pixels."""
+        return Components(self.quiet, self.flare_electrons, weights)
+
+    @cached_property
+    def coefficients(self) -> Float:
+        """Known coefficients of star, sky, dark, neighbours and flares in each frame, shape (n_frame, 4 + n_flare)."""
+        return self._bare.coefficients(self.stare, self.flare)
+
+    @cached_property
+    def _bare(self) -> Components:
+        return self.components(self.used[None].astype(np.float64))
+
+    @cached_property
+    def used(self) -> NDArray[np.bool_]:
+        """Pixels that the quiescent star does not saturate, shape (n_pixel,)."""
+        return ~self.quiet.saturated
+
+    @cached_property
+    def quality(self) -> NDArray[np.int32]:
+        """`SATURATED` where the mean of a used pixel reaches saturation in a frame, 0 elsewhere, shape (n_frame,)."""
+        rise = self._bare.mean_dn[:, self.used]
+        room = self.quiet.ceiling_dn - self.quiet.bias_dn[self.used]
+        quality = np.zeros(self.stare.n_frames, np.int32)
+        # A fast upper bound excludes most frames: the sum of the maxima of all components.
+        near = np.flatnonzero(self.coefficients @ rise.max(axis=1) >= room.min())
+        for begin in range(0, near.size, BLOCK):
+            rows = near[begin : begin + BLOCK]
+            quality[rows] = SATURATED * (self.coefficients[rows] @ rise >= room).any(axis=1)
+        return quality
+
+    def snr(self, flare: Float) -> float:
+        """Return the matched-filter S/N of a flare with mean amplitudes of shape (n_frame, n_flare)."""
+        constant, each = self._bare.pixel_cumulants(2)
+        variance = (constant + each[: len(STEADY)].sum(axis=0))[self.used]
+        spectra = self._bare.mean_dn[len(STEADY) :, self.used]
+        return float(np.sqrt(np.einsum("tk,kl,tl->", flare, spectra / variance @ spectra.T, flare, optimize=True)))
+
+    def net(self, weights: Float, draw: Draw, kind: type[np.floating[Any]] = np.float64) -> tuple[Any, Any, Any]:
+        """Draw the net light in weighted sums of pixels, and return it with its standard deviation and mean, DN/s.
+
+        Net light is the raw count minus bias and dark current at the known temperature; it includes the sky and
+        neighbours.
+
+        Parameters
+        ----------
+        weights : ndarray, shape (n_sum, n_pixel)
+            Zero in pixels that are not used.
+        kind : type
+            Type of the arrays.
+
+        Returns
+        -------
+        net, sd, mean : ndarray of `kind`, shape (n_frame, n_sum)
+            The standard deviation is that of photons, dark current and read noise, without jitter.
+        """
+        frame_s, coefficients = self.stare.frame_s, self.coefficients
+        net, sd, mean = (np.empty((self.stare.n_frames, len(weights)), kind) for _ in range(3))
+        for begin in range(0, len(weights), MOST_STATISTICS):
+            there = slice(begin, begin + MOST_STATISTICS)
+            rows = weights[there]
+            first = self._bare.mean_dn @ rows.T
+            drawn = np.asarray(draw(self.components(rows)), np.float64)
+            # The sums are relative to the quiescent light at the temperature of its expectation.
+            net[:, there] = (drawn + first[0] + first[1] + first[3] + (1.0 - coefficients[:, 2:3]) * first[2]) / frame_s
+            sd[:, there], mean[:, there] = self.expected(rows)
+        return net, sd, mean
+
+    def raw(self, draw: Draw) -> Float:
+        """Return drawn raw counts of each pixel, DN, shape (n_frame, n_pixel); saturated pixels hold their mean."""
+        frames = np.tile(self.quiet.recorded_dn, (self.stare.n_frames, 1))
+        pixels = np.flatnonzero(self.used)
+        for begin in range(0, pixels.size, MOST_STATISTICS):
+            some = pixels[begin : begin + MOST_STATISTICS]
+            frames[:, some] += draw(self.components(np.eye(self.used.size)[some]))
+        return frames
+
+    @cached_property
+    def mean_raw(self) -> Float:
+        """Mean raw counts of each pixel, DN, shape (n_frame, n_pixel)."""
+        return np.asarray(self.coefficients @ self._bare.mean_dn + self.quiet.bias_dn)
+
+    def expected(self, weights: Float) -> tuple[Float, Float]:
+        """Return standard deviation and mean of the net light in sums of pixels, DN/s, shape (n_frame, n_sum)."""
+        frame_s, coefficients = self.stare.frame_s, self.coefficients
+        constant, each = self._bare.pixel_cumulants(2)
+        squares, light = weights.T**2, np.delete(self._bare.mean_dn, 2, axis=0) @ weights.T
+        sd = np.sqrt(constant @ squares + coefficients @ (each @ squares))
+        return sd / frame_s, np.delete(coefficients, 2, axis=1) @ light / frame_s
+
+
+@dataclass(frozen=True, eq=False)
+class LightCurves:
+    """Light curves and spectra of a stare, DN/s without bias and dark current."""
+
+    bands: tuple[str, ...]  # the first is the whole range
+    #: Shape (n_frame, n_band); drawn light, standard deviation of its noise, and light without noise.
+    flux: Float
+    sd: Float  # shape (n_frame, n_band)
+    mean: Float  # shape (n_frame, n_band)
+    #: Shape (n_frame, n_element); the same in resolution elements.
+    spectrum: NDArray[np.float32]
+    spectrum_sd: NDArray[np.float32]  # shape (n_frame, n_element)
+    spectrum_mean: NDArray[np.float32]  # shape (n_frame, n_element)
+    element_nm: Float  # shape (n_element,)
+
+
+def draw_light_curves(
+    expectation: StareExpectation, bands_nm: Sequence[tuple[float, float]], draw: Draw
+) -> LightCurves:
+    """Draw a stare in bands and resolution elements, all from the same pixels.
+
+    Raises InputError if a band contains no pixel.
+
+    Parameters
+    ----------
+    bands_nm : sequence of (float, float)
+        Wavelengths, nm; the upper limit is excluded, and saturated pixels are not used.
+    draw : callable
+        Draws the same pixels for all sums.
+    """
+    quiet, used = expectation.quiet, expectation.used.astype(np.float64)
+    rows = []
+    for low, high in bands_nm:
+        row = used * ((quiet.wavelength_nm >= low) & (quiet.wavelength_nm < high))
+        if not row.any():
+            raise InputError.of("bands_nm", (low, high), f"a band with usable pixels{quiet.saturation_clause}")
+        rows.append(row)
+    elements = used * (quiet.element == np.arange(quiet.element_wavelength_nm.size)[:, None])
+    filled = np.flatnonzero(elements.any(axis=1))
+    spectrum, spectrum_sd, spectrum_mean = expectation.net(elements[filled], draw, np.float32)
+    # Each pixel belongs to one element, so their sum is the whole range.
+    whole = spectrum.sum(axis=1, dtype=np.float64), *expectation.expected(used[None])
+    parts = (
+        expectation.net(np.array(rows).reshape(len(rows), used.size), draw) if rows else np.zeros((3, len(whole[0]), 0))
+    )
+    flux, sd, mean = (np.column_stack(both) for both in zip(whole, parts, strict=True))
+    low, high = quiet.wavelength_nm[[0, -1]]
+    return LightCurves(
+        (f"{low:.0f}-{high:.0f} nm", *(f"{a:g}-{b:g} nm" for a, b in bands_nm)),
+        flux,
+        sd,
+        mean,
+        spectrum,
+        spectrum_sd,
+        spectrum_mean,
+        quiet.element_wavelength_nm[filled],
+    )

@@ -1,0 +1,591 @@
+"""Stares as arrays that kernels read, requests for them, and the cumulants of their sums.
+
+Joint cumulants of weighted sums of a frame, from which the sums are drawn without drawing pixels.
+
+The cumulants of independent counts add up, so those of the sums are exact. A frame is drawn as the Cholesky factor of
+the sums times normals. A quadratic function of all normals is added to each, which reproduces the third cumulants, and
+if needed a cubic function (Cornish & Fisher 1938, doi 10.2307/1400905, in several dimensions).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.detection.requests import Countable
+from mauvecl.flares.frames import MOST_STATISTICS, STEADY, Components
+from mauvecl.flares.stare import Stare
+from mauvecl.noise import layout
+from mauvecl.noise.drawing import Cumulants, expansion_error, joint_is_exact
+from mauvecl.noise.processes import NONE, Processes
+from mauvecl.noise.scene import Scene, padded, prepare
+from mauvecl.noise.unknowns import ADDITIVE
+from mauvecl.schema.calls import validated
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Range
+from mauvecl.schema.physical import Realisations, Seed
+
+if TYPE_CHECKING:
+    from mauvecl.host.exposure.expectation import Expectation
+
+Float = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+#: Deviation of conditions from their known values up to which frames are checked, in standard deviations.
+REACH_SIGMA = 7.0
+#: Largest number of unknowns of a stare, and of scenarios on common draws.
+MOST_UNKNOWNS, MOST_SCENARIOS = 32, 16
+#: Largest amplitude of a flare.
+LARGEST = 1e12
+#: Distance of a count from its base up to which the device rounds to whole DN.
+REACH_DN = 2.0**22
+
+
+@dataclass(frozen=True, eq=False)
+class Flares:
+    """Flares that are added to stares."""
+
+    # Amplitude of each flare spectrum in each frame, shape (n_row, n_frame, n_flare), with one row or one per stare.
+    given: NDArray[Any]
+    amplitudes: Floats  # factors on `given`, shape (n_scenario, n_amplitude_row)
+
+    @classmethod
+    def of(cls, components: Components, stare: Stare, flare: Any, amplitudes: Any, count: int) -> Self:
+        """Validate the arguments of `Stares.frames`; raises InputError for wrong shapes and negative values."""
+        n_frames, n_flares = stare.n_frames, components.n_flares
+        given = np.zeros((1, n_frames, n_flares), np.float32) if flare is None else np.asarray(flare)
+        if given.ndim == 2:
+            given = given[None]
+        if given.shape[1:] != (n_frames, n_flares) or given.shape[0] not in (1, count):
+            raise InputError(
+                f"flare coefficients have the shape {given.shape}",
+                f"({count}, {n_frames}, {n_flares}), or one row for all stares",
+                key="flare",
+                value=given.shape,
+            )
+        factors = np.ones((1, 1)) if amplitudes is None else np.asarray(amplitudes)
+        if factors.ndim != 2 or factors.shape[1] not in (1, count) or not 1 <= len(factors) <= MOST_SCENARIOS:
+            raise InputError(
+                f"amplitudes have the shape {factors.shape}",
+                f"(n, {count}) or (n, 1) with n of 1 to {MOST_SCENARIOS} scenarios",
+                key="amplitudes",
+                value=factors.shape,
+            )
+        # The minimum of values that include NaN is NaN.
+        ends = [("flare coefficients", given.min(initial=0.0)), ("amplitudes", factors.min(initial=0.0))]
+        ends += [("flare coefficients", most) for most in _largest(given)] + [("amplitudes", factors.max())]
+        for what, end in ends:
+            if not 0 <= end <= LARGEST:
+                raise InputError.of(what, end, f"0 to {LARGEST:g}")
+        return cls(given, factors.astype(np.float32))
+
+    @cached_property
+    def rows(self) -> Floats:
+        """Amplitudes for the kernels, shape (n_row, n_flare, n_padded_frame)."""
+        n_row, n_frames, n_flares = self.given.shape
+        rows = np.zeros((n_row, n_flares, padded_frames(n_frames)), np.float32)
+        rows[:, :, :n_frames] = np.moveaxis(self.given, 2, 1)
+        return rows
+
+    def part(self, first: int, count: int) -> Flares:
+        """Return the flares of some stares."""
+        there = slice(first, first + count)
+        amplitudes = self.amplitudes if self.amplitudes.shape[1] == 1 else self.amplitudes[:, there]
+        return Flares(self.given if len(self.given) == 1 else self.given[there], np.ascontiguousarray(amplitudes))
+
+    @cached_property
+    def most(self) -> Float:
+        """Largest coefficient of each spectrum, shape (n_flare,)."""
+        return np.array(_largest(self.given), np.float64) * float(self.amplitudes.max())
+
+
+@dataclass(frozen=True, eq=False)
+class StareScene:
+    """Arrays of a stare that a launch reads."""
+
+    components: Components
+    stare: Stare
+    scene: Scene  # of one quiescent frame, for addresses, clipping and additive processes
+    numbers: NDArray[np.uint32]  # of frames, including gaps, shape (n_padded_frame,)
+    #: Star, sky, dark and neighbours, each followed by its value minus one; then all light. Shape (9, n_padded_frame).
+    known: Floats
+    curves: Floats  # of the stare's unknowns, times their standard deviations, shape (n_unknown, n_padded_frame)
+    kinds: NDArray[np.uint32]  # rows of `layout.MOVED`, shape (n_unknown,)
+    stare_job: NDArray[np.void]  # of `layout.STARE_JOB`, without the values of flares, shape ()
+    mixtures: NDArray[np.void]  # of `layout.MIXTURE`, shape (n_padded,)
+    spectra: Floats  # DN of flares of unit amplitude, shape (n_flare, n_padded)
+    weights: Floats  # shape (n_statistic, n_padded)
+    constants: Floats  # added to each sum, since kernels omit whole DN, shape (n_statistic,)
+
+    @classmethod
+    def of(cls, components: Components, stare: Stare, processes: Processes = NONE) -> Self:
+        """Build the arrays.
+
+        Raises InputError if the quiescent frame cannot be drawn jointly, or there are too many sums or unknowns.
+        """
+        x, n_pixel = components.quiet, components.quiet.wavelength_nm.size
+        if abs(stare.frame_s - x.frame_s) > 1e-9 * x.frame_s:
+            raise InputError.of("frame_s", stare.frame_s, f"the instrument's {x.frame_s:g} s")
+        if components.n_statistics > MOST_STATISTICS:
+            raise InputError.of("weights", components.n_statistics, f"at most {MOST_STATISTICS} spectral weights")
+        if len(stare.unknowns) > MOST_UNKNOWNS:
+            raise InputError.of("unknowns", len(stare.unknowns), f"at most {MOST_UNKNOWNS} of a stare")
+        for name, _ in processes.modulations:
+            raise InputError(f"{name} is a prior of exposures", "an unknown of the stare", key=name)
+        scene = prepare([x], processes=processes)
+        if not scene.joint:
+            raise _not_joint_error(x.name)
+        size = padded(n_pixel)
+        mixtures = np.zeros(size, layout.MIXTURE)
+        mixtures["variance"] = 1.0
+        mixtures["rest"][:n_pixel] = x.mean_raw_dn - scene.base_dn[0]
+        for row, name in enumerate(STEADY):
+            mixtures[name][:n_pixel] = components.mean_dn[row]
+        for order, name in ((2, "variance"), (3, "third"), (4, "fourth"), (5, "fifth")):
+            constant, each = components.pixel_cumulants(order)
+            # Rounding is done by the kernels.
+            constant = constant - {2: 1 / 12, 4: -1 / 120}.get(order, 0.0)
+            mixtures[name][:n_pixel] = constant + each[: len(STEADY)].sum(axis=0)
+            mixtures[f"dark_{name}"][:n_pixel] = each[2]
+            mixtures[f"photon_{name}"][:n_pixel] = (
+                x.gain_dn_per_electron ** (order - 1) if order == 2 or x.photon_noise == "poisson" else 0.0
+            )
+        spectra = np.zeros((components.n_flares, size), np.float32)
+        spectra[:, :n_pixel] = components.mean_dn[len(STEADY) :]
+        weights = np.zeros((components.n_statistics, size), np.float32)
+        weights[:, :n_pixel] = components.weights
+        constants = weights[:, :n_pixel].astype(np.float64) @ (scene.base_dn[0] - x.mean_raw_dn)
+        stare_job = np.zeros((), layout.STARE_JOB)
+        stare_job["frame_count"], stare_job["padded_frames"] = stare.n_frames, padded_frames(stare.n_frames)
+        stare_job["unknown_count"], stare_job["jittered"] = len(stare.unknowns), any(stare.jitters.values())
+        stare_job["light_jitter"], stare_job["sky_jitter"] = stare.light_jitter, stare.sky_jitter
+        stare_job["temperature_jitter"] = stare.temperature_jitter_c
+        stare_job["dark_slope"] = x.conditions["dark_slope_per_c"]
+        curves = np.reshape([u.sd * u.curve for u in stare.unknowns], (len(stare.unknowns), stare.n_frames))
+        return cls(
+            components,
+            stare,
+            scene,
+            _padded(stare.numbers, np.uint32),
+            _known(components, stare),
+            _padded(curves, np.float32),
+            np.array([layout.MOVED.index(u.of) for u in stare.unknowns], np.uint32),
+            stare_job,
+            mixtures,
+            spectra,
+            weights,
+            constants.astype(np.float32),
+        )
+
+    @property
+    def counts(self) -> bool:
+        """True if photons are Poisson counts."""
+        return self.components.quiet.photon_noise == "poisson"
+
+    def stare_struct(self, flares: Flares) -> NDArray[np.void]:
+        """Return the `layout.STARE_JOB` structure with the values of flares, shape (1,)."""
+        stare_job = self.stare_job.copy()
+        stare_job["scenario_count"], stare_job["amplitude_rows"] = flares.amplitudes.shape
+        stare_job["flare_rows"] = len(flares.given)
+        return stare_job.reshape(1)
+
+    def losses(self, numbers: NDArray[np.uint64], seed: int) -> Floats:
+        """Return the share of all light that padded frames of stares lose, shape (n_stare, n_padded_frame)."""
+        return np.asarray(_padded(self.stare.pointing_losses(numbers, seed), np.float32))
+
+    def job(self, seed: int) -> NDArray[np.void]:
+        """Return the job of a frame with a seed, shape (1,)."""
+        job = self.scene.job.copy()
+        job["seed_low"], job["seed_high"] = seed & 0xFFFFFFFF, seed >> 32
+        return job.reshape(1)
+
+    def conditions(self, flares: Flares) -> Conditions:
+        """Return the range of the frames' conditions."""
+        low, high = self._ends
+        mean = self.components.mean_dn
+        darkest = low[0] * mean[0] + low[1] * mean[1] + low[3] * mean[3]
+        brightest = high[0] * mean[0] + high[1] * mean[1] + high[3] * (mean[3] + flares.most @ mean[len(STEADY) :])
+        return Conditions(darkest.tobytes(), brightest.tobytes(), float(low[2]), float(high[2]))
+
+    @property
+    def _ends(self) -> tuple[Float, Float]:
+        """Smallest and largest factors on star, sky, dark, and neighbours and flares."""
+        stare, spread = self.stare, self._spreads
+        ends = []
+        for sign, of in ((-1.0, np.min), (1.0, np.max)):
+            light, star, sky = (1.0 + sign * REACH_SIGMA * spread[name] for name in ("light", "star", "sky"))
+            if sign < 0 and stare.pointing is not None:
+                light = light * (1.0 - stare.pointing.depth)
+            warm = np.exp(sign * REACH_SIGMA * abs(self.stare_job["dark_slope"]) * spread["temperature"])
+            known = (stare.light * stare.star * light * star, stare.light * stare.sky * light * sky)
+            dark = stare.dark_factor(self.components.quiet) * warm
+            ends.append(np.array([float(of(values)) for values in (*known, dark, stare.light * light)]))
+        return ends[0], ends[1]
+
+    @property
+    def _spreads(self) -> dict[str, Float]:
+        """Standard deviations of the conditions that are drawn for each frame, shape (n_frame,) each."""
+        variances = {of: np.full(self.stare.n_frames, self.stare.jitters.get(of, 0.0) ** 2) for of in layout.MOVED}
+        for unknown in self.stare.unknowns:
+            variances[unknown.of] += (unknown.sd * unknown.curve) ** 2
+        return {of: np.sqrt(variance) for of, variance in variances.items()}
+
+    def check(self, flares: Flares) -> None:
+        """Raise InputError if light may be negative, counts exceed the range of rounding, or noise is not joint."""
+        spread = self._spreads
+        for of in ("light", "star", "sky"):
+            if (REACH_SIGMA * spread[of] >= 1.0).any():
+                raise InputError(
+                    f"the {of} of a frame scatters by {float(spread[of].max()):.3g}",
+                    f"less than {1 / REACH_SIGMA:.3g}, so that it is never drawn below zero",
+                    key=of,
+                    value=float(spread[of].max()),
+                )
+        x, mean = self.components.quiet, self.components.mean_dn
+        _, high = self._ends
+        lit = mean[3] + flares.most @ mean[len(STEADY) :]
+        reach = high[0] * mean[0] + high[1] * mean[1] + high[2] * mean[2] + high[3] * lit
+        if not (reach < REACH_DN).all():
+            pixel = int(np.argmax(~(reach < REACH_DN)))
+            raise InputError(
+                f"the stare carries pixel {pixel} of {x.name} to {reach[pixel]:.3g} DN in a frame",
+                f"less than {REACH_DN:g}",
+                key="flare",
+                value=float(reach[pixel]),
+            )
+        if not _joint_throughout(x, self.conditions(flares)):
+            raise _not_joint_error(x.name)
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Range of the conditions of frames; hashable, so that what holds for all of them is computed once."""
+
+    darkest: bytes  # photons in DN of each pixel, float64
+    brightest: bytes
+    least_dark: float  # factor on the dark
+    most_dark: float
+
+    def __iter__(self) -> Iterator[tuple[Float, float]]:
+        """Yield photons in DN of each pixel and factors on the dark, in steps of at most a factor of 2."""
+        darkest, brightest = np.frombuffer(self.darkest), np.frombuffer(self.brightest)
+        span = float(np.max(brightest / np.maximum(darkest, 1e-30), initial=1.0, where=brightest > 1e-9))
+        steps = 1 + int(np.ceil(np.log2(min(span, 2.0**20))))
+        for part in np.linspace(0.0, 1.0, steps + 1):
+            light = np.maximum(darkest, 1e-30) ** (1 - part) * np.maximum(brightest, 1e-30) ** part
+            number = 2 + int(np.log2(self.most_dark / self.least_dark))
+            for dark in np.geomspace(self.least_dark, self.most_dark, number):
+                yield light, float(dark)
+
+
+# The pixels of a stare are drawn in many parts.
+@lru_cache(maxsize=4)
+def _joint_throughout(x: Expectation, conditions: Conditions) -> bool:
+    one, counts = Cumulants.of(x, 1), x.photon_noise == "poisson"
+    for light, dark in conditions:
+        photons = light / x.gain_dn_per_electron
+        other = x.read_noise_dn**2 + (0.0 if counts else x.gain_dn_per_electron * light)
+        if not joint_is_exact(replace(one, gaussian=other, photons=photons, dark_dn=dark * one.dark_dn)).all():
+            return False
+    return True
+
+
+def padded_frames(n_frames: int) -> int:
+    """Return the number of frames including padding."""
+    return -(-n_frames // layout.FRAME_BLOCK) * layout.FRAME_BLOCK
+
+
+def unique(n: int, order: int) -> list[tuple[int, ...]]:
+    """Return the unique indices of a symmetric tensor in the order of the kernels: (0, 0), (1, 0), (1, 1), ..."""
+    return sorted(tuple(sorted(key, reverse=True)) for key in itertools.combinations_with_replacement(range(n), order))
+
+
+def _largest(given: NDArray[Any]) -> list[float]:
+    """Return the maximum of each spectrum, one by one since NumPy is slow over the other axes."""
+    return [float(given[..., j].max()) for j in range(given.shape[-1])]
+
+
+def _padded(values: NDArray[Any], kind: type) -> NDArray[Any]:
+    """Pad with zeros to whole blocks of frames."""
+    more = padded_frames(values.shape[-1]) - values.shape[-1]
+    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, more)]).astype(kind)
+
+
+def _known(components: Components, stare: Stare) -> Floats:
+    rows = components.coefficients(stare)[:, : len(STEADY)].T
+    changes = [part for row in rows for part in (row, row - 1.0)]
+    return np.asarray(_padded(np.stack([*changes, stare.light]), np.float32))
+
+
+def _not_joint_error(name: str) -> InputError:
+    return InputError(
+        f"the noise of a frame of {name} cannot be drawn jointly under all conditions of the stare",
+        "Gaussian noise with the variance of at least 1.5 Poisson counts in each pixel, and more where counts are few",
+        key="recipe",
+        value="joint",
+    )
+
+
+Arrays = dict[str, NDArray[Any]]
+Method = Literal["pixels", "cumulants"]
+StareNumber = Annotated[int, Range(0, 2**64 - 1)]
+
+#: Approximate cost of reducing a frame of a scenario by Fourier transforms, in draws of a pixel.
+REDUCED = 500
+
+
+class Reduction(Protocol):
+    """Reduction of stares to results: a frozen dataclass, which can be pickled and identified by its content.
+
+    It is called as ``reduction(values, first)`` and returns arrays by name for stares from `first` on, which do not
+    depend on each other. ``values`` are float32, (n_stare, n_frame, n_statistic), preceded by an
+    axis of scenarios if there are several; they are valid only during the call. If the request has `glow`, it is
+    called as ``reduction(values, first, glow)`` with an array of shape (n_stare, n_frame, n_statistic + 1).
+
+    Attributes
+    ----------
+    adds : bool
+        True if results are integers that are summed over stares. Otherwise, arrays are joined along their first axis,
+        in the order of stares.
+    """
+
+    adds: ClassVar[bool]
+
+    @property
+    def __call__(self) -> Callable[..., Mapping[str, NDArray[Any]]]:
+        """Reduce stares; see the class."""
+
+
+@validated
+@dataclass(frozen=True, eq=False)
+class StaresRequest(Countable):
+    """Request for stares; flares and amplitudes as for `Stares.frames`.
+
+    Attributes
+    ----------
+    realisations : int
+        Number of stares.
+    start : int
+        Number of the first stare.
+    reduction : Reduction, optional
+        By default, statistics are returned as they are.
+    glow : bool
+        Whether the reduction also receives the draws for flares that it adds: a standard normal per statistic, for
+        their photon noise, and the factor on all light minus one.
+    """
+
+    components: Components
+    stare: Stare
+    realisations: Realisations
+    seed: Seed
+    flare: NDArray[Any] | None = None
+    amplitudes: NDArray[Any] | None = None
+    start: StareNumber = 0
+    method: Method = "cumulants"
+    processes: Processes = NONE
+    reduction: Reduction | None = None
+    glow: bool = False
+    #: Number of the stare of the first row of flares and amplitudes, if these differ between stares.
+    rows_from: int = field(init=False, default=0)
+
+    parts = 1
+    least: ClassVar[int] = 64
+
+    def __post_init__(self) -> None:
+        if len(self.flares.given) > 1 or self.flares.amplitudes.shape[1] > 1:
+            object.__setattr__(self, "rows_from", self.start)
+
+    @cached_property
+    def flares(self) -> Flares:
+        """Flares of all stares."""
+        return Flares.of(self.components, self.stare, self.flare, self.amplitudes, self.realisations)
+
+    @property
+    def work(self) -> int:
+        """Approximate cost of a stare, in draws of a pixel."""
+        drawn = (
+            self.components.quiet.wavelength_nm.size if self.method == "pixels" else 4 * self.components.n_statistics
+        )
+        return self.stare.n_frames * (drawn + len(self.flares.amplitudes) * (REDUCED if self.reduction else 0))
+
+
+@dataclass(frozen=True)
+class KeepStatistics:
+    """Reduction that returns the statistics as they are."""
+
+    adds: ClassVar[bool] = False
+
+    def __call__(self, values: NDArray[np.float32], first: int) -> Arrays:
+        """Return one row per stare, with scenarios on the second axis."""
+        return {"values": np.moveaxis(values, 0, 1).copy() if values.ndim == 4 else values.copy()}
+
+
+class StareSums:
+    """Shards of a request that are finished."""
+
+    def __init__(self, request: StaresRequest) -> None:
+        self._adds = (request.reduction or KeepStatistics()).adds
+        self._found: dict[int, Arrays] = {}
+
+    def add(self, part: int, shard: Arrays) -> None:
+        """Add a shard."""
+        rest = dict(shard)
+        self._found[int(rest.pop("start"))] = rest
+
+    def answer(self) -> Arrays:
+        """Return the result of all shards, in the order of stares."""
+        return joined([self._found[start] for start in sorted(self._found)], adds=self._adds)
+
+
+def joined(parts: list[Arrays], *, adds: bool) -> Arrays:
+    """Join the parts of a request, which are in order."""
+    together = (lambda arrays: np.sum(arrays, axis=0)) if adds else np.concatenate
+    return {name: np.asarray(together([part[name] for part in parts])) for name in parts[0]}
+
+
+#: Number of frames after which Pearson's test would notice the neglected cumulants at five sigma: sixteen thousand
+#: star-years of 5 s.
+FRAMES_TO_NOTICE = 1e11
+#: Number of classes of that test: range in standard deviations that contains all but 1e-14.
+CLASSES = 15.3
+#: Smallest distance of a pixel's mean from zero and saturation, in standard deviations.
+RAIL_SIGMA = 8.0
+#: Smallest variance of a pixel, DN^2; below it, rounding is not like noise of variance 1/12.
+LEAST_VARIANCE = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class SumTable:
+    """Cumulants of whitened sums, which are independent and have unit variance at coefficients of one."""
+
+    #: Shape (4 + n_flare, n); total at coefficients of one, then star, sky, dark, neighbours and each flare: means (0
+    #: for the total), then the unique second, third and, if needed, fourth cumulants, in the order of
+    #: `stare_scene.unique`; fourth ones are multiplied by their multiplicity.
+    rows: Floats
+    #: Shape (n_statistic * (n_statistic + 1) / 2,); lower triangular matrix that converts whitened sums to the
+    #: statistics.
+    whole: Floats
+    fourths: bool  # whether fourth cumulants are needed
+
+    @classmethod
+    def of(cls, components: Components) -> Self:
+        """Compute the table.
+
+        Raises InputError if weights are linearly dependent, or counts are too few for the expansion.
+        """
+        n = components.n_statistics
+        constant, each = components.sum_cumulants(2)
+        covariance = constant + each[: len(STEADY)].sum(axis=0)
+        sd = np.sqrt(np.diag(covariance))
+        if (sd == 0).any() or np.linalg.eigvalsh(covariance / np.outer(sd, sd))[0] < 1e-9:
+            raise InputError(
+                f"{n} spectral weights of which one is a sum of others", "independent ones", key="weights", value=n
+            )
+        lower = np.linalg.cholesky(covariance)
+        white = Components(
+            components.quiet,
+            components.flare_electrons,
+            np.asarray(np.linalg.solve(lower, components.weights), np.float64),
+        )
+        fourths = _fourths_are_needed(components) or _fourths_are_needed(white)
+        columns = []
+        for order in range(1, 5 if fourths else 4):
+            constant, each = white.sum_cumulants(order)
+            reference = constant + (0.0 if order == 1 else each[: len(STEADY)].sum(axis=0))
+            for key in unique(n, order):
+                often = 1
+                if order == 4:
+                    often = math.factorial(4) // math.prod(math.factorial(m) for m in Counter(key).values())
+                columns.append(often * np.array([reference[key], *(component[key] for component in each)]))
+        return cls(np.array(columns, np.float32).T.copy(), lower[np.tril_indices(n)].astype(np.float32), fourths)
+
+    @property
+    def packed(self) -> Floats:
+        """Array for the kernel."""
+        return np.concatenate([self.rows.ravel(), self.whole])
+
+
+def check_sums(scene: StareScene, flares: Flares) -> None:
+    """Raise InputError if cumulants do not describe frames: clipping, pixels without noise, or rare large hits."""
+    for name in scene.scene.additive:
+        raise InputError(
+            f"{ADDITIVE[name].label} with method 'cumulants'", "method 'pixels'", key="method", value="cumulants"
+        )
+    x = scene.components.quiet
+    used = (scene.components.weights != 0).any(axis=0)
+    for light, dark in scene.conditions(flares):
+        mean = x.bias_dn + light + dark * x.dark_dn
+        variance = x.read_noise_dn**2 + x.gain_dn_per_electron * light + dark * x.dark_variance_dn2
+        sd = np.sqrt(variance)
+        near = used & ((mean - RAIL_SIGMA * sd < 0.0) | (mean + RAIL_SIGMA * sd > x.highest_dn))
+        if near.any():
+            pixel = int(np.argmax(near))
+            raise InputError(
+                f"pixel {pixel} of {x.name} comes within {RAIL_SIGMA:g} sigma of zero or saturation and has a weight",
+                "method 'pixels', which clips, or weight 0 there",
+                key="method",
+                value="cumulants",
+            )
+        if (used & (variance < LEAST_VARIANCE)).any():
+            pixel = int(np.argmax(used & (variance < LEAST_VARIANCE)))
+            raise InputError(
+                f"pixel {pixel} of {x.name} scatters by {sd[pixel]:.2g} DN, too little for its rounding to be noise",
+                "method 'pixels'",
+                key="method",
+                value="cumulants",
+            )
+
+
+def method_for(components: Components, stare: Stare, processes: Processes = NONE) -> Method:
+    """Return the method for frames without flares: cumulants if these describe them, otherwise pixels."""
+    scene = StareScene.of(components, stare, processes)
+    try:
+        check_sums(scene, Flares.of(components, stare, None, None, 1))
+        SumTable.of(components)
+    except InputError:
+        return "pixels"
+    return "cumulants"
+
+
+def _over_sd(components: Components) -> list[Float]:
+    """Return the standardised third to seventh cumulants of each sum, shape (n_statistic,) each."""
+    x, w = components.quiet, components.weights
+    photons, dark = components.mean_dn[:2].sum(axis=0), components.mean_dn[2]
+    sd = np.sqrt(np.sum(w**2 * (x.unsaturated_variance_dn2), axis=1))
+    cumulants = []
+    for order in range(3, 8):
+        cumulant = x.dark_step_dn ** (order - 1) * dark
+        if x.photon_noise == "poisson":
+            cumulant = cumulant + x.gain_dn_per_electron ** (order - 1) * photons
+        cumulants.append(np.sum(w**order * cumulant, axis=1) / sd**order)
+    return cumulants
+
+
+def _fourths_are_needed(components: Components) -> bool:
+    """Return whether neglecting cumulants beyond the third could be noticed.
+
+    Raises InputError if neglecting those beyond the fourth could be noticed.
+    """
+    shapes = _over_sd(components)
+    least = 5.0 * np.sqrt(2.0 * CLASSES) / FRAMES_TO_NOTICE
+    beyond = expansion_error(shapes, fourth_power=False)
+    if (beyond > least).any():
+        row = int(np.argmax(beyond))
+        raise InputError(
+            f"the sum with spectral weight {row} has a skewness of {abs(shapes[0][row]):.2g} in a frame "
+            f"of {components.quiet.name}, too much for method 'cumulants'",
+            "method 'pixels'",
+            key="method",
+            value="cumulants",
+        )
+    g3, g4 = shapes[0], shapes[1]
+    cubic, linear = g4 / 24 - g3**2 / 18, g3**2 * (5 / 36 - 6 / 36)
+    return bool((24 * cubic**2 + 2 * linear**2 > least).any())

@@ -1,1 +1,0 @@
-"""Flares: shapes in time, energies and rates."""

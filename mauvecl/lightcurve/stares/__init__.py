@@ -1,1 +1,0 @@
-"""Stares, continuous observations of one star: conditions of frames, simulated sums, and measurements."""

@@ -1,0 +1,457 @@
+"""Disturbances of frames: priors of unknown values, cosmic rays, drifts out of the fibre, and additive charge.
+
+Prior distributions of unknown values.
+
+Studies contain priors, so this module imports NumPy only when a quantile is computed, to keep start-up fast.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
+
+from pydantic import PlainSerializer, PlainValidator, WithJsonSchema, model_validator
+
+from mauvecl.schema.calls import validated
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Help, Range, Unit, Widget
+from mauvecl.schema.physical import Duration
+from mauvecl.schema.quantities import is_quantity, without_unit
+from mauvecl.schema.section import Section
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from pydantic import GetCoreSchemaHandler
+    from pydantic_core import CoreSchema
+
+    from mauvecl.host.exposure.expectation import Expectation
+
+    Float = NDArray[np.float64]
+
+#: Events in a pixel and draw with a smaller probability are neglected.
+NEGLIGIBLE = 2.0**-40
+
+
+@validated
+class AdditiveProcess(Section, ABC):
+    """Charge that each pixel collects independently in each draw, and the study section that describes it.
+
+    Kernels draw it from a table of `charge` in a separate stream, multiply it by the gain, and add it to the other
+    noise of the pixel. Subclasses are listed in `unknowns.ADDITIVE` by their study keys.
+    """
+
+    #: Number of the random stream in `layout.STREAMS`.
+    stream: ClassVar[int]
+    #: Name in messages and tables.
+    label: ClassVar[str]
+
+    @abstractmethod
+    def charge(self, seconds: float) -> Float:
+        """Return the probabilities of 0, 1, 2, ... electrons in a pixel in a time, shape (n,).
+
+        The omitted tail has a probability below `NEGLIGIBLE`.
+        """
+
+    @abstractmethod
+    def most_electrons(self, seconds: float) -> int:
+        """Return the charge that a pixel exceeds in a time with a probability of at most `NEGLIGIBLE`."""
+
+    def variance_dn2(self, quiet: Expectation) -> Float:
+        """Return the added variance of each pixel in a frame, DN^2, shape (n_pixel,)."""
+        import numpy as np
+
+        charge = self.charge(quiet.frame_s)
+        electrons = np.arange(charge.size)
+        variance = float(charge @ electrons**2 - (charge @ electrons) ** 2)
+        return np.asarray(variance * quiet.gain_dn_per_electron**2)
+
+    @property
+    def particles_per_cm2_s(self) -> float | None:
+        """Rate of incident particles, or None if the process is not caused by particles from outside."""
+        return None
+
+    def with_particles(self, rate_per_cm2_s: float) -> Self:
+        """Return the process at another rate of incident particles."""
+        return self
+
+    @property
+    def assumption(self) -> tuple[str, str, str]:
+        """Row of a table of assumptions: quantity, value and source."""
+        return (self.label, "", "the study")
+
+
+#: Rate of hits per area.
+ParticleRate = Annotated[float, Unit("1 / (cm2 s)"), Range(0, 1e6)]
+
+
+@validated
+class CosmicRays(AdditiveProcess):
+    """Hits by charged particles; the defaults are assumptions (INSTRUMENT.md: outside the South Atlantic Anomaly).
+
+    Attributes
+    ----------
+    rate_per_cm2_s : float
+        Hits per area and time.
+    area_cm2 : float
+        Area of the whole detector: 2048 pixels of 14 x 200 um.
+    pixels : int
+        Number of pixels that share the area; a hit affects one pixel.
+    electrons : tuple of float, shape (2,)
+        Smallest and largest number of electrons of a hit.
+    weights : tuple of float, optional
+        Relative probabilities of the integers in this range; equal by default.
+    """
+
+    stream: ClassVar[int] = 3
+    label: ClassVar[str] = "cosmic rays"
+
+    rate_per_cm2_s: ParticleRate = 1.0
+    area_cm2: Annotated[float, Unit("cm2"), Range(0, 1e4, open_low=True)] = 0.057
+    pixels: Annotated[int, Range(1)] = 2048
+    electrons: tuple[float, float] = (500.0, 1000.0)
+    weights: tuple[float, ...] | None = None
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        low, high = self.electrons
+        if not 1 <= low <= high <= 100_000:
+            raise InputError.of("electrons", (low, high), "1 to 100000, ascending", where="cosmic rays")
+        if self.weights is not None:
+            wanted = int(high) - int(low) + 1
+            if len(self.weights) != wanted or min(self.weights) < 0 or not sum(self.weights) > 0:
+                raise InputError.of("weights", self.weights, f"{wanted} of 0 and above", where="cosmic rays")
+        return self
+
+    def charge(self, seconds: Annotated[float, Unit("s"), Range(0)]) -> Float:
+        """Return the distribution of the charge that a pixel collects in a time, a compound Poisson distribution."""
+        import numpy as np
+
+        low, high = (int(e) for e in self.electrons)
+        hits, most = self._hits(seconds), self.most_electrons(seconds)
+        size = 1 << (most + 1).bit_length()
+        if size > 2**24:
+            raise InputError(
+                f"cosmic rays free up to {most} electrons in a pixel and draw",
+                f"at most {2**23}: lower the rate, the charge or the exposure",
+                key="rate_per_cm2_s",
+                value=most,
+            )
+        one = np.zeros(size)
+        one[low : high + 1] = 1.0 if self.weights is None else self.weights
+        # This is the generating function of a Poisson number of hits; charges beyond `size` would alias.
+        spectrum = np.exp(hits * (np.fft.rfft(one / one.sum()) - 1.0))
+        return np.asarray(np.maximum(np.fft.irfft(spectrum, size)[: most + 1], 0.0))
+
+    def most_electrons(self, seconds: Annotated[float, Unit("s"), Range(0)]) -> int:
+        """Return the charge that a pixel exceeds in a time with a probability of at most `NEGLIGIBLE`."""
+        from scipy import special
+
+        hits = self._hits(seconds)
+        most = max(1, int(hits))
+        while special.pdtrc(most, hits) > NEGLIGIBLE:
+            most += 1
+        return most * int(self.electrons[1])
+
+    def _hits(self, seconds: float) -> float:
+        """Return the mean number of hits in one pixel."""
+        return self.rate_per_cm2_s * self.area_cm2 / self.pixels * seconds
+
+    @property
+    def particles_per_cm2_s(self) -> float:
+        """Rate of incident particles."""
+        return self.rate_per_cm2_s
+
+    def with_particles(self, rate_per_cm2_s: ParticleRate) -> Self:
+        """Return the process at another rate of incident particles."""
+        return self.model_copy(update={"rate_per_cm2_s": rate_per_cm2_s})
+
+    @property
+    def assumption(self) -> tuple[str, str, str]:
+        """Row of a table of assumptions: quantity, value and source."""
+        low, high = self.electrons
+        return ("charge of a hit", f"{low:g} to {high:g} electrons in one pixel", "assumption; adds to the noise")
+
+
+#: Drifts that are drawn at a time, per stare.
+BATCH = 16
+
+
+@validated
+class PointingDrifts(Section):
+    """Drifts out of the fibre during a stare, each ended by a re-acquisition; all values are assumptions.
+
+    The target is in place at the start of a stare. The time until a drift begins and the duration of the drift are
+    exponentially distributed. In a drift, the lost share of all light (of star, flare, neighbours and sky) rises
+    linearly from zero. The target is then acquired again, and the light returns at once.
+    """
+
+    stream: ClassVar[int] = 20
+    label: ClassVar[str] = "pointing drifts"
+    #: For messages and tables of assumptions.
+    source: ClassVar[str] = "assumption: rate, depth and duration of drifts are not published"
+
+    # Drifts per hour of good pointing.
+    rate_per_h: Annotated[
+        float,
+        Unit("1 / h"),
+        Range(0, 3600, open_low=True),
+        Help("Drifts per hour of good pointing", "an assumption"),
+        Widget(
+            label="Pointing losses",
+            hint="Drifts of the star out of the fibre, each ended by a new acquisition, per hour of good pointing. "
+            "Nothing: none. How often they happen is not published.",
+            group="Pointing",
+            name="pointing_rate",
+            first="",
+            unit="per hour",
+            most=60.0,
+        ),
+    ] = 0.5
+    # Mean duration of a drift.
+    duration_s: Annotated[
+        Duration,
+        Help("Mean duration of a drift", "exponential; an assumption"),
+        Widget(
+            label="Duration of a loss",
+            hint="Mean time from the start of a drift to the new acquisition; an assumption.",
+            group="Pointing",
+            place=1,
+            name="pointing_duration",
+        ),
+    ] = 300.0
+    # Largest share of the light lost at the end of a drift; the shares are uniform between zero and this.
+    depth: Annotated[
+        float,
+        Range(0, 1, open_low=True),
+        Help("Largest share of the light lost at the end of a drift", "uniform from 0; an assumption"),
+        Widget(
+            label="Depth of a loss",
+            hint="Largest share of the light that is lost at the end of a drift; an assumption.",
+            group="Pointing",
+            place=2,
+            name="pointing_depth",
+            unit="%",
+            scale=100.0,
+        ),
+    ] = 0.5
+
+    def drifts(self, numbers: NDArray[np.uint64], end_s: float, seed: int) -> tuple[Float, Float, Float]:
+        """Draw the drifts of stares up to a time.
+
+        Parameters
+        ----------
+        numbers : ndarray, shape (n_stare,)
+            Numbers of the stares; each depends only on the seed and its number.
+
+        Returns
+        -------
+        start_s, duration_s, depth : ndarray, shape (n_stare, n_drift)
+            In order of time; the last drift of each stare begins at `end_s` or later.
+        """
+        import numpy as np
+
+        from mauvecl.noise.random_numbers import four_normals, words
+
+        parts: list[tuple[Float, Float, Float]] = []
+        begin = np.zeros((len(numbers), 1))
+        index, n = np.asarray(numbers, np.uint64)[:, None], 0
+        while not parts or not (parts[-1][0][:, -1] >= end_s).all():
+            which = np.arange(n, n + BATCH)[None]
+            # Half the sum of two squared normals is exponential, and has the same bits on every machine.
+            a, b, c, d = (z.astype(np.float64) for z in four_normals(words(index, which, self.stream, 0, seed)))
+            wait, lasts = (a * a + b * b) / 2 * (3600.0 / self.rate_per_h), (c * c + d * d) / 2 * self.duration_s
+            share = (words(index, which, self.stream, 1, seed)[0].astype(np.float64) + 0.5) / 2**32
+            ends = begin + np.cumsum(wait + lasts, axis=1)
+            parts.append((ends - lasts, lasts, share * self.depth))
+            begin, n = ends[:, -1:], n + BATCH
+        start, lasts, depth = (np.concatenate(several, axis=1) for several in zip(*parts, strict=True))
+        return start, lasts, depth
+
+    def losses(self, numbers: NDArray[np.uint64], start_s: Float, frame_s: float, seed: int) -> Float:
+        """Draw the mean share of the light that each frame loses, shape (n_stare, n_frame).
+
+        Parameters
+        ----------
+        numbers : ndarray, shape (n_stare,)
+        start_s : ndarray, shape (n_frame,)
+            Start of the frames after the start of the stare.
+        """
+        import numpy as np
+
+        start, lasts, depth = self.drifts(numbers, float(start_s[-1]) + frame_s, seed)
+        # Light lost up to the start of each drift, in seconds.
+        before = np.cumsum(depth * lasts / 2, axis=1) - depth * lasts / 2
+        rows = zip(start, lasts, depth, before, strict=True)
+        lost = np.array([_lost_until(start_s + frame_s, *row) - _lost_until(start_s, *row) for row in rows])
+        return np.clip(lost / frame_s, 0.0, 1.0)
+
+
+def _lost_until(times_s: Float, start_s: Float, duration_s: Float, depth: Float, before_s: Float) -> Float:
+    """Return the integral of the lost share of the light up to some times, s."""
+    import numpy as np
+
+    k = np.searchsorted(start_s, times_s, side="right") - 1
+    since = np.clip(times_s - start_s[k], 0.0, duration_s[k])
+    until = before_s[k] + depth[k] * since * (since / np.maximum(duration_s[k], 1e-300)) / 2
+    return np.asarray(np.where(k < 0, 0.0, until))
+
+
+#: Largest distance of a cut from the mean in standard deviations; beyond it, the logarithm of the tail loses precision.
+MAX_CUT_SD = 1e5
+
+
+class PriorUnit:
+    """Unit of a value with a prior: deg C of temperatures, none of others."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_before_validator_function(self._plain, handler(source))
+
+    @staticmethod
+    def _plain(value: Any) -> Any:
+        is_temperature = is_quantity(value) and value.unit.physical_type == "temperature"
+        return without_unit(value, "deg_C") if is_temperature else value
+
+
+PriorValue = Annotated[float, PriorUnit(), Range()]
+
+
+@validated
+@dataclass(frozen=True)
+class Uniform:
+    """Uniform prior between two values; temperatures may be Quantities and are stored in deg C."""
+
+    low: PriorValue
+    high: PriorValue
+
+    def __post_init__(self) -> None:
+        if not self.low <= self.high:
+            raise InputError.of("low", self.low, "low <= high")
+
+    def quantile(self, below: Float, above: Float | None = None) -> Float:
+        """Return the quantiles at probabilities `below`; see `Normal.quantile`."""
+        import numpy as np
+
+        from_low = self.low + (self.high - self.low) * below
+        if above is None:
+            return np.asarray(from_low)
+        return np.asarray(np.where(below < above, from_low, self.high - (self.high - self.low) * above))
+
+
+@validated
+@dataclass(frozen=True)
+class Normal:
+    """Normal prior truncated at `low` and `high`; values as for `Uniform`, with a plain `sd` in deg C."""
+
+    mean: PriorValue
+    sd: Annotated[float, Range()]
+    low: PriorValue
+    high: PriorValue
+
+    def __post_init__(self) -> None:
+        if not (self.sd > 0 and self.low < self.high):
+            raise InputError(
+                f"a normal prior of mean {self.mean:g}, sd {self.sd:g}, cut at {self.low:g} and {self.high:g}",
+                "sd > 0 and low < high",
+                key="sd",
+                value=self.sd,
+            )
+        away = max(self.low - self.mean, self.mean - self.high) / self.sd
+        if away > MAX_CUT_SD:
+            raise InputError(
+                f"a normal prior of mean {self.mean:g} and sd {self.sd:g} is cut at {self.low:g} and "
+                f"{self.high:g}, {away:g} sd from its mean",
+                f"at most {MAX_CUT_SD:g}",
+                key="low",
+                value=(self.low, self.high),
+            )
+
+    def is_wide(self, least_sd: float) -> bool:
+        """Return whether both cuts are at least this many standard deviations from the mean."""
+        return min(self.mean - self.low, self.high - self.mean) >= least_sd * self.sd * (1.0 - 1e-12)
+
+    def quantile(self, below: Float, above: Float | None = None) -> Float:
+        """Return the quantiles at probabilities `below`.
+
+        Parameters
+        ----------
+        below : ndarray
+        above : ndarray, same shape, optional
+            1 - below, if the subtraction would lose precision.
+        """
+        import numpy as np
+        from scipy import special
+
+        above = 1.0 - below if above is None else above
+        with np.errstate(divide="ignore", over="ignore"):
+            low, high = np.log(below), np.log(above)
+            a, b = ((np.array([self.low, self.high]) - self.mean) / self.sd).tolist()
+            # Each side of the mean uses the logarithm of its own tail, which does not underflow.
+            left = special.ndtri_exp(np.logaddexp(special.log_ndtr(a) + high, special.log_ndtr(b) + low))
+            right = -special.ndtri_exp(np.logaddexp(special.log_ndtr(-a) + high, special.log_ndtr(-b) + low))
+        inside = np.where(left < 0.0, left, right)
+        return np.asarray(np.clip(self.mean + self.sd * inside, self.low, self.high))
+
+
+Prior = Uniform | Normal
+
+#: Keys of a prior in a study, each with the number of its values.
+_FORMS: dict[type[Prior], dict[str, int]] = {Uniform: {"uniform": 2}, Normal: {"normal": 2, "between": 2}}
+
+
+def _from_study(given: Any) -> Prior:
+    """Return the prior that a study gives as a table; raises InputError otherwise."""
+    if isinstance(given, Uniform | Normal):
+        return given
+    for kind, form in _FORMS.items():
+        if isinstance(given, Mapping) and {key for key in given if given[key] is not None} == form.keys():
+            return kind(*(value for key, n in form.items() for value in _values(key, given[key], n)))
+    known = [key for form in _FORMS.values() for key in form]
+    if isinstance(given, Mapping) and (other := next((key for key in given if key not in known), None)):
+        raise InputError(
+            f"unknown key {other!r} of a prior", f"some of {', '.join(known)}", key=other, value=given[other]
+        )
+    raise InputError(
+        "a prior is neither { uniform = [low, high] } nor { normal = [mean, sd], between = [low, high] }",
+        "one of them",
+        key="uniform",
+        value=given.get("uniform") if isinstance(given, Mapping) else given,
+    )
+
+
+def _values(key: str, given: Any, n: int) -> list[float]:
+    if not isinstance(given, list | tuple) or len(given) != n:
+        raise InputError.of(key, given, f"{n} numbers")
+    # Numbers in quotes are accepted, as in other fields.
+    return [float(value) if isinstance(value, int) or _is_number(value) else value for value in given]
+
+
+def _is_number(text: Any) -> bool:
+    with contextlib.suppress(ValueError):
+        return isinstance(text, str) and float(text) is not None
+    return False
+
+
+def _to_study(prior: Prior) -> dict[str, tuple[float, ...]]:
+    """Return the table that a study contains."""
+    if isinstance(prior, Uniform):
+        return {"uniform": (prior.low, prior.high)}
+    return {"normal": (prior.mean, prior.sd), "between": (prior.low, prior.high)}
+
+
+def _json_schema() -> dict[str, Any]:
+    def pair(keys: Mapping[str, int]) -> dict[str, Any]:
+        several = {"type": "array", "items": {"type": "number"}}
+        lists = {key: several | {"minItems": n, "maxItems": n} for key, n in keys.items()}
+        return {"type": "object", "properties": lists, "required": [*keys], "additionalProperties": False}
+
+    return {"anyOf": [pair(form) for form in _FORMS.values()]}
+
+
+#: Prior as a field of a study's section.
+PriorField = Annotated[Prior, PlainValidator(_from_study), PlainSerializer(_to_study), WithJsonSchema(_json_schema())]

@@ -1,1 +1,0 @@
-"""Histograms and moments in integer arithmetic, from the counts of a device."""

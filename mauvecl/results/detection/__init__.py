@@ -1,1 +1,0 @@
-"""Detections: thresholds, probabilities, ROC curves, rare tails, departures from closed forms, campaigns."""

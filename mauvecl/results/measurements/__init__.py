@@ -1,1 +1,0 @@
-"""Measurements of flares: models of their light, forecasts of errors, and fits."""

@@ -1,1 +1,0 @@
-"""Requests to an engine as data: hypotheses, channels of a launch, requests and their shards."""

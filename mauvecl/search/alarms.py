@@ -1,0 +1,437 @@
+"""Iterative detection and fitting of the flares in one stare.
+
+Each pass searches the residuals of the fits. A template raises an alarm if its value exceeds the threshold by more than
+the share of the fitted flux that a wrong shape may leave in the residuals. Flares that overlap are fitted together
+(`blends`) from several starting points, and each must improve chi-squared by the square of the threshold. The passes
+end when there are no more alarms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.search.flare_fits import (
+    AMPLITUDE,
+    KELVIN,
+    PEAK,
+    WIDTH,
+    BlendFit,
+    Block,
+    Factor,
+    FittedFlares,
+    Interval,
+    SearchedStare,
+    StareSums,
+)
+from mauvecl.search.templates import LEAD, TAIL
+
+if TYPE_CHECKING:
+    from mauvecl.search.search import Row
+    from mauvecl.search.templates import Templates
+
+Float = NDArray[np.float64]
+
+#: Values of a fit without a measurement.
+UNMEASURED = FittedFlares(**{each.name: np.full(1, np.nan) for each in fields(FittedFlares)})
+#: Share of a flare's S/N that may remain in nearby residuals without an alarm, because its shape or temperature differs
+#: from that of the fit.
+LEFT_BEHIND = 0.05
+#: The same as a share of a template's response to the fitted flux, when a block is tested for a further flare.
+LEFT_UNSEEN = 0.15
+#: Largest number of flares per fit; longer chains of overlapping flares are fitted in parts, alternately.
+MAX_FLARES_PER_FIT = 6
+#: Iterations over parts and their neighbours after each pass.
+TURNS = 2
+#: Starting points for a further flare in each block.
+SPLITS = 3
+#: Distance from a bound, as a share of the parameter's range, at which a parameter counts as at the bound.
+AT_BOUND = 1e-3
+#: Largest S/N for which intervals are from the profile likelihood; above it, intervals from the curvature agree.
+MAX_PROFILED_SNR = 40.0
+#: The rise of chi-squared that 68 % of the true values stay within is 1 + this / (S/N of the fit)^2: a correction of
+#: the likelihood ratio as Bartlett's (1937, doi 10.1098/rspa.1937.0109), counted by `bench/blends.py`.
+BARTLETT = 14.0
+#: Quantities with intervals, by their names in `FittedFlares`.
+QUANTITIES = ("peak_s", "amplitude", "half_width_s", "temperature_k", "equivalent_duration_s")
+
+
+@dataclass(frozen=True, eq=False)
+class Alarm:
+    """A detected flare."""
+
+    rho: float  # statistic at detection; root of the fall of chi-squared if a fitted flare was split in two
+    recovered: FittedFlares  # fitted values, arrays of shape (1,); NaN if not measured
+    intervals: dict[str, tuple[float, float]]  # 68 % intervals of `QUANTITIES` and "energy"; NaN if not available
+    note: str  # explanation of an unusual fit
+    block: int  # number of the block in which it was fitted, from 1
+    flares: int  # number of flares in the block
+    chi2: float  # goodness of fit of the block
+    dof: int
+    p_value: float
+
+    @property
+    def measured(self) -> bool:
+        """True if the fit has values."""
+        return bool(np.isfinite(self.recovered.peak_s[0]))
+
+
+@dataclass(eq=False)
+class Candidate:
+    """A flare during the search."""
+
+    theta: Float  # fitted parameters
+    rho: float  # statistic at detection
+    template: tuple[float, float]  # peak time and half-width of the template, s
+
+
+def alarms(
+    survey: SearchedStare, templates: Templates, sums: NDArray[Any], threshold: float, energy: Factor | None = None,
+    *, profiled: Collection[str] = QUANTITIES,
+) -> list[Alarm]:  # fmt: skip
+    """Detect and fit all flares of a stare, largest statistic first.
+
+    Parameters
+    ----------
+    templates : Templates
+        Templates from which the survey's bank and components are made.
+    sums : ndarray, shape (n_frame, n_sum)
+        Simulated sums; known means are subtracted here.
+    energy : callable, optional
+        Logarithm of the energy per second of equivalent duration as a function of the logarithm of the temperature,
+        and its derivative.
+    profiled : collection of str
+        Those of `QUANTITIES` whose intervals are computed; each takes many fits.
+    """
+    search = _StareSearch(StareSums(survey, templates, np.asarray(survey.net(sums[None])[0], np.float64)), threshold)
+    search.run()
+    return sorted(_measured_alarms(search, energy, profiled), key=lambda alarm: -alarm.rho)
+
+
+@dataclass(eq=False)
+class _StareSearch:
+    """State of the search of one stare."""
+
+    sums: StareSums
+    threshold: float
+    found: list[Candidate] = field(default_factory=list)
+    refused: list[tuple[float, float]] = field(default_factory=list)
+    complete: set[tuple[float, ...]] = field(default_factory=set)  # blocks that no further flare improves
+
+    def run(self) -> None:
+        """Search and fit until there are no alarms and no block improves with a further flare."""
+        while new := self._searched() or self._split():
+            self.found += new
+            changed = {id(one) for one in new}
+            for _ in range(TURNS):
+                changed = self._fitted(changed)
+
+    @property
+    def thetas(self) -> Float:
+        """Parameters of all flares, shape (n_flare, 4)."""
+        return np.array([one.theta for one in self.found]).reshape(len(self.found), 4)
+
+    def blocks(self) -> list[list[Candidate]]:
+        """Group overlapping flares in order of time, with at most `MAX_FLARES_PER_FIT` flares per group."""
+        spans = sorted(((*self.sums.overlap(one.theta), k) for k, one in enumerate(self.found)))
+        blocks: list[list[Candidate]] = []
+        reach = -np.inf
+        for first, last, k in spans:
+            if first > reach:
+                blocks.append([])
+            blocks[-1].append(self.found[k])
+            reach = max(reach, last)
+        n = MAX_FLARES_PER_FIT
+        return [block[k : k + n] for block in blocks for k in range(0, len(block), n)]
+
+    def _near(self, peaks: Float, width_s: float) -> Float:
+        """Return the sum of the statistics of flares within reach of templates, shape of `peaks`."""
+        total = np.zeros(peaks.shape)
+        for one in self.found:
+            reach = TAIL * np.exp(one.theta[WIDTH]) + LEAD * width_s
+            total += np.where(np.abs(peaks - one.theta[PEAK]) < reach, one.rho, 0.0)
+        return total
+
+    def _values(self, near_share: float = 0.0) -> Iterator[tuple[Float, Float, Float, NDArray[np.int64], Row]]:
+        """Yield per row the best value of each onset, its excess over fit residuals, peak time and temperature."""
+        light = self.sums.light(self.thetas)
+        # Flares at the bounds of the fit may remain in the residuals entirely.
+        wrong = self.sums.light(self.thetas[self._at_end(self.thetas)])
+        both = np.stack([self._evened(self.sums.net - light, light), LEFT_UNSEEN * light + wrong])
+        search = self.sums.survey.search
+        for row, rho in search.values(both.astype(np.float32)):
+            peaks = search.stare.numbers[0] + row.peaks + row.template.phases[row.phase]
+            peaks = peaks * self.sums.survey.bank.frame_s
+            rests = np.abs(np.where(np.isfinite(rho[1]), rho[1], 0.0))
+            excess = rho[0] - np.maximum(rests, near_share * self._near(peaks, row.template.half_width_s))
+            which = excess.argmax(axis=0)
+            onsets = np.arange(excess.shape[1])
+            yield rho[0, which, onsets], excess[which, onsets], peaks, which, row
+
+    def _candidate(self, rho: float, peak: float, row: Row, onset: int, direction: int) -> Candidate:
+        """Return a candidate with the parameters of its template."""
+        templates, width = self.sums.templates, row.template.half_width_s
+        size = float(np.linalg.norm(templates.directions[templates.chosen[direction]]))
+        amplitude = max(rho / float(row.per_amplitude[onset]), 1e-3) / size
+        kelvin = templates.temperatures_k[templates.chosen[direction]]
+        theta = np.array([np.log(amplitude), peak, np.log(width), np.log(kelvin)])
+        return Candidate(theta, rho, (peak, width))
+
+    def _searched(self) -> list[Candidate]:
+        """Return new candidates from the residuals, at most one within the window of another."""
+        sums, bank = self.sums, self.sums.survey.bank
+        candidates = []
+        for rho, excess, peaks, which, row in self._values(LEFT_BEHIND):
+            for k in np.flatnonzero(excess >= self.threshold):
+                one = self._candidate(float(rho[k]), float(peaks[k]), row, int(k), int(which[k]))
+                candidates.append((float(excess[k]), one))
+        candidates.sort(key=lambda pair: -pair[0])
+        # An alarm near a larger one may be caused by it and waits for the next pass, as do the alarms near it.
+        waiting = np.zeros(len(sums.net), np.bool_)
+        new = []
+        for _, one in candidates:
+            peak, width = one.template
+            if self._was_refused(peak, width):
+                continue
+            lead, tail = (frames * bank.frame_s for frames in bank.window(width))
+            window = sums.frames(peak - lead, peak + tail)
+            waits = waiting[window].any()
+            waiting[window] = True
+            if not waits:
+                new.append(one)
+        return new
+
+    def _split(self) -> list[Candidate]:
+        """Return a further flare that improves the fit of a block as much as an alarm, if there is one."""
+        blocks = [block for block in self.blocks() if self._key(block) not in self.complete]
+        if not blocks:
+            return []
+        overlaps = [[self.sums.overlap(one.theta) for one in block] for block in blocks]
+        spans = [(min(a for a, _ in each), max(b for _, b in each)) for each in overlaps]
+        best: list[list[tuple[float, Candidate]]] = [[] for _ in blocks]
+        for rho, excess, peaks, which, row in self._values():
+            for several, (first, last) in zip(best, spans, strict=True):
+                inside = np.flatnonzero((peaks >= first) & (peaks <= last) & np.isfinite(excess))
+                if inside.size:
+                    k = int(inside[np.argmax(excess[inside])])
+                    one = self._candidate(float(rho[k]), float(peaks[k]), row, k, int(which[k]))
+                    several.append((float(excess[k]), one))
+        for block, several in zip(blocks, best, strict=True):
+            several.sort(key=lambda pair: -pair[0])
+            for _, one in several[:SPLITS]:
+                if not self._was_refused(*one.template) and self._improves(block, one):
+                    return [one]
+            self.complete.add(self._key(block))
+        return []
+
+    def _improves(self, block: list[Candidate], one: Candidate) -> bool:
+        """Return whether a further flare improves a block significantly, and update the flares to the better fit."""
+        before = np.array([each.theta for each in block])
+        with_it = [*block, one]
+        rows = self.sums.block(np.array([each.theta for each in with_it]), np.vstack([self.thetas, one.theta]))
+        best = self._best(rows, with_it, {id(one)})
+        # The other flares alone may fit better from their new parameters.
+        alone = min((rows.fit(before), rows.without(best, len(block))), key=lambda fit: fit.chi2)
+        fall = alone.chi2 - best.chi2
+        # The other flares may have another shape, which changes their overlap with this one.
+        mine, others = rows.model(best.theta[-1:])[0], rows.model(best.theta[:-1])[0]
+        seen = abs(float(mine @ others)) / max(float(np.linalg.norm(mine)), 1e-300)
+        rests = max(LEFT_UNSEEN * seen, LEFT_BEHIND * max(each.rho for each in block))
+        if fall < (self.threshold + rests) ** 2:
+            for each, theta in zip(block, alone.theta, strict=True):
+                each.theta = theta
+            return False
+        for each, theta in zip(with_it, best.theta, strict=True):
+            each.theta = theta
+        one.rho = float(np.sqrt(fall))
+        return True
+
+    @staticmethod
+    def _key(block: list[Candidate]) -> tuple[float, ...]:
+        return tuple(np.round([one.theta for one in block], 2).ravel().tolist())
+
+    def _at_end(self, theta: Float) -> NDArray[np.bool_]:
+        """Return which flares peak at an end of the stare or are at an end of the bank, shape (n_flare,)."""
+        low, high = self.sums.bounds
+        at_end: NDArray[np.bool_] = np.minimum(theta - low, high - theta) <= AT_BOUND * (high - low)
+        return np.asarray(at_end[:, [PEAK, WIDTH]].any(axis=1))
+
+    def _was_refused(self, peak: float, width: float) -> bool:
+        return any(abs(peak - other) <= max(width, wide) and 1 / 3 < width / wide < 3 for other, wide in self.refused)
+
+    def _evened(self, left: Float, light: Float) -> Float:
+        """Scale residuals under flares down to the noise of frames without a flare."""
+        if not self.found:
+            return left
+        noise = self.sums.noise(self.thetas, light)
+        base = self.sums.covariance
+        excess = np.einsum("tkk->t", np.linalg.solve(base, noise)) / base.shape[1]
+        loud = excess > 1.01
+        if not loud.any():
+            return left
+        evened = left.copy()
+        # The baseline under a flare is the median of the surrounding frames without excess noise.
+        times = self.sums.edges[:, 0]
+        for start, stop in _runs(loud):
+            near = ~loud & (
+                np.abs(times - times[(start + stop) // 2]) < self.sums.survey.bank.baseline.window_s / 2 + 1
+            )
+            level = np.median(left[near], axis=0) if near.any() else np.zeros(left.shape[1])
+            rows = slice(start, stop)
+            evened[rows] = level + (left[rows] - level) / np.sqrt(excess[rows])[:, None]
+        return evened
+
+    def _fitted(self, changed: set[int]) -> set[int]:
+        """Fit all blocks that have changed or adjoin changed ones, and return the flares whose parameters changed."""
+        moved: set[int] = set()
+        spans = [self.sums.window(one.theta) for one in self.found if id(one) in changed]
+        for block in self.blocks():
+            mine = [self.sums.window(one.theta) for one in block]
+            if any(a < d and c < b for a, b in mine for c, d in spans):
+                moved |= self._fit(block, {id(one) for one in block} & changed)
+        return moved
+
+    def _fit(self, block: list[Candidate], new: set[int]) -> set[int]:
+        sums = self.sums
+        before = np.array([one.theta for one in block])
+        rows = sums.block(before, self.thetas)
+        best = self._best(rows, block, new)
+        # The noise depends on the fitted flares.
+        inside = {id(one) for one in block}
+        others = np.array([one.theta for one in self.found if id(one) not in inside]).reshape(-1, 4)
+        rows = sums.block(best.theta, np.vstack([others, best.theta]))
+        best = rows.fit(best.theta)
+        kept = list(block)
+        while len(kept) > 1:
+            falls = [rows.without(best, j) for j in range(len(kept))]
+            j = int(np.argmin([one.chi2 for one in falls]))
+            if falls[j].chi2 - best.chi2 >= self.threshold**2:
+                break
+            self.refused.append(kept[j].template)
+            self.found.remove(kept[j])
+            best = falls[j]
+            del kept[j]
+        moved = set()
+        for one, theta in zip(kept, best.theta, strict=True):
+            if np.abs(theta - one.theta).max() > 1e-4:
+                moved.add(id(one))
+            one.theta = theta
+        return moved
+
+    def _best(self, rows: Block, block: list[Candidate], new: set[int]) -> BlendFit:
+        """Return the best of several fits with different starting points for blends with a new flare."""
+        start = np.array([one.theta for one in block])
+        fits = [rows.fit(start)]
+        if len(block) > 1:
+            for k, one in enumerate(block):
+                if id(one) not in new:
+                    continue
+                # A flare that was fitted alone may be too wide because it includes another.
+                for j in range(len(block)):
+                    if j != k and start[j, WIDTH] > start[k, WIDTH]:
+                        other = start.copy()
+                        other[j, WIDTH] = start[k, WIDTH]
+                        fits.append(rows.fit(other))
+        return min(fits, key=lambda one: one.chi2)
+
+
+def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the start and end of each run of true values."""
+    steps = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in steps.reshape(-1, 2)]
+
+
+def _measured_alarms(search: _StareSearch, energy: Factor | None, profiled: Collection[str]) -> list[Alarm]:
+    """Measure all flares of a finished search."""
+    measured_alarms = []
+    for number, block in enumerate(search.blocks(), 1):
+        theta = np.array([one.theta for one in block])
+        rows = search.sums.block(theta, search.thetas)
+        better: BlendFit | None = rows.fit(theta)
+        while better is not None:
+            # If profiling finds a better fit, start again from it.
+            best, measured = better, []
+            for j in range(len(block)):
+                gain = rows.without(best, j).chi2 - best.chi2
+                values, better = _measured(rows, best, j, gain, energy, profiled)
+                if better is not None:
+                    break
+                measured.append(values)
+        for one, values in zip(block, measured, strict=True):
+            measured_alarms.append(Alarm(one.rho, *values, number, len(block), best.chi2, best.dof, best.p_value))
+    return measured_alarms
+
+
+def _measured(
+    rows: Block, best: BlendFit, j: int, gain: float, energy: Factor | None, profiled: Collection[str]
+) -> tuple[tuple[FittedFlares, dict[str, tuple[float, float]], str], BlendFit | None]:
+    """Return the values, intervals and note of a flare, and a better fit of its block if profiling finds one."""
+    sums, theta = rows.sums, best.theta[j]
+    low, high = sums.bounds
+    at_low, at_high = (np.abs(theta - end) <= AT_BOUND * (high - low) for end in (low, high))
+    snr = float(np.sqrt(max(gain, 0.0)))
+    missing = ""
+    if at_low[PEAK] or at_high[PEAK]:
+        missing = "its best fit peaks outside the stare"
+    elif at_low[WIDTH] or at_high[WIDTH]:
+        missing = f"its best fit is {'wider' if at_high[WIDTH] else 'narrower'} than the half-widths of the bank"
+    elif not best.converged:
+        missing = "its fit did not converge"
+    if missing:
+        nowhere = dict.fromkeys((*QUANTITIES, "energy"), (np.nan, np.nan))
+        return (replace(UNMEASURED, snr=np.array([snr])), nowhere, f"detected but not measured: {missing}"), None
+    area = sums.survey.bank.shape.equivalent_duration
+    several = KELVIN in sums.free
+    covariance = best_covariance(rows, best, j)
+    duration = np.array([1.0, 0.0, 1.0, 0.0])
+    sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    sd_duration = float(np.sqrt(max(duration @ covariance @ duration, 0.0)))
+    amplitude, width, kelvin = np.exp(theta[[AMPLITUDE, WIDTH, KELVIN]])
+    factors: dict[str, tuple[int, Factor | None, float]] = {
+        "peak_s": (PEAK, None, 0.0), "amplitude": (AMPLITUDE, None, 0.0), "half_width_s": (WIDTH, None, 0.0),
+        "temperature_k": (KELVIN, None, 0.0), "equivalent_duration_s": (AMPLITUDE, lambda _: (0.0, 0.0), np.log(area)),
+    }  # fmt: skip
+    if energy is not None:
+        factors["energy"] = (AMPLITUDE, energy, np.log(area))
+    intervals, notes = {"energy": (np.nan, np.nan)}, []
+    for name, (column, factor, offset) in factors.items():
+        if name not in (*profiled, "energy") or (column == KELVIN and not several):
+            intervals[name] = (np.nan, np.nan)
+            continue
+        if snr > MAX_PROFILED_SNR:
+            found = _by_curvature(theta, covariance, column, factor)
+        else:
+            found, better = rows.interval(best, j, column, factor, 1.0 + BARTLETT / max(snr, 1.0) ** 2)
+            if better is not None:
+                return (UNMEASURED, {}, ""), better
+        ends = np.array([found.low, found.high])
+        low_end, high_end = ends if column == PEAK else np.exp(ends + offset)
+        intervals[name] = (float(low_end), float(high_end))
+        if found.open_low or found.open_high:
+            notes.append(name.rsplit("_", 1)[0].replace("_", " "))
+    note = f"the interval of its {' and its '.join(notes)} ends where the fit does" if notes else ""
+    values = (
+        theta[PEAK], sd[PEAK], amplitude, amplitude * sd[AMPLITUDE], width, width * sd[WIDTH],
+        kelvin if several else np.nan, kelvin * sd[KELVIN] if several else np.nan,
+        amplitude * width * area, amplitude * width * area * sd_duration, snr,
+    )  # fmt: skip
+    return (FittedFlares(*(np.array([value]) for value in values)), intervals, note), None
+
+
+def best_covariance(rows: Block, best: BlendFit, j: int) -> Float:
+    """Return the covariance of one flare's parameters, shape (4, 4)."""
+    return np.asarray(rows.covariance(best.theta)[j, :, j, :])
+
+
+def _by_curvature(theta: Float, covariance: Float, column: int, factor: Factor | None) -> Interval:
+    if factor is None:
+        middle, sd = theta[column], np.sqrt(covariance[column, column])
+    else:
+        value, slope = factor(theta[KELVIN])
+        along = np.array([1.0, 0.0, 1.0, slope])
+        middle, sd = theta[AMPLITUDE] + theta[WIDTH] + value, np.sqrt(along @ covariance @ along)
+    return Interval(float(middle - sd), float(middle + sd))

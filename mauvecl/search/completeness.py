@@ -1,0 +1,482 @@
+"""Completeness of a search, the number of flares that a campaign recovers, and rates that follow from them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import optimize, stats
+
+from mauvecl.detection.distributions import Interval, central_counts, clopper_pearson, smallest_integer
+from mauvecl.flares.defaults import HALF_WIDTHS_S as BANK_S
+from mauvecl.flares.energies import EnergyScale, PowerLaw, Rates
+from mauvecl.flares.shapes import Shape, consecutive_integrals, shape_of
+from mauvecl.host.exposure.expectation import Expectation
+from mauvecl.schema.calls import validated
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DAY_S, Duration, DurationExponent, DurationScatter, Energy, NotNegative, Positive
+from mauvecl.search.false_alarms import TemplateGrid
+from mauvecl.search.templates import Bank, white_bank
+
+Float = NDArray[np.float64]
+
+#: Energies per decade of the closed form, and its numbers of half-widths and peak times.
+PER_DECADE, WIDTHS, PEAKS = 20, 40, 24
+HALF_WIDTHS_S = (2.0, 20_000.0)
+#: Range of thresholds, sigma.
+THRESHOLDS = (2.0, 20.0)
+
+
+@validated
+@dataclass(frozen=True)
+class DurationLaw:
+    """Assumed half-widths by energy: t_1/2 = half_width_s (E / at_erg)^exponent, with a normal scatter in dex.
+
+    The exponent is that of superflares on G dwarfs (Maehara et al. 2015); the default scale gives minutes at 1e34 erg
+    and tens of seconds at 1e31 erg.
+
+    Attributes
+    ----------
+    half_width_s, at_erg : float
+        Bolometric energy.
+    exponent, scatter_dex : float
+    """
+
+    half_width_s: Duration = 100.0
+    at_erg: Energy = 1e33
+    exponent: DurationExponent = 0.39
+    scatter_dex: DurationScatter = 0.3
+
+    def half_width(self, energy_erg: ArrayLike) -> Float:
+        """Return the median half-width, s, shape of the energy."""
+        return np.asarray(self.half_width_s * (np.asarray(energy_erg, float) / self.at_erg) ** self.exponent)
+
+
+@dataclass(frozen=True, eq=False)
+class Completeness:
+    """Probability that a flare is recovered, by energy.
+
+    Attributes
+    ----------
+    energy_erg : ndarray, shape (n,)
+        Energies in the band, ascending.
+    probability : ndarray, shape (n,)
+    band : str
+        Name of the band, or "bolometric".
+    how : str
+        Description of the method.
+    """
+
+    energy_erg: Float
+    probability: Float
+    band: str
+    how: str
+
+    def __post_init__(self) -> None:
+        for name in ("energy_erg", "probability"):
+            kept = np.array(getattr(self, name), np.float64)
+            kept.setflags(write=False)
+            object.__setattr__(self, name, kept)
+        energy, p = self.energy_erg, self.probability
+        if energy.ndim != 1 or energy.shape != p.shape or energy.size < 2:
+            raise InputError.of("probability", p.size, f"one for each of {energy.size} energies, at least 2")
+        if not ((energy > 0).all() and (np.diff(energy) > 0).all() and np.isfinite(energy).all()):
+            raise InputError("energies of a completeness do not ascend", "ascending ones above 0", key="energy_erg")
+        if not ((p >= 0) & (p <= 1)).all():
+            raise InputError.of("probability", (float(p.min()), float(p.max())), "0 to 1")
+
+    def at(self, energy_erg: ArrayLike) -> Float:
+        """Return the interpolated probability, constant outside the table, shape of the energy."""
+        return np.asarray(np.interp(np.log10(energy_erg), np.log10(self.energy_erg), self.probability))
+
+    @property
+    def decades(self) -> tuple[float, float]:
+        """Logarithms of the first and last energy."""
+        return float(np.log10(self.energy_erg[0])), float(np.log10(self.energy_erg[-1]))
+
+    def energy_at(self, probability: float) -> float:
+        """Return the energy above which the probability is reached, erg; infinite if it never is."""
+        reached = self.probability >= probability
+        if not reached[-1]:
+            return float("inf")
+        if reached.all():
+            return float(self.energy_erg[0])
+        first = int(np.flatnonzero(~reached)[-1])
+        low, high = self.probability[first : first + 2]
+        part = (probability - low) / (high - low)
+        e0, e1 = np.log10(self.energy_erg[first : first + 2])
+        return float(10 ** (e0 + part * (e1 - e0)))
+
+    @classmethod
+    @validated
+    def of_search(
+        cls,
+        signal_per_frame: Positive,
+        scale: EnergyScale,
+        *,
+        window_s: Duration,
+        false_alarms_per_day: float,
+        bank: Bank | None = None,
+        law: DurationLaw | None = None,
+    ) -> Self:
+        """Compute the closed form for a bank of matched filters in observing windows of equal length.
+
+        Offset and slope of each window are unknown, so that only the deviation of a flare from a straight line counts;
+        peaks are distributed uniformly over the window. Flares with an S/N below half of the threshold count as lost.
+        The closed form neglects the photon noise of flares, the mismatch between templates (about 1 %), and the effect
+        of several temperatures on the threshold.
+
+        Parameters
+        ----------
+        signal_per_frame : float
+            S/N of one frame with a flare of amplitude 1 and optimal spectral weights; see `frame_signal`.
+        scale : EnergyScale
+            Bolometric energies by amplitude.
+        window_s : float
+            Length of a window without gaps.
+        false_alarms_per_day : float
+            False alarms per day of frames, which set the threshold.
+        bank : Bank, optional
+            Shape, half-widths and baseline; `default_bank` by default.
+        law : DurationLaw, optional
+        """
+        if scale.kind != "bolometric":
+            raise InputError.of("kind", scale.kind, "bolometric")
+        law, bank = law or DurationLaw(), bank or default_bank()
+        threshold = search_threshold(false_alarms_per_day, bank)
+        widths, gain = _gains(bank.shape, window_s, bank.frame_s)
+        # From undetectable energies to those that are always detected.
+        log_energy = np.arange(24.0, 40.0, 1 / PER_DECADE)
+        nodes, weights = np.polynomial.hermite_e.hermegauss(15)
+        half = law.half_width(10**log_energy)[:, None] * 10 ** (law.scatter_dex * nodes)
+        duration = scale.equivalent_duration(1.0) * 10**log_energy
+        amplitude = duration[:, None] / (half * bank.shape.equivalent_duration)
+        place = np.clip(np.log(half / widths[0]) / np.log(widths[-1] / widths[0]), 0, 1) * (WIDTHS - 1)
+        i = np.minimum(place.astype(int), WIDTHS - 2)
+        # The logarithm of the gain is interpolated linearly between half-widths.
+        part = (place - i)[..., None]
+        one = np.exp((1 - part) * np.log(gain[i]) + part * np.log(gain[i + 1]))
+        signal = amplitude[..., None] * signal_per_frame * one
+        # Small flares that noise lifts above the threshold, about 1 % of them, count as false alarms, since small
+        # flares are arbitrarily frequent.
+        p = np.where(signal > threshold / 2, stats.norm.sf(threshold - signal), 0.0).mean(axis=-1)
+        probability = p @ (weights / weights.sum())
+        how = (
+            f"closed form of a bank of matched filters, {bank.shape.name}, threshold {threshold:.2f} sigma for "
+            f"{false_alarms_per_day:g} false alarms a day, stretches of {window_s / 60:.0f} min"
+        )
+        return cls(10**log_energy, np.clip(probability, 0, 1), "bolometric", how)
+
+
+def default_bank() -> Bank:
+    """Return the bank of a default search with one sum per frame."""
+    return white_bank(BANK_S, shape_of("davenport2014"), 5.0)
+
+
+@validated
+def search_threshold(false_alarms_per_day: Positive, bank: Bank | None = None) -> float:
+    """Return the threshold of a bank in white noise, sigma, for a number of false alarms per day of frames.
+
+    The threshold follows from `TemplateGrid` and is about 1 % too high at one alarm per day, and less at lower rates.
+    Raises InputError if it is not between 2 and 20 sigma.
+    """
+    return _search_threshold(false_alarms_per_day, bank or default_bank())
+
+
+# A plan asks for the threshold and the gains of each target and each mode of a calibrated throughput.
+@lru_cache(maxsize=8)
+def _search_threshold(false_alarms_per_day: float, bank: Bank) -> float:
+    grid = TemplateGrid.from_bank(bank)
+
+    def over(threshold: float) -> float:
+        return float(np.log(grid.false_alarms_per_second(threshold) * DAY_S / false_alarms_per_day))
+
+    if over(THRESHOLDS[0]) < 0 or over(THRESHOLDS[1]) > 0:
+        most, least = (grid.false_alarms_per_second(u) * DAY_S for u in THRESHOLDS)
+        raise InputError.of("false_alarms_per_day", false_alarms_per_day, f"{least:.2g} to {most:.3g}")
+    return float(optimize.brentq(over, *THRESHOLDS, xtol=1e-9))
+
+
+def frame_signal(
+    quiet: Expectation, flare: Expectation, amplitude: float = 1.0, *, added_variance_dn2: Float | None = None
+) -> float:
+    """Return the S/N of one frame with a flare of amplitude 1, with optimal weights.
+
+    Parameters
+    ----------
+    quiet, flare : Expectation
+        One frame each; pixels that saturate without a flare are excluded.
+    amplitude : float
+        Amplitude of the flare in `flare`.
+    added_variance_dn2 : ndarray, shape (n_pixel,), optional
+        Additional variance, such as that of particle hits.
+    """
+    if quiet.n_frames != 1 or flare.n_frames != 1:
+        raise InputError.of("n_frames", (quiet.n_frames, flare.n_frames), "one frame each")
+    light = (flare.source_electrons - quiet.source_electrons) * quiet.gain_dn_per_electron / amplitude
+    variance = quiet.unsaturated_variance_dn2 + (0.0 if added_variance_dn2 is None else added_variance_dn2)
+    used = ~quiet.saturated
+    return float(np.sqrt(np.sum(light[used] ** 2 / variance[used])))
+
+
+@lru_cache(maxsize=32)
+def _gains(shape: Shape, window_s: float, frame_s: float) -> tuple[Float, Float]:
+    """Return half-widths, (WIDTHS,), and the norm of detrended shapes by half-width and peak time, (WIDTHS, PEAKS)."""
+    n = max(3, round(window_s / frame_s))
+    edges = np.arange(n + 1) * frame_s
+    line = np.stack([np.ones(n), np.linspace(-1, 1, n)])
+    line /= np.linalg.norm(line, axis=1)[:, None]
+    widths = np.geomspace(*HALF_WIDTHS_S, WIDTHS)
+    # Peaks have irregular phases within frames, which averages over the phase of short flares.
+    peaks = (np.arange(PEAKS) + 0.5) / PEAKS * n * frame_s + frame_s * ((np.arange(PEAKS) * 0.618034) % 1.0 - 0.5)
+    gain = np.empty((WIDTHS, PEAKS))
+    for i, half in enumerate(widths):
+        tau = (edges[None, :] - peaks[:, None]) / half
+        frames = consecutive_integrals(shape, tau) * half / frame_s
+        rest = frames - (frames @ line.T) @ line
+        gain[i] = np.linalg.norm(rest, axis=1)
+    gain = np.maximum(gain, 1e-12)
+    for shared in (widths, gain):
+        shared.setflags(write=False)
+    return widths, gain
+
+
+@dataclass(frozen=True, eq=False)
+class InjectedCompleteness:
+    """Detection of injected flares."""
+
+    half_widths_s: tuple[float, ...]
+    sizes: Float  # shape (n_size,)
+    amplitudes: Float  # shape (n_half_width, n_size)
+    critical: Float  # smallest size that is detected in each draw, shape (n_half_width, n_position, n_draw)
+
+    @property
+    def count(self) -> int:
+        """Injections per cell."""
+        return int(self.critical[0].size)
+
+    @cached_property
+    def _cells(self) -> tuple[Float, Float, Float]:
+        cells = np.empty((3, len(self.half_widths_s), self.sizes.size))
+        for d, critical in enumerate(self.critical):
+            for s, size in enumerate(self.sizes):
+                p = self._completeness(critical, float(size))
+                cells[:, d, s] = p.value, p.low, p.high
+        return cells[0], cells[1], cells[2]
+
+    @property
+    def completeness(self) -> Float:
+        """Detected fraction, shape (n_half_width, n_size)."""
+        return self._cells[0]
+
+    @property
+    def completeness_low(self) -> Float:
+        """Lower limits of the 95 % intervals of `completeness`."""
+        return self._cells[1]
+
+    @property
+    def completeness_high(self) -> Float:
+        """Upper limits of the 95 % intervals of `completeness`."""
+        return self._cells[2]
+
+    def _completeness(self, critical: Float, size: float) -> Interval:
+        """Return the detected fraction at a size, with an interval for the effective number of independent draws."""
+        each = np.mean(critical <= size, axis=1)
+        fraction, trials = float(each.mean()), self._independent(each, critical.size)
+        around = clopper_pearson(round(fraction * trials), trials)
+        return Interval(fraction, min(around.low, fraction), max(around.high, fraction))
+
+    @staticmethod
+    def _independent(each: Float, count: int) -> int:
+        """Return the effective number of independent draws, reduced if positions differ (Kish's design effect)."""
+        fraction = float(each.mean())
+        binomial = fraction * (1 - fraction) / count
+        if not binomial > 0 or each.size < 2:
+            return count
+        return max(1, int(count * min(1.0, binomial / max(float(each.var(ddof=1)) / each.size, 1e-300))))
+
+    def limit(self, power: float, half_width: int | None) -> Interval:
+        """Return the size at which the fraction `power` is detected, with a 95 % interval; infinite if never reached.
+
+        Parameters
+        ----------
+        half_width : int, optional
+            Index of a half-width; by default the average over all.
+        """
+        critical = self.critical if half_width is None else self.critical[half_width : half_width + 1]
+        by_position = np.moveaxis(critical, 1, 0).reshape(critical.shape[1], -1)
+        ordered = np.sort(by_position, axis=None)
+        value = float(ordered[min(int(np.ceil(power * ordered.size)), ordered.size) - 1])
+        trials = self._independent(np.mean(by_position <= value, axis=1), ordered.size)
+        # Half-widths share draws and do not add independent ones.
+        trials = max(1, min(trials, self.count))
+        ranks = [int(k / trials * ordered.size) for k in central_counts(trials, power)]
+        low, high = (float(ordered[min(max(k, 0), ordered.size - 1)]) for k in ranks)
+        return Interval(value, min(low, value), max(high, value))
+
+    def never(self, half_width: int | None) -> float:
+        """Return the fraction that no template can detect because of gaps."""
+        critical = self.critical if half_width is None else self.critical[half_width]
+        return float(np.mean(np.isinf(critical)))
+
+
+#: Energy steps per decade for sums of rates.
+ENERGIES_PER_DECADE = 100
+#: Number of quantiles of the scatter of a rate.
+NODES = 1000
+#: Range of fitted exponents, and number of energies of the grid for sums of flares.
+EXPONENTS, GRID = (1.01, 6.0), 1200
+
+
+@dataclass(frozen=True)
+class Yield:
+    """Number of flares that a campaign recovers.
+
+    Attributes
+    ----------
+    expected : float
+        Mean at the nominal rate.
+    low, high : int
+        Central 95 % of campaigns, with the scatter of the rate and Poisson noise.
+    at_least_one : float
+        Probability of at least one flare, with the same scatter.
+    """
+
+    expected: float
+    low: int
+    high: int
+    at_least_one: float
+
+    @classmethod
+    @validated
+    def of(cls, rates: Rates, completeness: Completeness, days: NotNegative) -> Yield:
+        """Compute the yield from flare rates, completeness and observed days; energies must be in the same band."""
+        expected = recovered_per_day(rates, completeness) * days
+        return cls.of_expected(expected, rates.scatter_dex)
+
+    @classmethod
+    def of_expected(cls, expected: float, scatter_dex: float) -> Yield:
+        """Compute the yield from the expected number and the scatter of its logarithm."""
+        # Many quantiles are needed, since the Poisson distribution may be narrower than the scatter.
+        nodes = stats.norm.ppf((np.arange(NODES) + 0.5) / NODES) if scatter_dex > 0 else np.zeros(1)
+        means = expected * 10.0 ** (scatter_dex * nodes)
+        largest = float(means.max())
+        most = int(largest + 20 * np.sqrt(largest) + 20)
+
+        def quantile(probability: float) -> int:
+            return smallest_integer(lambda n: float(np.mean(stats.poisson.cdf(n, means))) >= probability, -1, most)
+
+        return cls(expected, quantile(0.025), quantile(0.975), float(np.abs(np.expm1(-means)).mean()))
+
+
+def recovered_per_day(rates: Rates, completeness: Completeness) -> float:
+    """Return the recovered flares per day, the integral of rate times completeness over energy."""
+    if rates.band != completeness.band:
+        raise InputError.of("band", rates.band, f"{completeness.band!r}, the band of the completeness")
+    low, high = completeness.decades
+    edges = 10 ** np.linspace(low, high, max(2, round((high - low) * ENERGIES_PER_DECADE)))
+    above = rates.per_day_above(edges)
+    chance = completeness.at(np.sqrt(edges[1:] * edges[:-1]))
+    # The completeness is constant above the table.
+    return float(np.sum((above[:-1] - above[1:]) * chance) + above[-1] * completeness.probability[-1])
+
+
+@dataclass(frozen=True)
+class FittedPowerLaw:
+    """Power law fitted to recovered flares."""
+
+    alpha: float
+    alpha_sd: float
+    log10_rate: float  # of flares per day with energies of at least `pivot_erg`
+    log10_rate_sd: float
+    pivot_erg: float
+    flares: int
+
+    def law(self, band: str = "Kepler") -> PowerLaw:
+        """Return the power law as flare rates."""
+        return PowerLaw.through(self.alpha, self.pivot_erg, 10**self.log10_rate, band=band, source="fitted")
+
+
+@validated
+def fit_power_law(
+    energy_erg: Float,
+    completeness: Completeness,
+    days: Positive,
+    *,
+    error_dex: float = 0.0,
+    bias_dex: float = 0.0,
+) -> FittedPowerLaw:
+    """Estimate exponent and rate of flares from recovered energies by maximum likelihood.
+
+    Recovered energies are a Poisson process of density days * dN/dlogE * completeness, blurred by the error of a
+    recovered energy; standard errors follow from the curvature of the likelihood.
+
+    Parameters
+    ----------
+    energy_erg : ndarray, shape (n,)
+        Recovered energies, at least 3.
+    completeness : Completeness
+        Completeness by true energy.
+    days : float
+        Observed time.
+    error_dex, bias_dex : float
+        Standard deviation and mean of the normal error of the logarithm of a recovered energy.
+    """
+    logs = np.log10(np.asarray(energy_erg, np.float64))
+    if logs.size < 3 or not np.isfinite(logs).all():
+        raise InputError(
+            f"energy_erg has {logs.size} flares", "at least 3 with energies above 0", key="energy_erg", value=logs.size
+        )
+    pivot = float(np.median(logs))
+    x = np.linspace(*completeness.decades, GRID)
+    step = float(x[1] - x[0])
+    chance = completeness.at(10**x)
+    recovered = logs - bias_dex
+    # The density is unconstrained where the completeness is zero, and may be huge there.
+    used = chance > 0
+    x, chance = x[used], chance[used]
+    blur = None
+    if error_dex > 0:
+        blur = stats.norm.pdf(recovered[:, None], x, error_dex) * step
+
+    def seen(alpha: float) -> Float:
+        """Return recovered flares per day and dex of true energy, for a rate of 1 above the pivot."""
+        return np.asarray((alpha - 1) * np.log(10) * 10 ** ((1 - alpha) * (x - pivot)) * chance)
+
+    def cost(alpha: float, log10_rate: float | None = None) -> float:
+        """Return the negative log likelihood, by default at the best rate for the exponent."""
+        flares = seen(alpha)
+        at = np.interp(recovered, x, flares) if blur is None else blur @ flares
+        mean = days * step * flares.sum()
+        rate = logs.size / mean if log10_rate is None else 10**log10_rate
+        return float(mean * rate - np.sum(np.log(np.maximum(at, 1e-300))) - logs.size * np.log(rate * days))
+
+    alpha = float(optimize.minimize_scalar(cost, bounds=EXPONENTS, method="bounded", options={"xatol": 1e-7}).x)
+    log10_rate = float(np.log10(logs.size / (days * step * seen(alpha).sum())))
+    covariance = np.linalg.inv(_curvature(lambda one: cost(one[0], one[1]), np.array([alpha, log10_rate])))
+    return FittedPowerLaw(
+        alpha=alpha,
+        alpha_sd=float(np.sqrt(covariance[0, 0])),
+        log10_rate=log10_rate,
+        log10_rate_sd=float(np.sqrt(covariance[1, 1])),
+        pivot_erg=10**pivot,
+        flares=int(logs.size),
+    )
+
+
+def _curvature(cost: Callable[[Float], float], at: Float) -> Float:
+    """Return second derivatives by central differences, (2, 2)."""
+    h = 1e-3
+    second = np.empty((2, 2))
+    steps = h * np.eye(2)
+    for i in range(2):
+        for j in range(2):
+            second[i, j] = (
+                cost(at + steps[i] + steps[j]) - cost(at + steps[i] - steps[j])
+                - cost(at - steps[i] + steps[j]) + cost(at - steps[i] - steps[j])
+            ) / (4 * h * h)  # fmt: skip
+    return second

@@ -1,0 +1,619 @@
+"""Rates of false alarms of a search: counted, in closed form, and by importance sampling.
+
+Rate of false alarms, counted in simulated stares, and the conventional rule of consecutive points.
+
+Rates are false alarms per star-day, 86 400 s of frames (gaps do not count). Alarms occur in clusters, of which a search
+reports the largest value, so that the probability of no alarm in t star-days is exp(-rate t). `importance_sampling`
+covers rates that are too small to count.
+
+Closed-form false-alarm rate of a template bank in white noise.
+
+The templates of a bank form a grid over onset, half-width and temperature. An alarm is a local maximum of the statistic
+on that grid, so the rate of local maxima above a threshold bounds the rate of alarms from above and approaches it for
+high thresholds (Taylor, Worsley & Gosselin 2007, doi 10.1093/biomet/asm004):
+
+    rate(u) = sum over templates of  integral_u^inf phi(z) * prod over axes of P(both neighbours < z | z) dz
+
+Given z, the two neighbours along an axis are jointly normal with known correlations, and their joint probability
+follows from Owen's T function (Owen 1956, doi 10.1214/aoms/1177728074). Neighbours in half-width are compared at the
+onset of maximum correlation, which makes them independent of neighbours in onset to first order; neighbours in
+temperature are independent of both.
+
+Importance sampling of the false-alarm rate in normal noise, for alarms too rare to count.
+
+The method gives an unbiased estimate of P(max > u) for M correlated normal values rho_j at any u. One of them, i, is
+chosen with a probability proportional to w_i, and the noise is drawn except for rho_i, so that every value is
+r_j + c_ij z with z = rho_i. Then, for any function G that is not zero above u,
+
+    P = sum(w) E[integral phi(z) G(z) 1(max_j rho_j > u) / sum_j w_j G(rho_j) dz].
+
+With G a step at u this is the method of Naiman & Priebe (J. Comput. Graph. Stat. 10, 296, 2001) and of Adler, Blanchet
+& Liu (2012, doi 10.1214/11-AAP792), whose 1 / number of values above u has a large variance if clusters of values above
+u vary in size. Here G(z) = exp(u z) from slightly below u: the sum over a cluster then follows its maximum, and the
+integral over z is computed by quadrature, so that the estimate hardly depends on how far the maximum exceeds u. The
+weights w are the probabilities that a template is a local maximum, so that all clusters contribute equally.
+
+Effect of unknown light, sky and temperature on the false alarms of a search.
+
+If the star is brighter or the detector warmer than assumed, the scatter of a template's value increases by a factor r,
+and it exceeds u as often as u / r is exceeded otherwise. If the baseline has trends that the search neither subtracts
+nor marginalises over, values are shifted, and exceed u as often as u less the shift is exceeded otherwise.
+
+False-alarm rate of a survey by importance sampling, with the unknowns of its stare.
+
+A search weights frames by their known variance and marginalises over known curves. The unknowns of a stare are drawn
+from a widened distribution and weighted accordingly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from mauvecl.detection.distributions import CONFIDENCE, Interval, central_counts, clopper_pearson
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DAY_S
+from mauvecl.search.search import BATCH
+from mauvecl.search.templates import Bank, Template
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from mauvecl.search.search import Search, Survey
+
+Float = NDArray[np.float64]
+
+#: Smallest number of alarms for a counted threshold.
+MIN_ALARMS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class CountedRate:
+    """False-alarm rate from the largest values of stares without a flare."""
+
+    maxima: Float  # ascending, shape (n_stare,)
+    days: float  # star-days of each stare
+
+    def rate(self, threshold: float) -> Interval:
+        """Return the false alarms per star-day at a threshold, with a 95 % interval; infinite if all stares alarm."""
+        n = self.maxima.size
+        above = n - int(np.searchsorted(self.maxima, threshold, side="left"))
+        p = clopper_pearson(above, n)
+        with np.errstate(divide="ignore"):
+            values = [float(-np.log1p(-x) / self.days) for x in (p.value, p.low, p.high)]
+        return Interval(*values)
+
+    def threshold(self, rate: float) -> Interval:
+        """Return the threshold for a number of false alarms per star-day, with a 95 % interval.
+
+        Raises InputError if it is expected that fewer than 10 stares alarm, or fewer than 10 do not.
+        """
+        n = self.maxima.size
+        alarmed = -np.expm1(-rate * self.days)
+        if min(alarmed, 1 - alarmed) * n < MIN_ALARMS:
+            raise InputError(
+                f"{rate:g} false alarms per star-day occur in {alarmed * n:.3g} of {n} simulated stares",
+                f"at least {MIN_ALARMS} with an alarm and as many without",
+                key="false_alarms",
+                value=rate,
+            )
+        low, high = central_counts(n, 1 - alarmed)
+        ranks = np.clip([round(n * (1 - alarmed)), low, high], 0, n - 1)
+        return Interval(*(float(self.maxima[k]) for k in ranks))
+
+
+def consecutive_alarm_rate(points: int, sigma: float, frame_s: float) -> float:
+    """Return the false alarms per star-day of the rule of consecutive points in white noise."""
+    above = float(scipy.special.ndtr(-sigma))
+    frames = DAY_S / frame_s
+    # A run starts at the first frame or after a frame that is not above sigma.
+    return above**points * (1 + (frames - points) * (1 - above))
+
+
+#: Gauss-Laguerre nodes for the integral over z, in the variable (z^2 - u^2) / 2.
+N_NODES = 32
+#: Threshold at which `TemplateGrid.peak_probabilities` weights templates.
+WEIGHTING_THRESHOLD = 5.0
+#: Correlations are clipped here to keep 1 - r^2 positive.
+MAX_CORRELATION = 1 - 1e-12
+
+
+@dataclass(frozen=True)
+class UnitFilter:
+    """A detrended template, normalised to unit length."""
+
+    values: Float  # shape (n,)
+    first_frame: int  # frame of values[0] relative to the peak
+
+    def shifted(self, n_frames: int) -> UnitFilter:
+        """Return the filter delayed by `n_frames`."""
+        return UnitFilter(self.values, self.first_frame + n_frames)
+
+    def correlation(self, other: UnitFilter) -> float:
+        """Return the correlation with another filter at their present positions."""
+        first = max(self.first_frame, other.first_frame)
+        end = min(self.first_frame + self.values.size, other.first_frame + other.values.size)
+        return float(
+            self.values[first - self.first_frame : end - self.first_frame]
+            @ other.values[first - other.first_frame : end - other.first_frame]
+        )
+
+    def best_alignment(self, other: UnitFilter) -> tuple[float, UnitFilter]:
+        """Return the largest correlation over all shifts of `other`, and `other` at that shift."""
+        correlations = np.correlate(self.values, other.values, "full")
+        best = int(np.argmax(correlations))
+        shift = self.first_frame - other.first_frame + best - other.values.size + 1
+        return float(correlations[best]), other.shifted(shift)
+
+
+@dataclass(frozen=True)
+class TemplateGrid:
+    """Correlations between neighbouring templates of a bank.
+
+    Each correlation tuple is ``(previous, next, between them)``, ``(only,)`` at the edge of the bank, or ``()`` if the
+    template has no neighbour along that axis.
+    """
+
+    frame_s: float
+    templates_per_frame: Float  # shape (n_row,); one row per half-width and sub-frame phase
+    onset_correlations: tuple[tuple[float, ...], ...]  # one per row
+    width_correlations: tuple[tuple[float, ...], ...]  # one per row
+    temperature_correlations: tuple[tuple[float, ...], ...]  # one per temperature
+
+    @classmethod
+    def from_bank(cls, bank: Bank) -> TemplateGrid:
+        """Compute the correlations between all neighbouring templates of a bank."""
+        rows = [
+            [_detrended(template, shape, bank.baseline.powers) for shape in template.shapes]
+            for template in bank.templates
+        ]
+        per_frame, onset, width = [], [], []
+        for k, (template, filters) in enumerate(zip(bank.templates, rows, strict=True)):
+            adjacent_rows = rows[max(k - 1, 0) : k] + rows[k + 1 : k + 2]
+            # The phases within a frame are followed by those of the next onset.
+            onsets = [one.shifted(n * template.stride) for n in (-1, 0, 1) for one in filters]
+            for p, one in enumerate(filters, len(filters)):
+                per_frame.append(1 / template.stride)
+                onset.append(_neighbour_correlations(one, [onsets[p - 1], onsets[p + 1]]))
+                aligned = [
+                    max((one.best_alignment(other) for other in row), key=lambda pair: pair[0])[1]
+                    for row in adjacent_rows
+                ]
+                width.append(_neighbour_correlations(one, aligned))
+        directions = [UnitFilter(direction, 0) for direction in bank.directions]
+        temperature = [
+            _neighbour_correlations(one, directions[max(k - 1, 0) : k] + directions[k + 1 : k + 2])
+            for k, one in enumerate(directions)
+        ]
+        return cls(bank.frame_s, np.array(per_frame), tuple(onset), tuple(width), tuple(temperature))
+
+    def false_alarms_per_second(self, threshold: float) -> float:
+        """Return the rate of local maxima above `threshold`, in standard deviations of the statistic."""
+        density, row_probabilities, temperature_probabilities = self._probabilities(threshold)
+        rate = self.templates_per_frame @ row_probabilities @ (density * sum(temperature_probabilities))
+        return float(rate) / self.frame_s
+
+    def trials_per_frame(self, threshold: float) -> float:
+        """Return the number of independent trials per frame with the same false-alarm rate."""
+        rate = self.false_alarms_per_second(threshold)
+        return rate * self.frame_s / float(scipy.special.ndtr(-threshold))
+
+    def peak_probabilities(self, threshold: float) -> Float:
+        """Return each template's probability that a value above `threshold` is a local maximum.
+
+        The shape is (n_row, n_temperature).
+        """
+        density, row_probabilities, temperature_probabilities = self._probabilities(threshold)
+        weights = density / density.sum()
+        return np.asarray(np.einsum("z,rz,tz->rt", weights, row_probabilities, temperature_probabilities))
+
+    def _probabilities(self, threshold: float) -> tuple[Float, Float, Float]:
+        """Return the weighted density at nodes z, and the probabilities of rows and temperatures, (n, n_node)."""
+        x, weights = np.polynomial.laguerre.laggauss(N_NODES)
+        z = np.sqrt(threshold**2 + 2 * x)
+        density = weights / z * np.exp(-(threshold**2) / 2) / np.sqrt(2 * np.pi)
+        rows = [
+            _probability_neighbours_below(z, onset) * _probability_neighbours_below(z, width)
+            for onset, width in zip(self.onset_correlations, self.width_correlations, strict=True)
+        ]
+        temperatures = [_probability_neighbours_below(z, one) for one in self.temperature_correlations]
+        return density, np.array(rows), np.array(temperatures)
+
+
+def _detrended(template: Template, shape: Float, powers: tuple[int, ...]) -> UnitFilter:
+    """Remove the fitted baseline polynomial from a template and normalise it."""
+    if powers:
+        columns = np.stack([template.time**power for power in powers], axis=1)
+        shape = shape - columns @ np.linalg.lstsq(columns, shape, rcond=None)[0]
+    return UnitFilter(shape / np.linalg.norm(shape), template.first)
+
+
+def _neighbour_correlations(one: UnitFilter, neighbours: list[UnitFilter]) -> tuple[float, ...]:
+    """Return the correlations with the neighbours and, if there are two, between them."""
+    correlations = [one.correlation(other) for other in neighbours]
+    if len(neighbours) == 2:
+        correlations.append(neighbours[0].correlation(neighbours[1]))
+    return tuple(correlations)
+
+
+def _probability_neighbours_below(z: Float, correlations: tuple[float, ...]) -> Float:
+    """Return P(all neighbours < z | z), shape of `z`."""
+    if not correlations:
+        return np.ones_like(z)
+    # A neighbour with correlation r is normal with mean r z and variance 1 - r^2.
+    correlations = tuple(float(np.clip(r, -MAX_CORRELATION, MAX_CORRELATION)) for r in correlations)
+    limits = [z * np.sqrt((1 - r) / (1 + r)) for r in correlations[:2]]
+    first = scipy.special.ndtr(limits[0])
+    if len(correlations) == 1:
+        return np.asarray(first)
+    a, b, between = correlations
+    scale = np.sqrt((1 - a * a) * (1 - b * b))
+    r = np.clip((between - a * b) / scale, -MAX_CORRELATION, MAX_CORRELATION)
+    root = np.sqrt(1 - r * r)
+    h, k = limits
+    owen = scipy.special.owens_t
+    return np.asarray((first + scipy.special.ndtr(k)) / 2 - owen(h, (k / h - r) / root) - owen(k, (h / k - r) / root))
+
+
+#: Sampled thresholds; between them, the logarithm of the number of independent templates is a cubic polynomial.
+STEP = 0.25
+LADDER = tuple(float(u) for u in np.arange(3.0, 8.01, STEP))
+#: Number of coefficients of that polynomial.
+POWERS = 4
+#: Number of draws, for a standard error of the rate of 3-4 % at one false alarm per star-month.
+DRAWS = 160
+#: Largest probability of an alarm in a stare for which importance sampling is used.
+MAX_PROBABILITY = 0.7
+#: Number of thresholds at which rates are tabulated for interpolation.
+FINE = 20_000
+#: Second half of the generator's key, which makes the draws independent of others.
+NULL_KEY = 0x6E756C6C
+#: G is zero below u - BELOW / u.
+BELOW = 4.0
+#: Nodes of the integral over the chosen template's value.
+NODES = 6
+#: Smallest weight of a template relative to the largest.
+MIN_WEIGHT = 1e-3
+#: Smallest correlation with the chosen template for which a value's crossing of the threshold is computed.
+MIN_CORRELATION = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class SampledRate:
+    """False-alarm rate in normal noise from importance sampling."""
+
+    thresholds: Float  # shape (n,)
+    probability: Float  # P(max > threshold) of a stare, shape (n,)
+    error: Float  # standard error of `probability`
+    days: float  # star-days of the stare
+    shifted: bool = False  # stares have trends that the search neither subtracts nor marginalises over
+
+    @property
+    def likely(self) -> tuple[float, float, float]:
+        """Threshold that about three stares in ten exceed, its probability, and the standard error."""
+        k = int(np.argmin(np.abs(self.probability - 0.3)))
+        return float(self.thresholds[k]), float(self.probability[k]), float(self.error[k])
+
+    @property
+    def _trusted(self) -> NDArray[np.bool_]:
+        return np.asarray(self.probability <= MAX_PROBABILITY)
+
+    @property
+    def _relative(self) -> Float:
+        """Relative standard error of the rate at each trusted threshold: d(-ln(1 - P)) = dP / (1 - P)."""
+        p = self.probability[self._trusted]
+        return np.asarray(self.error[self._trusted] / (1 - p) / -np.log1p(-p))
+
+    def _fit(self) -> Float:
+        """Fit a polynomial to log(rate / Q) as a function of the centred threshold."""
+        u, p = self.thresholds[self._trusted], self.probability[self._trusted]
+        relative = self._relative
+        logs = np.log(-np.log1p(-p) / self.days) - scipy.special.log_ndtr(-u)
+        columns = np.vander(u - u.mean(), min(POWERS, u.size), increasing=True) / relative[:, None]
+        return np.asarray(np.linalg.pinv(columns) @ (logs / relative))
+
+    def under(self, shifts: UnknownShifts) -> SampledRate:
+        """Return the rate for stares whose noise differs from the noise that the search assumes."""
+        if shifts.is_nominal:
+            return self
+        # The rate is tabulated finely enough for linear interpolation.
+        shifted = bool(shifts.shifts.any())
+        low, high = self.thresholds[0] / shifts.scales.max(), self.thresholds[-1] / shifts.scales.min()
+        # Shifted values exceed a threshold as often as unshifted ones exceed a much lower one.
+        fine = np.linspace(0.0 if shifted else low, high, FINE)
+        polynomial = np.polynomial.polynomial.polyval(fine - self.thresholds[self._trusted].mean(), self._fit())
+        rates = np.exp(scipy.special.log_ndtr(-fine) + polynomial)
+        probability, error = np.zeros((2, self.thresholds.size))
+        for k, threshold in enumerate(self.thresholds):
+            each = shifts.alarm_probability(threshold, self.days, lambda u: np.interp(u, fine, rates))
+            probability[k] = shifts.weights @ each
+            spread = np.sqrt(np.sum((shifts.weights * (each - probability[k])) ** 2))
+            error[k] = np.hypot(spread, probability[k] * self.error[k] / self.probability[k])
+        return SampledRate(self.thresholds, probability, error, self.days, shifted)
+
+    def log_rate(self, threshold: float) -> tuple[float, float]:
+        """Return the logarithm of false alarms per star-day, and its standard error."""
+        kept = self._trusted
+        # All thresholds share draws, so that their errors are correlated and do not average out.
+        error = float(np.interp(threshold, self.thresholds[kept], self._relative))
+        if self.shifted:
+            logs = np.log(-np.log1p(-self.probability[kept]) / self.days)
+            return float(scipy.interpolate.PchipInterpolator(self.thresholds[kept], logs)(threshold)), error
+        coefficients = self._fit()
+        at = (threshold - self.thresholds[kept].mean()) ** np.arange(coefficients.size)
+        return float(scipy.special.log_ndtr(-threshold) + at @ coefficients), error
+
+    def rate(self, threshold: float) -> Interval:
+        """Return the false alarms per star-day at a threshold, with a 95 % interval.
+
+        Raises InputError if the threshold is outside the sampled range.
+        """
+        self._check(threshold)
+        log, error = self.log_rate(threshold)
+        reach = float(scipy.special.ndtri(0.5 + CONFIDENCE / 2)) * error
+        return Interval(*(float(np.exp(log + d)) for d in (0.0, -reach, reach)))
+
+    def threshold(self, rate: float) -> Interval:
+        """Return the threshold for a number of false alarms per star-day, with a 95 % interval.
+
+        Raises InputError if it is outside the sampled range, or if trends cause more alarms at all sampled thresholds.
+        """
+        from scipy.optimize import brentq
+
+        most = float(self.probability[-1])
+        if self.shifted and most >= -np.expm1(-rate * self.days):
+            least = -np.log1p(-min(most, 1 - 1e-16)) / self.days
+            raise InputError(
+                f"{rate:g} false alarms per star-day",
+                f"at least {least:.2g}: what is unknown of the stare moves the level in ways that the "
+                "search does not marginalise over (see search.cycle, slope, offset and window_s)",
+                key="false_alarms",
+                value=rate,
+            )
+        low, high = self._ends
+        goal = np.log(rate)
+        if not self.log_rate(high)[0] <= goal <= self.log_rate(low)[0]:
+            ends = [float(np.exp(self.log_rate(u)[0])) for u in (high, low)]
+            raise InputError(
+                f"{rate:g} false alarms per star-day",
+                f"{ends[0]:.2g} to {ends[1]:.2g} for importance sampling of stares of {self.days:.3g} star-days",
+                key="false_alarms",
+                value=rate,
+            )
+        value = float(brentq(lambda u: self.log_rate(u)[0] - goal, low, high, xtol=1e-6))
+        # The rate falls by about a factor exp(-u) per unit of u.
+        reach = float(scipy.special.ndtri(0.5 + CONFIDENCE / 2)) * self.log_rate(value)[1] / value
+        return Interval(value, value - reach, value + reach)
+
+    @property
+    def lowest(self) -> float:
+        """Smallest threshold at which the rate is known."""
+        return self._ends[0]
+
+    @property
+    def _ends(self) -> tuple[float, float]:
+        """Range of thresholds: from one step below the lowest trusted one to the highest."""
+        return float(self.thresholds[self._trusted][0] - STEP), float(self.thresholds[-1])
+
+    def _check(self, threshold: float) -> None:
+        low, high = self._ends
+        if not low <= threshold <= high:
+            raise InputError.of("threshold", threshold, f"{low:g} to {high:g} for importance sampling")
+
+
+def sample_rate(search: Search, *, seed: int, draws: int = DRAWS) -> SampledRate:
+    """Estimate the false-alarm rate of a search in normal noise of the assumed variance.
+
+    The stare should not exceed a few days, since every draw evaluates all templates.
+    """
+    rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, NULL_KEY]))
+    rows, n_sum = search.grid, search.bank.directions.shape[1]
+    tried = [np.flatnonzero(row.per_amplitude > 0) for row in rows]
+    sizes = np.array([t.size for t in tried])
+    if not sizes.any():
+        raise InputError.of("half_widths_s", search.bank.half_widths_s, "templates that fit into the stare")
+    weights = TemplateGrid.from_bank(search.bank).peak_probabilities(WEIGHTING_THRESHOLD)
+    weights = np.maximum(weights, MIN_WEIGHT * weights.max())
+    shares = np.cumsum(weights * sizes[:, None])
+    variance = search.variance[:, None]
+    estimates = np.empty((draws, len(LADDER)))
+    # One more sum holds the response that changes the chosen template's own value by one, since it is proportional to
+    # the template in time. Batches are small so that they fit into the processor's caches.
+    directions = search.bank.directions
+    batch = max(1, BATCH // (8 * (n_sum + 1) * search.n_grid))
+    for first in range(0, draws, batch):
+        count = min(batch, draws - first)
+        held = np.empty((count, search.stare.n_frames, n_sum + 1))
+        own, along = np.empty(count), np.empty((count, len(directions), 1))
+        for n in range(count):
+            which, direction = divmod(
+                int(np.searchsorted(shares, rng.random() * shares[-1], "right")), weights.shape[1]
+            )
+            onset = int(rng.choice(tried[which]))
+            template = search.in_time(rows[which], np.array([onset]))[0]
+            held[n, :, :n_sum] = np.sqrt(variance) * rng.standard_normal((search.stare.n_frames, n_sum))
+            held[n, :, n_sum] = template * search.variance
+            own[n] = template @ held[n, :, :n_sum] @ directions[direction]
+            along[n, :, 0] = directions @ directions[direction]
+        values: list[list[Float]] = [[] for _ in range(count)]
+        for (row, correlated), weight in zip(search.correlations(held), weights, strict=True):
+            at = row.per_amplitude > 0
+            for n, kept in enumerate(values):
+                c = along[n] * correlated[n, n_sum, at]
+                r = directions @ correlated[n, :n_sum, at].T - own[n] * c
+                kept.append(_near(np.array([r, c]), weight, LADDER[0]))
+        for n, kept in enumerate(values):
+            estimates[first + n] = _estimates(np.concatenate(kept, axis=1))
+    estimates *= shares[-1]
+    return SampledRate(
+        np.array(LADDER), estimates.mean(axis=0), estimates.std(axis=0, ddof=1) / np.sqrt(draws),
+        search.stare.observed_s / DAY_S,
+    )  # fmt: skip
+
+
+#: Nodes and weights of an integral over exp(-x).
+_X, _W = np.polynomial.laguerre.laggauss(NODES)
+
+
+def _near(rho: Float, weight: Float, u: float) -> Float:
+    """Return r, c and w of the values for which G may be positive at a threshold of at least u, shape (3, n)."""
+    near = np.flatnonzero(_reach(rho[0], rho[1], LADDER[-1]) > u - BELOW / u)
+    weights = np.broadcast_to(weight[:, None], rho.shape[1:])
+    return np.array([each.reshape(-1)[near] for each in (rho[0], rho[1], weights)])
+
+
+def _reach(r: Float, c: Float, u: float) -> Float:
+    """Return the largest values at the nodes of the integral for a threshold u."""
+    return np.asarray(r + np.abs(c) * (u + _X[-1] / (u - BELOW / u)))
+
+
+def _estimates(values: Float) -> Float:
+    """Return one draw's estimates of P / sum(w) at each threshold, from r, c and w of its values."""
+    estimates = np.zeros(len(LADDER))
+    for k, u in enumerate(LADDER):
+        least = u - BELOW / u
+        values = values[:, _reach(values[0], values[1], LADDER[-1]) > least]
+        near = values[:, _reach(values[0], values[1], u) > least]
+        if not near.size:
+            continue
+        r, c, w = near
+        # Value z at which each template exceeds the threshold; the chosen one (r = 0, c = 1) does at z = u.
+        crossing = np.divide(u - r, c, out=np.full(r.size, u), where=c > MIN_CORRELATION)
+        z = max(least, min(u, float(crossing.min())))
+        if ((r + least * c) > u).any():
+            z = least
+        nodes = z + _X / z
+        rho = r + nodes[:, None] * c
+        counted = rho > least
+        total = np.where(counted, np.exp(np.where(counted, u * (rho - u), 0.0)), 0.0) @ w
+        # The tolerance allows for rounding of the crossing value.
+        exceeds = rho.max(axis=1) > u * (1 - 1e-12)
+        density = np.exp(-(nodes**2) / 2 + u * (nodes - u) + _X) / np.sqrt(2 * np.pi) / z
+        estimates[k] = np.sum(_W * density * np.divide(exceeds, total, out=np.zeros(NODES), where=exceeds))
+    return estimates
+
+
+#: Relative change of the scatter that is neglected.
+NEGLIGIBLE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class UnknownShifts:
+    """Scatter and shift of templates' values for drawn conditions."""
+
+    scales: Float  # standard deviations of values at some times and all temperatures, nominally 1, shape (n_draw, n)
+    weights: Float  # of the draws, sum 1, shape (n_draw,)
+    shifts: Float  # means of values, ascending, shape (n_shift,)
+    shares: Float  # shares of templates with each mean, shape (n_draw, n_shift)
+
+    @property
+    def is_nominal(self) -> bool:
+        """True if scatter and shift are as the search assumes."""
+        return bool(np.abs(self.scales - 1).max() < NEGLIGIBLE and not self.shifts.any())
+
+    def alarm_probability(self, threshold: float, days: float, rate: Callable[[Float], Float]) -> Float:
+        """Return the probability of an alarm in each draw, shape (n_draw,).
+
+        Parameters
+        ----------
+        days : float
+            Star-days of the stare.
+        rate : callable
+            False alarms per star-day at a threshold for the noise that the search assumes.
+        """
+        rates = np.zeros(self.weights.size)
+        largest = np.zeros(self.weights.size)
+        for shift, share in zip(self.shifts, self.shares.T, strict=True):
+            rates += share * rate((threshold - shift) / self.scales).mean(axis=1)
+            largest = np.where(share > 0, shift, largest)
+        if not self.shifts.any():
+            return np.asarray(-np.expm1(-days * rates))
+        # A few templates with a large mean suffice for an alarm.
+        return np.asarray(1 - np.exp(-days * rates) * scipy.special.ndtr(threshold - largest))
+
+
+#: Largest length of the part of a stare that importance sampling uses, star-days.
+SAMPLED_DAYS = 2.0
+#: Number of draws of the unknowns, and of times in the stare at which the noise is evaluated.
+RATE_DRAWS, POINTS = 500, 16
+#: Factor by which half of the proposals are widened.
+WIDENING = 1.5
+#: Second half of the generator's key.
+CONDITIONS_KEY = 0x636F6E64
+#: Shift that is neglected, bin width of shifts, and number of draws of which one is used for shifts.
+MIN_SHIFT, SHIFT_STEP, ONE_IN = 0.2, 0.1, 4
+#: Largest shift; larger ones are counted in the last bin.
+MAX_SHIFT = 60.0
+
+
+def sampled_rate(survey: Survey, seed: int) -> SampledRate:
+    """Estimate the false-alarm rate of a survey by importance sampling, including the unknowns of its stare."""
+    part = survey.of_days(SAMPLED_DAYS)
+    return sample_rate(part.search, seed=seed).under(draw_shifts(survey, seed, part))
+
+
+def draw_shifts(survey: Survey, seed: int, part: Survey | None = None) -> UnknownShifts:
+    """Draw the unknowns of a stare and compute scatter and shift of templates' values.
+
+    Parameters
+    ----------
+    part : Survey, optional
+        Part of the stare in which shifts are evaluated; all of it by default.
+    """
+    stare, components, rows = survey.stare, survey.components, survey.bank.directions
+    at = np.unique(np.linspace(0, stare.n_frames - 1, POINTS).astype(int))
+    rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, CONDITIONS_KEY]))
+    n = len(stare.unknowns)
+    z = rng.standard_normal((RATE_DRAWS, n))
+    z[RATE_DRAWS // 2 :] *= WIDENING
+    log = -np.sum(z**2, axis=1) / 2
+    weights = np.exp(log - np.logaddexp(log, log / WIDENING**2 - n * np.log(WIDENING)))
+    moved = {of: np.zeros((RATE_DRAWS, at.size)) for of in ("star", "light", "sky", "temperature")}
+    for amplitude, one in zip(z.T, stare.unknowns, strict=True):
+        moved[one.of] += amplitude[:, None] * one.sd * one.curve[at]
+    slope = components.quiet.conditions["dark_slope_per_c"]
+    coefficients = np.broadcast_to(survey.coefficients[at], (RATE_DRAWS, at.size, survey.coefficients.shape[1])).copy()
+    coefficients[..., 0] *= (1 + moved["light"]) * (1 + moved["star"])
+    coefficients[..., 1] *= (1 + moved["light"]) * (1 + moved["sky"])
+    coefficients[..., 2] *= np.exp(slope * moved["temperature"])
+    coefficients[..., 3] *= 1 + moved["light"]
+    covariance = components.covariance(coefficients)
+    for of, direction in components.directions(coefficients).items():
+        jitter = stare.jitters.get(of, 0.0)  # type: ignore[call-overload]
+        covariance += jitter**2 * direction[..., :, None] * direction[..., None, :]
+    variance = np.einsum("dk,ntkl,dl->ntd", rows, covariance, rows, optimize=True) / survey.variance[at, None]
+    scales = np.sqrt(np.maximum(variance, 1e-12)).reshape(RATE_DRAWS, -1)
+    searched = survey if part is None else part
+    if not _shifted(searched):
+        return UnknownShifts(scales, weights / weights.sum(), np.zeros(1), np.ones((RATE_DRAWS, 1)))
+    # The same share of draws from both halves.
+    some = slice(None, None, ONE_IN)
+    weights = weights[some]
+    return UnknownShifts(scales[some], weights / weights.sum(), *_shifts(searched, z[some]))
+
+
+def _shifted(survey: Survey) -> bool:
+    """Return whether unknowns of several standard deviations shift a template's value."""
+    if survey.unknowns is None:
+        return False
+    return bool(survey.search.largest(survey.unsubtracted(survey.unknowns.extremes)).maximum.max() > MIN_SHIFT)
+
+
+def _shifts(survey: Survey, amplitudes: Float) -> tuple[Float, Float]:
+    """Return binned means of templates' values, and the share of templates in each bin for each draw."""
+    bins = np.arange(-MAX_SHIFT, MAX_SHIFT + SHIFT_STEP, SHIFT_STEP)
+    shares = np.zeros((len(amplitudes), bins.size))
+    weights = TemplateGrid.from_bank(survey.bank).peak_probabilities(WEIGHTING_THRESHOLD)
+    for draw, amplitude in enumerate(amplitudes):
+        for (row, rho), weight in zip(survey.search.values(survey.unsubtracted(amplitude[None])), weights, strict=True):
+            means = rho[0][:, row.per_amplitude > 0]
+            place = np.clip(np.rint((means + MAX_SHIFT) / SHIFT_STEP), 0, bins.size - 1).astype(np.int64)
+            each = np.broadcast_to(weight[:, None], means.shape)
+            shares[draw] += np.bincount(place.ravel(), each.ravel(), bins.size)
+    shares /= shares.sum(axis=1, keepdims=True)
+    used = shares.any(axis=0)
+    return bins[used], shares[:, used]

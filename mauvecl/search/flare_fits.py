@@ -1,0 +1,692 @@
+"""Fits of single and of overlapping flares in stares.
+
+Joint fits of overlapping flares by non-linear least squares, with intervals from the profile likelihood.
+
+A block is the unit of a fit: overlapping flares, over the union of their windows. The baseline is marginalised as in
+the search: a straight line over the window of the widest flare, or a continuous piecewise line in longer blocks. Flux
+of flares outside the block is subtracted. The noise of a frame includes the photon noise of the flares.
+
+Fits of single flares: peak, amplitude, half-width, temperature and equivalent duration, with standard errors.
+
+For a given peak and half-width, the frames under the shape add up to one measurement of the flare's spectrum, of which
+`results.measurements` finds amplitude and temperature. Peak and half-width follow by least squares from the template
+that detected the flare, with the baseline of the search (Levenberg 1944, doi 10.1090/qam/10666; Marquardt 1963, doi
+10.1137/0111030; Golub & Pereyra 1973, doi 10.1137/0710036); errors from the inverse of the information. Amplitudes of
+flares near the threshold are biased high, because noise contributes to their detection; fits do not correct for that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike, NDArray
+
+from mauvecl.fits.profile import Profile
+from mauvecl.flares.shapes import between, sides
+
+if TYPE_CHECKING:
+    from mauvecl.flares.stare import Stare
+    from mauvecl.search.search import Search
+    from mauvecl.search.templates import Bank, Templates
+
+Float = NDArray[np.float64]
+
+#: Columns of a flare's parameters: log amplitude, peak time in s, log half-width in s, log temperature in K.
+AMPLITUDE, PEAK, WIDTH, KELVIN = range(4)
+#: Factor by which fitted half-widths may exceed the range of the bank.
+BEYOND_BANK = 1.25
+#: Half-widths before and after a peak within which flares overlap, and beyond which their flux is neglected.
+OVERLAP_BEFORE, OVERLAP_AFTER = 2.0, 10.0
+LIGHT_BEFORE, LIGHT_AFTER = 5.0, 80.0
+#: Bounds of log amplitude.
+LOG_AMPLITUDES = (-27.0, 14.0)
+#: Relative change of chi-squared at which a fit has converged, and its largest number of evaluations.
+CONVERGED, MAX_EVALUATIONS = 1e-7, 100
+#: Relative tolerance of the root of the rise of chi-squared at an end of an interval, and largest number of refits.
+CLOSE, MAX_REFITS = 0.02, 12
+#: Distances beyond an end of an interval, relative to its distance from the fit, at which to look for other optima.
+BEYOND = (1.5, 1.5, 1.5)
+#: Fall of chi-squared during profiling that indicates a better fit.
+BETTER = 0.05
+
+#: Logarithm of a factor in a profiled product as a function of log temperature, with its derivative.
+Factor = Callable[[float], tuple[float, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class BlendFit:
+    """Fit of the flares of a block."""
+
+    theta: Float  # shape (n_flare, 4); columns as `AMPLITUDE` and following
+    chi2: float
+    dof: int  # number of sums less the number of baseline terms and flare parameters
+    converged: bool
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a chi-squared at least as large."""
+        return float(scipy.stats.chi2.sf(self.chi2, self.dof)) if self.dof > 0 else float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class Interval:
+    """A 68 % interval from the profile likelihood."""
+
+    low: float
+    high: float
+    open_low: bool = False  # the interval ends at a bound of the fit
+    open_high: bool = False
+
+
+class SearchedStare(Protocol):
+    """Interface of a stare and its search for fits; the stare is simulated (`survey.Survey`) or observed."""
+
+    @property
+    def stare(self) -> Stare:
+        """Times of the frames."""
+
+    @property
+    def bank(self) -> Bank:
+        """Template bank of the search."""
+
+    @property
+    def search(self) -> Search:
+        """Search of the frames."""
+
+    @property
+    def curves(self) -> Float | None:
+        """Baseline curves with unknown amplitudes, shape (n_curve, n_frame)."""
+
+    @property
+    def directions(self) -> Mapping[Any, Float]:
+        """Derivatives of the mean sums by unknown changes, shape (n_frame, n_sum) each."""
+
+    def covariance(self) -> Float:
+        """Return the covariance of each frame's sums without a flare, shape (n_frame, n_sum, n_sum)."""
+
+    def net(self, sums: NDArray[Any]) -> NDArray[np.float32]:
+        """Return sums less their known mean, shape (n_stare, n_frame, n_sum)."""
+
+
+@dataclass(frozen=True, eq=False)
+class StareSums:
+    """The sums of a stare to which flares are fitted."""
+
+    survey: SearchedStare
+    templates: Templates
+    net: Float  # sums less their known means, shape (n_frame, n_sum)
+
+    @cached_property
+    def edges(self) -> Float:
+        """Start and end of each frame, s, shape (n_frame, 2)."""
+        start = self.survey.stare.start_s
+        return np.column_stack([start, start + self.survey.stare.frame_s])
+
+    @cached_property
+    def covariance(self) -> Float:
+        """Covariance of each frame's sums without a flare, shape (n_frame, n_sum, n_sum)."""
+        return self.survey.covariance()
+
+    @property
+    def free(self) -> list[int]:
+        """Columns of fitted parameters."""
+        return [AMPLITUDE, PEAK, WIDTH, *([KELVIN] if len(self.templates.temperatures_k) > 1 else [])]
+
+    @cached_property
+    def bounds(self) -> tuple[Float, Float]:
+        """Bounds of a flare's parameters, from the stare, the bank and the templates, shape (4,) each."""
+        widths, kelvin = self.survey.bank.half_widths_s, self.templates.mean_sums.log_k
+        first, last = self.edges[0, 0], self.edges[-1, 1]
+        narrow, wide = np.log(widths[0] / BEYOND_BANK), np.log(widths[-1] * BEYOND_BANK)
+        low, high = LOG_AMPLITUDES
+        return np.array([low, first, narrow, kelvin[0]]), np.array([high, last, wide, kelvin[-1]])
+
+    def frames(self, first_s: float, last_s: float) -> slice:
+        """Return the frames that overlap a time interval."""
+        first, stop = self._overlapping(first_s, last_s)
+        return slice(int(first), int(stop))
+
+    def _overlapping(self, first_s: Any, last_s: Any) -> tuple[Any, Any]:
+        """Return the first frame that overlaps each time interval, and the first one after it."""
+        start = self.survey.stare.start_s
+        return np.searchsorted(start, first_s - self.survey.stare.frame_s), np.searchsorted(start, last_s)
+
+    def mean(self, one: Float, frames: Any) -> Float:
+        """Return the mean of a flare's shape over frames, including throughput, shape (n_frame,)."""
+        shape = self.survey.bank.shape
+        mean = shape.mean_over(self.edges[frames], one[PEAK], np.exp(one[WIDTH]))
+        return np.asarray(self.survey.stare.light[frames] * mean)
+
+    def light(self, theta: Float, frames: slice = slice(None)) -> Float:
+        """Return the mean sums of flares in some frames, shape (n_frame, n_sum)."""
+        total = np.zeros_like(self.net)[frames]
+        for one, inside, mean in self._shining(theta, frames):
+            total[inside] += mean[:, None] * self.templates.mean_sums.spline(one[KELVIN])
+        return total
+
+    def noise(self, theta: Float, light: Float, frames: slice = slice(None)) -> Float:
+        """Return the covariance of frames' sums with flares, shape (n_frame, n_sum, n_sum)."""
+        total = self.covariance[frames].copy()
+        for one, inside, mean in self._shining(theta, frames):
+            total[inside] += mean[:, None, None] * self.templates.noise_of(float(np.exp(one[KELVIN])))
+        jitter = self.survey.stare.light_jitter
+        if jitter and len(theta):
+            # Star and flare light jitter together; the star's jitter is already in the covariance.
+            star = self.survey.directions["light"][frames]
+            both = star + light
+            total += jitter**2 * (both[:, :, None] * both[:, None, :] - star[:, :, None] * star[:, None, :])
+        return total
+
+    def _shining(self, theta: Float, frames: slice) -> Iterator[tuple[Float, slice, Float]]:
+        """Yield the flares that contribute to some frames, the affected frames, and the mean amplitude in them."""
+        first, last, _ = frames.indices(len(self.net))
+        peak, width = theta[:, PEAK], np.exp(theta[:, WIDTH])
+        starts, stops = self._overlapping(peak - LIGHT_BEFORE * width, peak + LIGHT_AFTER * width)
+        for one, start, stop in zip(theta, np.maximum(starts, first), np.minimum(stops, last), strict=True):
+            if start < stop:
+                mean = np.exp(one[AMPLITUDE]) * self.mean(one, slice(start, stop))
+                yield one, slice(start - first, stop - first), mean
+
+    def window(self, one: Float) -> tuple[float, float]:
+        """Return start and end of a flare's window, s."""
+        lead, tail = self.survey.bank.window(float(np.exp(one[WIDTH])))
+        frame_s = self.survey.stare.frame_s
+        return one[PEAK] - (lead + 1) * frame_s, one[PEAK] + (tail + 1) * frame_s
+
+    def overlap(self, one: Float) -> tuple[float, float]:
+        """Return start and end of the interval in which a flare overlaps others, s."""
+        width = np.exp(one[WIDTH])
+        return one[PEAK] - OVERLAP_BEFORE * width, one[PEAK] + OVERLAP_AFTER * width
+
+    def block(self, inside: Float, every: Float) -> Block:
+        """Build the block of the flares `inside` among all flares `every`."""
+        windows = [self.window(one) for one in inside]
+        used = np.zeros(len(self.net), np.bool_)
+        for first, last in windows:
+            used[self.frames(first, last)] = True
+        there = np.flatnonzero(used)
+        span = slice(int(there[0]), int(there[-1]) + 1)
+        light = self.light(every, span)
+        others = light - self.light(inside, span)
+        noise = self.noise(every, light, span)[used[span]]
+        whiten = np.linalg.inv(np.linalg.cholesky(noise))
+        data = np.einsum("tij,tj->ti", whiten, (self.net[span] - others)[used[span]])
+        terms = self._level(used, max(last - first for first, last in windows))
+        columns = np.einsum("tij,tp->tijp", whiten, terms).reshape(data.size, -1)
+        basis = np.zeros((data.size, 0))
+        if columns.shape[1]:
+            left, size, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), False)
+            basis = left[:, size > 1e-9 * size[0]]
+        flat = data.ravel()
+        return Block(self, used, whiten, basis, flat - basis @ (basis.T @ flat))
+
+    def _level(self, used: NDArray[np.bool_], length_s: float) -> Float:
+        """Return the baseline terms of a block: splines in time with pieces of a length, and curves.
+
+        The shape is (n_frame, n_term).
+        """
+        powers = self.survey.bank.baseline.powers
+        time = self.edges[used].mean(axis=1)
+        terms: list[Float] = []
+        if powers:
+            span = float(time[-1] - time[0]) or 1.0
+            pieces = max(1, round(span / length_s))
+            place = np.clip((time - time[0]) / span, 0.0, 1.0) * pieces
+            degree = max(powers)
+            inner = np.arange(pieces + 1, dtype=np.float64)
+            knots = np.concatenate([np.zeros(degree), inner, np.full(degree, float(pieces))])
+            design = scipy.interpolate.BSpline.design_matrix(place, knots, degree).toarray()
+            terms += list(design.T)
+        if self.survey.bank.baseline.cycle and self.survey.curves is not None:
+            terms += list(self.survey.curves[:, used])
+        return np.array(terms).reshape(len(terms), time.size).T
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Frames and noise of flares that are fitted together."""
+
+    sums: StareSums
+    used: NDArray[np.bool_]  # frames of the stare, shape (n_frame,)
+    whiten: Float  # whitening matrices, shape (n_used, n_sum, n_sum)
+    basis: Float  # orthonormal columns of the whitened baseline, shape (n_used * n_sum, n_term)
+    data: Float  # whitened sums less their projection on the baseline, shape (n_used * n_sum,)
+
+    @cached_property
+    def _times(self) -> tuple[Float, NDArray[np.intp]]:
+        """Distinct times at which frames start or end, s, and their indices for each frame, shape (2, n_used)."""
+        edges = self.sums.edges[self.used]
+        times, index = np.unique(edges, return_inverse=True)
+        return times, index.reshape(edges.shape).T
+
+    def model(self, theta: Float) -> tuple[Float, Float]:
+        """Return the whitened flux less its projection on the baseline, (n_row,), and derivatives, (n_row, n, 4)."""
+        times, (first, last) = self._times
+        shape, spline = self.sums.survey.bank.shape, self.sums.templates.mean_sums.spline
+        light, length = self.sums.survey.stare.light[self.used], times[last] - times[first]
+        width = np.exp(theta[:, WIDTH, None])
+        tau = (times - theta[:, PEAK, None]) / width  # (n_flare, n_time)
+        at, integrals, relative = shape.at(tau), sides(shape, tau), width / length
+        mean = relative * between(integrals[..., first], integrals[..., last])
+        later = (at[:, first] - at[:, last]) / length
+        change = tau * at
+        wider = mean - relative * (change[:, last] - change[:, first])
+        time = np.exp(theta[:, AMPLITUDE, None]) * light * np.array([mean, later, wider])  # (3, n_flare, n_used)
+        whiten = self.whiten.reshape(self.data.size, -1).T
+        colour, hotter = (
+            (spline(theta[:, KELVIN], order) @ whiten).reshape(len(theta), *self.whiten.shape[:2]) for order in (0, 1)
+        )
+        derivatives = np.empty((4, *colour.shape))
+        derivatives[:KELVIN] = time[..., None] * colour
+        derivatives[KELVIN] = time[0][..., None] * hotter
+        rows = derivatives.reshape(-1, self.data.size)
+        rows -= (rows @ self.basis) @ self.basis.T
+        derivatives = rows.reshape(4, len(theta), -1)
+        return derivatives[AMPLITUDE].sum(axis=0), derivatives.T
+
+    def chi2(self, theta: Float) -> float:
+        """Return chi-squared for given parameters."""
+        left = self.data - self.model(theta)[0]
+        return float(left @ left)
+
+    def fit(self, theta: Float, fixed: tuple[int, int, float, Factor | None] | None = None) -> BlendFit:
+        """Fit all flares from a starting point.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_flare, 4)
+        fixed : (int, int, float, callable or None), optional
+            Flare, column, value and factor of a constraint: the column has the value, or with a factor, the sum of
+            log amplitude, log half-width and the factor.
+        """
+        low, high = (np.tile(end, (len(theta), 1)) for end in self.sums.bounds)
+        moved = np.zeros(theta.shape, np.bool_)
+        moved[:, self.sums.free] = True
+        if fixed is not None:
+            moved[fixed[0], fixed[1] if fixed[3] is None else AMPLITUDE] = False
+        margin = 1e-9 * (high - low)
+        start = np.clip(theta, low + margin, high - margin)
+
+        def whole(x: Float) -> Float:
+            every = start.copy()
+            every[moved] = x
+            if fixed is not None:
+                j, column, value, factor = fixed
+                if factor is None:
+                    every[j, column] = value
+                else:
+                    every[j, AMPLITUDE] = value - every[j, WIDTH] - factor(every[j, KELVIN])[0]
+            return every
+
+        held: dict[bytes, Float] = {}
+
+        def triangle(x: Float) -> Float:
+            """Return the triangular factor of derivatives and residuals as columns.
+
+            Its columns have the same scalar products, on which alone the fit depends. It has few rows.
+            """
+            # Residuals and derivatives are evaluated at the same point, one after the other.
+            if x.tobytes() not in held:
+                held.clear()
+                every = whole(x)
+                model, derivatives = self.model(every)
+                if fixed is not None and fixed[3] is not None:
+                    j = fixed[0]
+                    tied = derivatives[:, j, AMPLITUDE].copy()
+                    derivatives[:, j, WIDTH] -= tied
+                    derivatives[:, j, KELVIN] -= fixed[3](every[j, KELVIN])[1] * tied
+                columns = np.column_stack([-derivatives[:, moved], self.data - model])
+                held[x.tobytes()] = np.asarray(np.linalg.qr(columns, mode="r"))
+            return held[x.tobytes()]
+
+        def residual(x: Float) -> Float:
+            return triangle(x)[:, -1]
+
+        def jacobian(x: Float) -> Float:
+            return triangle(x)[:, :-1]
+
+        scale = np.ones(theta.shape)
+        scale[:, PEAK] = np.exp(start[:, WIDTH])
+        dof = self.data.size - self.basis.shape[1] - theta.shape[0] * len(self.sums.free)
+        if not moved.any():
+            return BlendFit(whole(start[moved]), self.chi2(whole(start[moved])), dof, True)
+
+        found = scipy.optimize.least_squares(
+            residual, start[moved], jacobian, bounds=(low[moved], high[moved]), x_scale=scale[moved],
+            ftol=CONVERGED, xtol=1e-9, gtol=None, max_nfev=MAX_EVALUATIONS,
+        )  # fmt: skip
+        return BlendFit(whole(found.x), 2 * float(found.cost), dof, bool(found.status > 0))
+
+    def covariance(self, theta: Float) -> Float:
+        """Return the covariance of all parameters, the inverse of the information, shape (n, 4, n, 4)."""
+        jacobian = self.model(theta)[1]
+        n, free = len(theta), self.sums.free
+        rows = jacobian[:, :, free].reshape(len(jacobian), -1)
+        scale = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+        inverse = np.linalg.pinv((rows / scale).T @ (rows / scale), hermitian=True) / np.outer(scale, scale)
+        covariance = np.zeros((n, 4, n, 4))
+        covariance[np.ix_(range(n), free, range(n), free)] = inverse.reshape(n, len(free), n, len(free))
+        return covariance
+
+    def interval(
+        self, best: BlendFit, j: int, column: int, factor: Factor | None = None, rises: float = 1.0
+    ) -> tuple[Interval, BlendFit | None]:
+        """Return the interval of a parameter or product, and a better fit if profiling finds one.
+
+        Parameters
+        ----------
+        j, column : int
+            Flare and column.
+        factor : callable, optional
+            If given, the interval is that of amplitude x half-width x factor.
+        rises : float, optional
+            Rise of chi-squared at the ends of the interval.
+        """
+        covariance, theta = self.covariance(best.theta), best.theta
+        weights = np.zeros(theta.shape)
+        if factor is None:
+            weights[j, column], middle = 1.0, theta[j, column]
+            ends = self.sums.bounds[0][column], self.sums.bounds[1][column]
+        else:
+            value, slope = factor(theta[j, KELVIN])
+            weights[j, [AMPLITUDE, WIDTH, KELVIN]] = 1.0, 1.0, slope
+            middle, ends = theta[j, AMPLITUDE] + theta[j, WIDTH] + value, (-np.inf, np.inf)
+        along = np.einsum("iajb,jb->ia", covariance, weights)
+        variance = float(np.sum(weights * along))
+        sd = np.sqrt(variance) if variance > 0 else 1e-3
+        found: list[tuple[float, bool]] = []
+        for sign, end in zip((-1.0, 1.0), ends, strict=True):
+            furthest = abs(end - middle)
+
+            def refit(step: float, start: Float | None, sign: float = sign) -> BlendFit:
+                straight = theta + along * sign * step / variance if variance > 0 else theta
+                fixed = j, column, float(middle + sign * step), factor
+                return self.fit(straight if start is None else start, fixed)
+
+            reached, probes = _interval_end(refit, best.chi2, rises, sd * np.sqrt(rises), furthest), list(BEYOND)
+            while probes and reached.better is None and reached.step < furthest:
+                # Another optimum may follow beyond a rise.
+                step = min(reached.step * probes.pop(0), furthest)
+                fits = [refit(step, start) for start in (None, reached.theta, theta)]
+                one = min(fits, key=lambda fit: fit.chi2)
+                if one.chi2 - best.chi2 < rises * (1.0 - CLOSE) ** 2:
+                    reached = _interval_end(refit, best.chi2, rises, step, furthest, one.theta)
+            if reached.better is not None:
+                return Interval(np.nan, np.nan), self.fit(reached.better.theta)
+            found.append((float(middle + sign * reached.step), reached.open))
+        (low, open_low), (high, open_high) = found
+        return Interval(low, high, open_low, open_high), None
+
+    def without(self, blended: BlendFit, j: int) -> BlendFit:
+        """Fit all flares except flare `j`."""
+        rest = np.delete(blended.theta, j, axis=0)
+        if not len(rest):
+            left = float(self.data @ self.data)
+            return replace(blended, theta=rest, chi2=left, dof=self.data.size - self.basis.shape[1])
+        return self.fit(rest)
+
+
+@dataclass(frozen=True, eq=False)
+class _IntervalEnd:
+    """One end of an interval from the profile likelihood."""
+
+    step: float  # distance from the best fit
+    open: bool  # chi-squared does not rise enough within the range of the fit
+    theta: Float  # parameters at the end
+    better: BlendFit | None = None  # fit that is better than the best one, if profiling found one
+
+
+def _interval_end(
+    refit: Callable[[float, Float | None], BlendFit], chi2: float, rises: float, step: float, furthest: float,
+    start: Float | None = None,
+) -> _IntervalEnd:  # fmt: skip
+    """Return the end of an interval on one side of the best fit.
+
+    Parameters
+    ----------
+    refit : callable
+        Returns the best fit at a distance from the best one, from given or extrapolated starting parameters.
+    chi2, rises : float
+        Chi-squared of the best fit, and its rise at the end of the interval.
+    step, furthest : float
+        First guess of the distance to the end, and distance to the bound of the fit.
+    start : ndarray, optional
+        Starting parameters of the first fit.
+    """
+    inner, outer, root_inner, root_outer = 0.0, np.inf, 0.0, np.inf
+    for _ in range(MAX_REFITS):
+        at_end = step >= furthest
+        step = min(step, furthest)
+        one = refit(step, start)
+        if one.chi2 - chi2 < -BETTER:
+            return _IntervalEnd(step, False, one.theta, one)
+        root = float(np.sqrt(max(one.chi2 - chi2, 0.0) / rises))
+        if abs(root - 1.0) < CLOSE or (at_end and root < 1.0):
+            return _IntervalEnd(step, at_end and root < 1.0 - CLOSE, one.theta)
+        start = one.theta
+        if root < 1.0:
+            inner, root_inner = step, root
+        else:
+            outer, root_outer = step, root
+        if np.isinf(outer):
+            step *= min(1.0 / max(root, 0.25), 4.0) * 1.02
+        else:
+            # The root of the rise is nearly linear: use regula falsi, but keep away from both ends.
+            share = (1.0 - root_inner) / (root_outer - root_inner)
+            step = inner + (outer - inner) * float(np.clip(share, 0.08, 0.92))
+    return _IntervalEnd(step, root < 1.0 - CLOSE, one.theta)
+
+
+#: Largest number of steps of a fit, and the change of chi-squared at which it has converged.
+STEPS, ENOUGH = 30, 1e-3
+#: Frames are averaged if at least this many averages remain per half-width.
+FINE = 25
+#: Initial damping, and its divisor and factor after successful and failed steps.
+DAMPING, EASIER, HARDER = 1e-2, 5.0, 4.0
+#: Relative step of numerical derivatives.
+DIFFERENCE = 1e-3
+#: Largest change of peak, in half-widths, and of log half-width in one step.
+LARGEST_STEP = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class FittedFlares:
+    """Fitted flares and standard errors; arrays of shape (n,)."""
+
+    peak_s: Float
+    peak_error_s: Float
+    amplitude: Float  # relative rise of the photons in the band
+    amplitude_error: Float
+    half_width_s: Float
+    half_width_error_s: Float
+    temperature_k: Float  # NaN if the templates have only one temperature
+    temperature_error_k: Float
+    equivalent_duration_s: Float  # proportional to the energy
+    equivalent_duration_error_s: Float
+    snr: Float
+
+
+@dataclass(frozen=True, eq=False)
+class SingleFlareFit:
+    """Least-squares fit of single flares."""
+
+    bank: Bank  # bank of the search, which defines shape, baseline and windows
+    templates: Templates  # effect of flares on the sums of a frame
+
+    def run(
+        self,
+        sums: NDArray[Any],
+        start_s: Float,
+        *,
+        peak_s: ArrayLike,
+        half_width_s: ArrayLike,
+        variance: Float | None = None,
+        curves: Float | None = None,
+    ) -> FittedFlares:
+        """Fit one flare to each of several light curves.
+
+        Parameters
+        ----------
+        sums : ndarray, shape (n, n_frame, n_sum)
+            Sums less their known mean.
+        start_s : ndarray, shape (n_frame,)
+        peak_s, half_width_s : array_like, shape (n,)
+            Starting points, such as those of the template that detected each flare.
+        variance : ndarray, shape (n_frame,), optional
+            Variance of each frame's sums; 1 by default.
+        curves : ndarray, shape (n_curve, n_frame), optional
+            Baseline curves; see `Search`.
+        """
+        n = len(sums)
+        peak, log_width = (np.array(np.broadcast_to(value, n), np.float64) for value in (peak_s, np.log(half_width_s)))
+        several = max(1, int(np.exp(log_width.min()) / self.bank.frame_s / FINE)) if n else 1
+        sums, start_s, variance, curves = self._averaged(several, sums, start_s, variance, curves)
+        weight, level = self._windows(start_s, peak, np.exp(log_width), variance, curves)
+        used = weight.any(axis=0)
+        weight, level, start_s = weight[:, used], level[:, used], start_s[used]
+        edges = np.column_stack([start_s, start_s + several * self.bank.frame_s])
+        y = _remove_baseline(np.asarray(sums[:, used], np.float64), weight, level)
+
+        def inner_products(peak: Float, log_width: Float) -> tuple[Float, Float]:
+            """Return products of shape and derivatives with each other, (n, 3, 3), and with the sums, (n, 3, K)."""
+            width = np.exp(log_width)
+            step = DIFFERENCE * width
+            here, later, wider = (
+                self.bank.shape.mean_over(edges, p[:, None], w[:, None])
+                for p, w in ((peak, width), (peak + step, width), (peak, width * np.exp(DIFFERENCE)))
+            )
+            three = _remove_baseline(
+                np.stack([here, (later - here) / DIFFERENCE, (wider - here) / DIFFERENCE], 2), weight, level
+            )
+            weighted = three * weight[:, :, None]
+            return np.einsum("nti,ntj->nij", weighted, three), np.einsum("nti,ntk->nik", weighted, y)
+
+        products = inner_products(peak, log_width)
+        log_kelvin, amplitude, gain = self._brightest(products)
+        damping = np.full(n, DAMPING)
+        going = np.ones(n, np.bool_)
+        for _ in range(STEPS):
+            information, pull = self._normal(products, amplitude, log_kelvin)
+            diagonal = np.einsum("nii->ni", information)
+            damped = information + (damping[:, None] * diagonal + 1e-12)[:, :, None] * np.eye(4)
+            move = np.linalg.solve(damped, pull[:, :, None])[:, :, 0]
+            move = np.where(going[:, None], np.clip(move, -LARGEST_STEP, LARGEST_STEP), 0.0)
+            there = peak + move[:, 1] * np.exp(log_width), log_width + move[:, 2]
+            tried = inner_products(*there)
+            kelvin, best, reached = self._brightest(tried)
+            better = going & (reached > gain)
+            small = np.abs(reached - gain) < ENOUGH
+            peak, log_width, log_kelvin, amplitude, gain = (
+                np.where(better, a, b)
+                for a, b in zip(
+                    (*there, kelvin, best, reached), (peak, log_width, log_kelvin, amplitude, gain), strict=True
+                )
+            )
+            products = tuple(  # type: ignore[assignment]
+                np.where(better[:, None, None], a, b) for a, b in zip(tried, products, strict=True)
+            )
+            damping = np.where(better, damping / EASIER, damping * HARDER)
+            going &= ~(small & better) & (damping < 1e6)
+            if not going.any():
+                break
+        information, _ = self._normal(products, amplitude, log_kelvin)
+        return self._with_errors(peak, log_width, log_kelvin, amplitude, gain, information)
+
+    def _brightest(self, products: tuple[Float, Float]) -> tuple[Float, Float, Float]:
+        """Return log temperature, amplitude and fall of chi-squared of the best fits of given shapes."""
+        shapes, data = products
+        length = np.sqrt(np.maximum(shapes[:, 0, 0], 1e-300))
+        sums = data[:, 0] / length[:, None]
+        profile = Profile(self.templates.mean_sums, sums)
+        given = np.log(self.templates.temperatures_k[self.templates.chosen[0]])
+        x = profile.best().log_k if self.templates.coloured else np.full(len(sums), given)
+        amplitude, variance, _ = profile.parts(x)
+        best = np.maximum(amplitude, 1e-12 * length)
+        return x, best / length, (2 * amplitude - best) * best / variance
+
+    def _averaged(
+        self, several: int, sums: NDArray[Any], start_s: Float, variance: Float | None, curves: Float | None
+    ) -> tuple[NDArray[Any], Float, Float | None, Float | None]:
+        """Average groups of consecutive frames; incomplete groups at gaps are dropped."""
+        if several == 1:
+            return sums, start_s, variance, curves
+        number = np.rint(start_s / self.bank.frame_s).astype(np.int64)
+        _, first, count = np.unique(number // several, return_index=True, return_counts=True)
+        rows = first[count == several][:, None] + np.arange(several)
+        variance = np.ones(start_s.size) if variance is None else variance
+        mean = np.stack([one[rows].mean(axis=1) for one in sums])
+        return (
+            mean, start_s[rows[:, 0]], variance[rows].mean(axis=1) / several,
+            None if curves is None else curves[:, rows].mean(axis=2),
+        )  # fmt: skip
+
+    def _windows(
+        self, start_s: Float, peak: Float, width: Float, variance: Float | None, curves: Float | None
+    ) -> tuple[Float, Float]:
+        """Return weights of frames, zero outside the windows, (n, n_frame), and baseline terms, (n, n_frame, p)."""
+        n, frame_s = peak.size, self.bank.frame_s
+        weight = np.zeros((n, start_s.size))
+        terms = np.zeros((n, start_s.size, len(self.bank.baseline.powers) + (0 if curves is None else len(curves))))
+        for k in range(n):
+            lead, tail = self.bank.window(float(width[k]))
+            since = (start_s - peak[k]) / frame_s
+            inside = (since >= -lead - 1) & (since <= tail)
+            weight[k, inside] = 1.0 if variance is None else 1.0 / variance[inside]
+            time = since / (lead + tail)
+            rows = [time**power for power in self.bank.baseline.powers] + list([] if curves is None else curves)
+            for j, row in enumerate(rows):
+                terms[k, :, j] = row
+        if terms.shape[2]:
+            # Orthonormal in each window, so that a projection is a sum of products.
+            root = np.sqrt(weight)[:, :, None]
+            basis = np.linalg.qr(root * terms)[0]
+            terms = np.divide(basis, root, out=np.zeros_like(basis), where=root > 0)
+        return weight, terms
+
+    def _normal(self, products: tuple[Float, Float], amplitude: Float, log_kelvin: Float) -> tuple[Float, Float]:
+        """Return information and gradient for log amplitude, peak in half-widths, log half-width, log temperature."""
+        shapes, data = products
+        spline = self.templates.mean_sums.spline
+        r, dr = spline(log_kelvin), spline(log_kelvin, 1) * self.templates.coloured
+        # Each derivative is a product of one in time and one in the sums.
+        time, sums = np.array([0, 1, 2, 0]), np.stack([r, r, r, dr], axis=1)
+        inner = np.einsum("nik,njk->nij", sums, sums)
+        information = amplitude[:, None, None] ** 2 * shapes[:, time][:, :, time] * inner
+        left = data[:, time] - amplitude[:, None, None] * shapes[:, time, 0][:, :, None] * r[:, None]
+        pull = amplitude[:, None] * np.einsum("nik,nik->ni", left, sums)
+        # Parameters without information keep their values.
+        blind = np.einsum("nii->ni", information) <= 0
+        information[blind] = 0
+        np.einsum("nii->ni", information)[blind] = 1.0
+        return information, pull
+
+    def _with_errors(
+        self, peak: Float, log_width: Float, log_kelvin: Float, amplitude: Float, gain: Float, information: Float
+    ) -> FittedFlares:
+        width, kelvin = np.exp(log_width), np.exp(log_kelvin)
+        coloured = self.templates.coloured
+        if not coloured:
+            information = information[:, :3, :3]
+        covariance = np.linalg.pinv(information, hermitian=True)
+        error = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0.0))
+        both = np.sqrt(np.maximum(covariance[:, 0, 0] + covariance[:, 2, 2] + 2 * covariance[:, 0, 2], 0.0))
+        duration = amplitude * width * self.bank.shape.equivalent_duration
+        none = np.full(peak.size, np.nan)
+        return FittedFlares(
+            peak, width * error[:, 1], amplitude, amplitude * error[:, 0], width, width * error[:, 2],
+            kelvin if coloured else none, kelvin * error[:, 3] if coloured else none,
+            duration, duration * both, np.sqrt(np.maximum(gain, 0.0)),
+        )  # fmt: skip
+
+
+def _remove_baseline(values: Float, weight: Float, level: Float) -> Float:
+    """Subtract from values (n, n_frame, k) their weighted projection on orthonormal terms (n, n_frame, p)."""
+    if not level.shape[2]:
+        return values
+    amounts = np.einsum("ntp,ntk->npk", level * weight[:, :, None], values, optimize=True)
+    return np.asarray(values - np.einsum("ntp,npk->ntk", level, amounts, optimize=True))

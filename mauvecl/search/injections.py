@@ -1,0 +1,559 @@
+"""Injection of flares into simulated frames, their sites, and the accuracy of fits to them.
+
+Accuracy of fits to detected injections.
+
+Each injected flare is fitted alone (`flare_fit`), with standard errors from the curvature. Flares that `stare` detects
+are fitted together and have intervals from the profile likelihood (`alarms`), which have better coverage near the
+threshold.
+
+Injection of flares into simulated frames, and the smallest detected amplitude of each.
+
+The statistic of a template is a + A b + sqrt(A) c for a flare of amplitude A: a follows from simulated frames without
+the flare, b from its mean, and c from its photon noise. The flare is detected for all A above the root, so that one
+pass over the templates gives the critical amplitude of each realisation, and thereby the completeness at every
+amplitude. All half-widths and amplitudes share their realisations.
+
+The photon noise of the flare is approximated as normal; its skewness is small as long as flares add few photons.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.flares.frames import STEADY, Components
+from mauvecl.flares.stare_scene import Method, StaresRequest, method_for
+from mauvecl.noise.processes import NONE, Processes
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import Column
+from mauvecl.search.search import Search, select_frames, subtract_known
+
+if TYPE_CHECKING:
+    from mauvecl.search.flare_fits import FittedFlares, SingleFlareFit
+    from mauvecl.search.search import Survey, Trend
+    from mauvecl.search.templates import Bank
+
+Float = NDArray[np.float64]
+
+#: Quantities of each fit: ratios of fitted to injected values, the peak offset in half-widths, and whether the
+#: equivalent duration is within its standard error.
+FIT_QUANTITIES = ("energy", "amplitude", "half_width", "temperature", "peak", "covered")
+
+
+@dataclass(frozen=True, eq=False)
+class Refit:
+    """Injected flares to fit if they are detected."""
+
+    fit: SingleFlareFit
+    amplitudes: Float  # injected amplitudes, shape (n_half_width, n_amplitude)
+    temperature_k: float  # temperature of the injected flares
+    count: int  # number of stares per peak time with fits, the first ones
+
+    def compared(self, recovered: FittedFlares, amplitude: Float, site: InjectionSite) -> dict[str, NDArray[Any]]:
+        """Compare fits with the injected flares, by the names of `FIT_QUANTITIES`, shape (n_amplitude,) each."""
+        duration = amplitude * site.half_width_s * self.fit.bank.shape.equivalent_duration
+        off = np.abs(recovered.equivalent_duration_s - duration)
+        return {
+            "energy": recovered.equivalent_duration_s / duration,
+            "amplitude": recovered.amplitude / amplitude,
+            "half_width": recovered.half_width_s / site.half_width_s,
+            "temperature": recovered.temperature_k / self.temperature_k,
+            "peak": (recovered.peak_s - site.peak_s) / site.half_width_s,
+            "covered": off <= recovered.equivalent_duration_error_s,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class FitAccuracy:
+    """Accuracy of fits in each cell; arrays of shape (n_half_width, n_size), NaN without detections.
+
+    `COLUMNS` are the attributes as columns of a table.
+    """
+
+    fitted: Float
+    energy_ratio: Float
+    energy_ratio_low: Float
+    energy_ratio_high: Float
+    amplitude_ratio: Float
+    half_width_ratio: Float
+    temperature_ratio: Float
+    peak_offset: Float
+    peak_scatter: Float
+    energy_covered: Float
+
+    COLUMNS: ClassVar[tuple[Column, ...]] = (
+        Column("fitted", description="flares that were found and fitted"),
+        Column("energy_ratio", description="recovered over injected energy, median of those found"),
+        Column("energy_ratio_low", description="the same, 16 % quantile"),
+        Column("energy_ratio_high", description="the same, 84 % quantile"),
+        Column("amplitude_ratio", description="recovered over injected amplitude, median"),
+        Column("half_width_ratio", description="recovered over injected half-width, median"),
+        Column("temperature_ratio", description="recovered over injected temperature, median"),
+        Column("peak_offset", description="recovered less injected time of the peak, half-widths, median"),
+        Column("peak_scatter", description="half of the range of the middle 68 % of it, half-widths"),
+        Column("energy_covered", description="share of energies within their own standard error of the injected one"),
+    )
+
+    @classmethod
+    def of(cls, parts: Sequence[Mapping[str, NDArray[Any]]]) -> Self:
+        """Summarise the fits of all positions, arrays by `FIT_QUANTITIES` of shape (n_stare, n_half_width, n_size)."""
+        each = {name: np.moveaxis(np.concatenate([part[name] for part in parts]), 0, 2) for name in FIT_QUANTITIES}
+        count = np.isfinite(each["energy"]).sum(axis=2)
+        none = count == 0
+
+        def quantile(name: str, q: float) -> Float:
+            filled = np.where(none[:, :, None], 0.0, each[name])
+            return np.where(none, np.nan, np.nanquantile(filled, q, axis=2))
+
+        peak = [quantile("peak", q) for q in (0.16, 0.5, 0.84)]
+        return cls(
+            fitted=count.astype(np.float64),
+            energy_ratio=quantile("energy", 0.5),
+            energy_ratio_low=quantile("energy", 0.16),
+            energy_ratio_high=quantile("energy", 0.84),
+            amplitude_ratio=quantile("amplitude", 0.5),
+            half_width_ratio=quantile("half_width", 0.5),
+            temperature_ratio=_quiet_median(each["temperature"], none),
+            peak_offset=peak[1],
+            peak_scatter=(peak[2] - peak[0]) / 2,
+            energy_covered=np.where(none, np.nan, np.nanmean(np.where(none[:, :, None], 0.0, each["covered"]), axis=2)),
+        )
+
+
+def _quiet_median(values: NDArray[Any], none: NDArray[np.bool_]) -> Float:
+    """Return the median over stares, NaN for cells without fitted temperatures."""
+    blank = none | ~np.isfinite(values).any(axis=2)
+    return np.where(blank, np.nan, np.nanmedian(np.where(blank[:, :, None], 0.0, values), axis=2))
+
+
+Single = NDArray[np.float32]
+
+#: Smallest share of the best template's S/N for which a template counts as a detection.
+OVERLAP = 0.3
+#: Filters are multiples of this, so that sums are exact.
+STEP = 2.0**-18
+#: Largest ratio of half-widths of template and flare, and half-widths before and after the peak with templates.
+WIDEST, BEFORE, AFTER = 10.0, 3.0, 5.0
+#: Number of frames up to which the whole stare is searched; its search exists, and a part would hardly be smaller.
+WHOLE = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class InjectionSite:
+    """Half-width and time of a flare in a stare, and the templates that can detect it."""
+
+    half_width_s: float
+    peak_s: float
+    first: int  # first frame of the stare that a template covers
+    filters: Single  # weights of frames in the statistic of each template, shape (n_filter, n_frame)
+    mean: Single  # mean of the flare in these frames at unit amplitude, shape (n_frame,)
+    widths_s: Float  # half-widths of the templates, shape (n_filter,)
+    peaks_s: Float  # peak times of the templates, shape (n_filter,)
+    counts: NDArray[np.bool_]  # templates that count as a detection, shape (n_temperature, n_filter)
+
+    @property
+    def frames(self) -> slice:
+        """Frames of the stare that templates cover."""
+        return slice(self.first, self.first + self.mean.size)
+
+    @cached_property
+    def weights(self) -> Float:
+        """Transposed filters in double precision, shape (n_frame, n_filter)."""
+        return np.ascontiguousarray(self.filters.T, np.float64)
+
+    def within(self, first: int) -> InjectionSite:
+        """Return the site in the part of the stare that starts with frame `first`."""
+        return replace(self, first=self.first - first)
+
+
+def sites_of(survey: Survey, widths_s: Sequence[float], peak_s: float, response: Float) -> tuple[InjectionSite, ...]:
+    """Return the sites of flares of several half-widths that peak at one time.
+
+    Parameters
+    ----------
+    widths_s : sequence of float
+        Half-widths of the flares.
+    response : ndarray, shape (n_sum,)
+        Mean sums of a frame for a flare of unit amplitude.
+    """
+    bank = survey.bank
+    reaches = [_Reach.of(bank, width, peak_s) for width in widths_s]
+    search, first = _search_near(survey, reaches)
+    stare = search.stare
+    edges = np.column_stack([stare.start_s, stare.start_s + bank.frame_s])
+    means = np.array([stare.light * bank.shape.mean_over(edges, peak_s, width) for width in widths_s])
+    # A flare's sums are the product of its shape and the response, so that one correlation serves all temperatures.
+    along = (bank.directions @ response)[:, None]
+    seen: list[list[_NearbyTemplates]] = [[] for _ in reaches]
+    for number, (row, correlated) in enumerate(search.correlations(means[:, :, None])):
+        times = (stare.numbers[0] + row.peaks + row.template.phases[row.phase]) * bank.frame_s
+        for found, reach, value in zip(seen, reaches, correlated[:, 0], strict=True):
+            if row.template.half_width_s in reach.half_widths_s:
+                inside = (times >= reach.first_s) & (times <= reach.last_s) & (row.per_amplitude > 0)
+                onsets = np.flatnonzero(inside)
+                onsets = onsets[(along * value[onsets]).max(axis=0, initial=0) > 0]
+                found.append(_NearbyTemplates(number, onsets, times[onsets], along * value[onsets]))
+    for found in seen:
+        largest = max((float(one.values.max(initial=0)) for one in found), default=0.0)
+        found[:] = [one.above(OVERLAP * largest) for one in found]
+    filters = _filters(search, [one for found in seen for one in found])
+    return tuple(
+        _site(search, first, width, peak_s, mean, found, filters)
+        for width, mean, found in zip(widths_s, means, seen, strict=True)
+    )
+
+
+@dataclass(frozen=True)
+class _Reach:
+    """Templates that are tried for a flare, and the frames that they cover."""
+
+    half_widths_s: tuple[float, ...]
+    first_s: float  # earliest and latest peak of a template
+    last_s: float
+    begin_s: float  # start and end of the frames
+    end_s: float
+
+    @classmethod
+    def of(cls, bank: Bank, width_s: float, peak_s: float) -> _Reach:
+        near = [w for w in bank.half_widths_s if width_s / WIDEST <= w <= width_s * WIDEST]
+        if not near:
+            near = [min(bank.half_widths_s, key=lambda w: abs(np.log(w / width_s)))]
+        first, last = peak_s - (BEFORE * near[-1] + width_s), peak_s + AFTER * max(width_s, near[-1])
+        lead, tail = (frames * bank.frame_s for frames in bank.window(near[-1]))
+        return cls(tuple(near), first, last, first - lead, last + tail + bank.frame_s)
+
+
+@dataclass(frozen=True, eq=False)
+class _NearbyTemplates:
+    """Templates of one row of a search near a flare."""
+
+    row: int
+    onsets: NDArray[np.int64]  # shape (n,)
+    times_s: Float  # peak times, shape (n,)
+    values: NDArray[Any]  # values, or whether they exceed a limit, shape (n_temperature, n)
+
+    def above(self, least: float) -> _NearbyTemplates:
+        """Return the templates that reach a value at any temperature, with `values` true where they reach it."""
+        counts = self.values >= least
+        kept = counts.any(axis=0)
+        return _NearbyTemplates(self.row, self.onsets[kept], self.times_s[kept], counts[:, kept])
+
+
+def _search_near(survey: Survey, reaches: Sequence[_Reach]) -> tuple[Search, int]:
+    """Return a search of the frames that templates cover, and the first of these frames."""
+    stare = survey.stare
+    if stare.n_frames <= WHOLE:
+        return survey.search, 0
+    ends = min(reach.begin_s for reach in reaches), max(reach.end_s for reach in reaches)
+    part = slice(*(int(k) for k in np.searchsorted(stare.start_s, ends)))
+    near = {width for reach in reaches for width in reach.half_widths_s}
+    bank = replace(survey.bank, half_widths_s=tuple(sorted(near)))
+    curves = None if survey.curves is None else survey.curves[:, part]
+    return Search(bank, select_frames(stare, part), curves, survey.variance[part]), part.start
+
+
+def _filters(search: Search, seen: Sequence[_NearbyTemplates]) -> dict[int, tuple[NDArray[np.int64], Single]]:
+    """Return for each row the onsets of templates near any flare, ascending, and their filters."""
+    filters = {}
+    for number in sorted({one.row for one in seen}):
+        onsets = np.unique(np.concatenate([one.onsets for one in seen if one.row == number]))
+        in_time = search.in_time(search.grid[number], onsets)
+        filters[number] = onsets, (np.rint(in_time / STEP) * STEP).astype(np.float32)
+    return filters
+
+
+def _site(
+    search: Search, first: int, width_s: float, peak_s: float, mean: Float, seen: Sequence[_NearbyTemplates],
+    filters: dict[int, tuple[NDArray[np.int64], Single]],
+) -> InjectionSite:  # fmt: skip
+    none = np.zeros((0, mean.size), np.float32)
+    own = [filters[one.row][1][np.searchsorted(filters[one.row][0], one.onsets)] for one in seen]
+    weights = np.concatenate([none, *own])
+    used = np.flatnonzero(weights.any(axis=0))
+    ends = slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 0)
+    widths = [np.full(one.onsets.size, search.grid[one.row].template.half_width_s) for one in seen]
+    no_counts = np.zeros((len(search.bank.directions), 0), np.bool_)
+    return InjectionSite(
+        width_s,
+        peak_s,
+        first + ends.start,
+        np.ascontiguousarray(weights[:, ends]),
+        mean[ends].astype(np.float32),
+        np.concatenate([np.zeros(0), *widths]),
+        np.concatenate([np.zeros(0), *(one.times_s for one in seen)]),
+        np.concatenate([no_counts, *(one.values for one in seen)], axis=1),
+    )
+
+
+#: Number of stares per batch.
+BLOCK = 64
+#: Frames and flare means are rounded to multiples of these, so that sums are exact in float64 and independent of the
+#: machine; filters are rounded likewise.
+NOISE_STEP, MEAN_STEP = 2.0**-11, 2.0**-20
+#: Second half of the key of the random generator for peak times.
+INJECT_KEY = 0x696E6A65
+#: Stares of each peak start at another multiple of this, so that peaks have independent realisations.
+NUMBERS = 2**32
+#: Half-widths after the peak beyond which the photon noise of a flare is neglected.
+GLOW = 15.0
+
+
+@dataclass(frozen=True, eq=False)
+class Injections:
+    """Flares of one temperature and several half-widths in a stare."""
+
+    survey: Survey
+    flare: int  # index of the flare spectrum in the components
+    half_widths_s: tuple[float, ...]
+    threshold: float
+    seed: int
+    positions: int  # number of peak times, stratified over the recorded frames
+    draws: int  # realisations per position
+    processes: Processes = NONE  # additive ones require frames that are drawn by pixel
+
+    def __post_init__(self) -> None:
+        if not self.half_widths_s or not all(np.isfinite(w) and w > 0 for w in self.half_widths_s):
+            raise InputError.of("half_widths_s", list(self.half_widths_s), "times above 0")
+        if self.positions < 1 or not 1 <= self.draws <= NUMBERS:
+            raise InputError.of("draws", (self.positions, self.draws), f"a position and 1 to {NUMBERS} draws")
+
+    @cached_property
+    def peaks_s(self) -> Float:
+        """Times of the peaks, s, shape (n_position,)."""
+        rng = np.random.Generator(np.random.Philox(key=[self.seed % 2**64, INJECT_KEY], counter=[0, 0, 0, 2**63]))
+        stare = self.survey.stare
+        along = (np.arange(self.positions) + rng.random(self.positions)) / self.positions * stare.n_frames
+        frame = np.minimum(along.astype(np.int64), stare.n_frames - 1)
+        return np.asarray(stare.start_s[frame] + (along - frame) * stare.frame_s)
+
+    @cached_property
+    def response(self) -> Float:
+        """Mean sums of a frame for a flare of unit amplitude, shape (n_sum,)."""
+        unit = np.zeros(len(STEADY) + self.survey.components.n_flares)
+        unit[: len(STEADY)] = 1.0
+        unit[len(STEADY) + self.flare] = 1.0
+        return self.survey.components.means(unit)
+
+    @property
+    def saturates(self) -> float:
+        """Amplitude at which the mean of a used pixel reaches saturation in a frame at the flare's peak."""
+        components, light = self.survey.components, float(self.survey.stare.light.max())
+        flare = light * components.mean_dn[len(STEADY) + self.flare] * (components.weights != 0).any(axis=0)
+        room = components.quiet.highest_dn - components.quiet.mean_raw_dn
+        return float(np.min(room[flare > 0] / flare[flare > 0], initial=np.inf))
+
+    @cached_property
+    def photons(self) -> Float:
+        """Root of the covariance that a flare of unit amplitude adds to a frame's sums, shape (n_sum, n_sum)."""
+        with_it, without = np.zeros((2, len(STEADY) + self.survey.components.n_flares))
+        with_it[len(STEADY) + self.flare] = 1.0
+        covariance = self.survey.components.covariance(with_it) - self.survey.components.covariance(without)
+        values, vectors = np.linalg.eigh(covariance)
+        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+    @cached_property
+    def quiescent(self) -> Components:
+        """Components of the frames without flares."""
+        components = self.survey.components
+        return Components(components.quiet, components.flare_electrons[:0], components.weights)
+
+    @cached_property
+    def method(self) -> Method:
+        """Method of drawing frames."""
+        return method_for(self.quiescent, self.survey.stare, self.processes)
+
+    def sites(self, position: int) -> tuple[InjectionSite, ...]:
+        """Return the sites of all half-widths at a peak time."""
+        return sites_of(self.survey, self.half_widths_s, float(self.peaks_s[position]), self.response)
+
+    def request(self, position: int, refit: Refit | None = None) -> StaresRequest:
+        """Return the request for the critical amplitudes at a peak time and, with `refit`, fits of detected flares."""
+        survey = self.survey
+        sites = self.sites(position)
+        reached = [site.frames for site in sites if len(site.filters)]
+        # Without templates, one frame is drawn, since requests cannot be empty.
+        first = min((part.start for part in reached), default=0)
+        window = slice(first, max((part.stop for part in reached), default=1))
+        start = (1 + position) * NUMBERS
+        stare = select_frames(survey.stare, window)
+        injecting = CriticalAmplitudes(
+            tuple(site.within(first) for site in sites),
+            self.threshold,
+            survey.bank.directions,
+            self.response,
+            self.photons,
+            survey.known[window].astype(np.float32),
+            stare.start_s,
+            stare.frame_s,
+            survey.variance[window],
+            None if survey.curves is None else survey.curves[:, window],
+            start,
+            refit,
+            None if survey.trend is None else survey.trend.part(window),
+        )
+        return StaresRequest(
+            self.quiescent,
+            stare,
+            self.draws,
+            self.seed,
+            start=start,
+            method=self.method,
+            processes=self.processes,
+            reduction=injecting,
+            glow=True,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class CriticalAmplitudes:
+    """Reduction of stares to the critical amplitudes of flares at one peak time."""
+
+    adds: ClassVar[bool] = False
+
+    sites: tuple[InjectionSite, ...]  # in these frames
+    threshold: float
+    directions: Float  # of the bank, shape (n_temperature, n_sum)
+    response: Float  # see `Injections.response`
+    photons: Float  # see `Injections.photons`
+    known: Single  # mean of frames without a flare, shape (n_frame, n_sum)
+    start_s: Float  # shape (n_frame,)
+    frame_s: float
+    variance: Float  # of each frame's sums, as in the search, shape (n_frame,)
+    curves: Float | None  # shape (n_curve, n_frame)
+    start: int  # number of the first stare
+    refit: Refit | None = None  # flares to fit
+    trend: Trend | None = None  # effect of unknowns on these frames beyond first order
+
+    def __call__(self, values: Single, first: int, glow: Single) -> dict[str, NDArray[Any]]:
+        """Return the smallest detected amplitude of each flare, (n_stare, n_half_width), and fits if requested.
+
+        It is infinite if no template covers the flare, and zero if there is an alarm without it.
+        """
+        critical = np.full((len(values), len(self.sites)), np.inf, np.float32)
+        for begin in range(0, len(values), BLOCK):
+            part = slice(begin, begin + BLOCK)
+            drawn = self.frame_noise(values[part], glow[part])
+            for column, site in zip(critical[part].T, self.sites, strict=True):
+                if len(site.filters):
+                    column[:] = self._critical(site, self.values(site, drawn))
+        kept: dict[str, NDArray[Any]] = {"critical": critical}
+        if self.refit is not None:
+            # Stares are processed one at a time, so that fits do not depend on the batch.
+            these = range(min(len(values), max(0, self.start + self.refit.count - first)))
+            each = [self._fitted(self.frame_noise(values[k : k + 1], glow[k : k + 1]), self.refit) for k in these]
+            none = np.zeros((0, *self.refit.amplitudes.shape), np.float32)
+            kept |= {name: np.array([one[name] for one in each]) if each else none for name in FIT_QUANTITIES}
+        return kept
+
+    def frame_noise(self, values: Single, glow: Single) -> FrameNoise:
+        """Prepare the random part of some stares."""
+        n_sum = values.shape[2]
+        noise = np.moveaxis(subtract_known(values, self.known, self.trend), 2, 0)
+        own, light = np.ascontiguousarray(np.moveaxis(glow[:, :, :n_sum], 2, 0)), glow[:, :, n_sum]
+        return FrameNoise(_multiple(noise, NOISE_STEP).astype(np.float64), own, light if light.any() else None)
+
+    def values(self, site: InjectionSite, drawn: FrameNoise) -> tuple[Single, Single, Single]:
+        """Return a, b and c of the module's formula, shapes (n_temperature, n_draw or 1, n_filter)."""
+        filters, here = site.weights, site.frames
+        mean = np.atleast_2d(site.mean if drawn.light is None else site.mean * (1 + drawn.light[:, here]))
+        start, width = self.start_s[here], site.half_width_s
+        shining = (start > site.peak_s - width - self.frame_s) & (start < site.peak_s + GLOW * width)
+        ends = np.flatnonzero(shining)[[0, -1]] if shining.any() else np.array([0, -1])
+        lit = slice(int(ends[0]), int(ends[1]) + 1)
+        own = drawn.own[:, :, here][:, :, lit] * np.sqrt(np.maximum(site.mean[lit], 0))
+        return (
+            _combined(self.directions, drawn.noise[:, :, here] @ filters),
+            _combined((self.directions @ self.response)[:, None], (_multiple(mean, MEAN_STEP) @ filters)[None]),
+            _combined(self.directions @ self.photons, _multiple(own, NOISE_STEP) @ filters[lit]),
+        )
+
+    def best(
+        self, site: InjectionSite, drawn: FrameNoise, amplitudes: Float
+    ) -> tuple[Float, NDArray[np.int64], NDArray[np.int64]]:
+        """Return the largest value of all templates, its temperature and its template, (n_amplitude, n_draw) each."""
+        a, b, c = self.values(site, drawn)
+        values = np.array([a + x * b + np.sqrt(x) * c for x in amplitudes.astype(np.float32)])
+        values[:, ~site.counts[:, None].repeat(a.shape[1], axis=1)] = -np.inf
+        flat = np.moveaxis(values, 2, 1).reshape(len(amplitudes), a.shape[1], -1)
+        which = flat.argmax(axis=2)
+        largest = np.take_along_axis(flat, which[:, :, None], axis=2)[:, :, 0]
+        temperature, template = np.divmod(which, a.shape[2])
+        return largest.astype(np.float64), temperature, template
+
+    def sums(self, site: InjectionSite, drawn: FrameNoise, amplitudes: Float) -> Single:
+        """Return frames with the flare less their known mean, shape (n_amplitude, n_draw, n_frame, n_sum)."""
+        here = site.frames
+        mean = np.atleast_2d(site.mean if drawn.light is None else site.mean * (1 + drawn.light[:, here]))
+        glow = np.sqrt(np.maximum(site.mean, 0))
+        own = np.einsum("kj,jmt->mtk", self.photons.astype(np.float32), drawn.own[:, :, here] * glow)
+        rise = mean[:, :, None] * self.response.astype(np.float32)
+        noise = np.moveaxis(drawn.noise[:, :, here], 0, 2)
+        return np.asarray([noise + x * rise + np.sqrt(x) * own for x in amplitudes.astype(np.float32)])
+
+    def _critical(self, site: InjectionSite, values: tuple[Single, Single, Single]) -> Single:
+        a, b, c = values
+        left = np.float32(self.threshold) - a
+        # Root of b x^2 + c x = left in its numerically stable form; zero if there is an alarm without the flare.
+        root = np.multiply(left, 4 * b)
+        root += c * c
+        np.sqrt(np.maximum(root, 0, out=root), out=root)
+        root += c
+        with np.errstate(divide="ignore", invalid="ignore"):
+            np.divide(2 * left, root, out=root)
+        root[~((b > 0) & site.counts[:, None]).repeat(root.shape[1] // b.shape[1], axis=1)] = np.inf
+        np.copyto(root, 0, where=(left <= 0) & site.counts[:, None])
+        return np.asarray(root.min(axis=(0, 2)) ** 2)
+
+    def _fitted(self, drawn: FrameNoise, refit: Refit) -> dict[str, Single]:
+        """Fit the detected flares of one stare; arrays of shape (n_half_width, n_amplitude), NaN if not detected."""
+        kept = {name: np.full(refit.amplitudes.shape, np.nan, np.float32) for name in FIT_QUANTITIES}
+        for d, (site, row) in enumerate(zip(self.sites, refit.amplitudes, strict=True)):
+            if not len(site.filters):
+                continue
+            value, _, template = (each[:, 0] for each in self.best(site, drawn, row))
+            alarm = value >= self.threshold
+            if not alarm.any():
+                continue
+            here, which = site.frames, template[alarm]
+            recovered = refit.fit.run(
+                self.sums(site, drawn, row[alarm])[:, 0],
+                self.start_s[here],
+                peak_s=site.peaks_s[which],
+                half_width_s=site.widths_s[which],
+                variance=self.variance[here],
+                curves=None if self.curves is None else self.curves[:, here],
+            )
+            for name, values in refit.compared(recovered, row[alarm], site).items():
+                kept[name][d, alarm] = values
+        return kept
+
+
+@dataclass(frozen=True, eq=False)
+class FrameNoise:
+    """Random part of the frames of some stares."""
+
+    noise: Float  # sums without a flare less their known mean, shape (n_sum, n_draw, n_frame)
+    own: Single  # standard normals for the photon noise of the flare, shape (n_sum, n_draw, n_frame)
+    light: Single | None  # relative change of all light, shape (n_draw, n_frame)
+
+
+def _multiple(values: Single, step: float) -> Single:
+    """Round to multiples of a power of two."""
+    values = values * np.float32(1 / step)
+    return np.asarray(np.rint(values, out=values) * np.float32(step))
+
+
+def _combined(rows: Float, values: Float) -> Single:
+    """Multiply rows (n_row, n_sum) with values (n_sum, n_draw, n_filter), summing in a fixed order."""
+    small = values.astype(np.float32)
+    combined = np.empty((len(rows), *values.shape[1:]), np.float32)
+    for row, out in zip(rows.astype(np.float32), combined, strict=True):
+        np.multiply(row[0], small[0], out=out)
+        for weight, value in zip(row[1:], small[1:], strict=True):
+            out += weight * value
+    return combined

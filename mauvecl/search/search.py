@@ -1,0 +1,656 @@
+"""Search of stares for flares with matched filters, exact over gaps, and the survey of a star.
+
+Search of stares for flares with a bank of matched filters, exact over gaps.
+
+For sums y of a frame with unit covariance, a template s in time and c in the sums, and a baseline G a with unknown
+amplitudes a in the window, the statistic is that of generalised least squares,
+
+    rho = c . (s - P G)^T m y / sqrt((s - P G)^T m (s - P G)),   P = (G^T m G)^-1 G^T m s,
+
+with m the inverse variance of a frame, zero in gaps. Without a flare it is normal with unit variance; with a flare, its
+mean is the S/N. All sums over time are correlations, computed by FFT. (Matched filters: Turin 1960, doi
+10.1109/TIT.1960.1057571.)
+
+Non-linear trends in the sums of a stare, fitted to the sums and subtracted.
+
+A search marginalises over the baseline of a window to first order: offset, slope and cycles. But dark current is
+exponential in temperature, so that a temperature drift is curved, and drifts of light and star multiply. This part
+follows from the amplitudes of the unknowns, which are well measured if they matter: over a whole stare, each changes
+the sums by many standard deviations. The amplitudes are fitted, and their effect beyond first order is subtracted. An
+error of one standard deviation in the baseline then leaves a few per cent of it, the relative change of the dark
+current.
+
+The fit uses the Gauss-Newton method on means over half a minute, with the distribution of the unknowns as prior. Means
+with flares have less weight (Huber 1964, doi 10.1214/aoms/1177703732), so that flares hardly affect the fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from mauvecl.flares.stare_scene import StaresRequest, method_for
+from mauvecl.noise.processes import NONE, Processes
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DAY_S
+from mauvecl.search.templates import LEAST_SHARE, Bank, Template
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from mauvecl.flares.frames import Components
+    from mauvecl.flares.stare import Stare, StareUnknown
+    from mauvecl.noise.unknowns import Changing
+
+Float = NDArray[np.float64]
+
+#: Approximate number of values in an array of a batch of stares.
+BATCH = 2**21
+#: Relative regularisation for curves that are degenerate within a window.
+RIDGE = 1e-11
+
+
+@dataclass(frozen=True, eq=False)
+class LargestValue:
+    """The largest value of each stare and its template; arrays of shape (n_stare,)."""
+
+    maximum: Float  # largest rho
+    peak_s: Float  # from the start of the stare
+    half_width_s: Float
+    temperature: NDArray[np.int64]  # row of the bank's directions
+    amplitude: Float  # of the template's peak, in standard deviations of a frame's sum
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One half-width and phase at all onsets; `Search.values` yields the statistics of each row."""
+
+    template: Template
+    phase: int
+    peaks: NDArray[np.int64]  # frame of the peak at each onset, from the first frame of the stare, including gaps
+    per_amplitude: Float  # mean of rho for a flare with unit peak, zero if not searched, shape (n_onset,)
+    project: Float  # P of the module's formula, shape (n_term, n_onset)
+
+
+class Search:
+    """Search of stares with a template bank.
+
+    Parameters
+    ----------
+    bank : Bank
+    stare : Stare
+        Only the times of its frames are used.
+    curves : ndarray, shape (n_curve, n_frame), optional
+        Curves with unknown amplitudes in each window, such as sine and cosine of the orbit or the detector's
+        temperature; required if the bank's baseline has `cycle`.
+    variance : ndarray, shape (n_frame,), optional
+        Variance of each frame's sums; 1 by default.
+    """
+
+    def __init__(self, bank: Bank, stare: Stare, curves: Float | None = None, variance: Float | None = None) -> None:
+        if abs(stare.frame_s - bank.frame_s) > 1e-9 * bank.frame_s:
+            raise InputError.of("frame_s", stare.frame_s, f"{bank.frame_s:g} s, as in the bank", unit="s")
+        if bank.baseline.cycle != (curves is not None and len(curves) > 0):
+            raise InputError("only one of curves and level.cycle is given", "both or neither", key="curves")
+        self.bank, self.stare = bank, stare
+        self._first = int(stare.numbers[0])
+        self._at = stare.numbers - self._first
+        self.n_grid = int(self._at[-1]) + 1
+        self._weight = np.zeros(self.n_grid)
+        self._weight[self._at] = 1.0 if variance is None else 1.0 / variance
+        series = [np.ones(stare.n_frames)]
+        for curve in np.zeros((0, stare.n_frames)) if curves is None else curves:
+            scale = float(np.std(curve))
+            if not scale > 0:
+                raise InputError("a baseline curve is constant over the stare", "one that varies", key="curves")
+            series.append((curve - np.mean(curve)) / scale)
+        # Terms of the baseline: a power of time in the window, and the index of a series in the stare.
+        self._terms = [(power, 0) for power in bank.baseline.powers] + [(0, 1 + k) for k in range(len(series) - 1)]
+        self._series = np.zeros((len(series), self.n_grid))
+        self._series[:, self._at] = series
+        # Only the part of a long template within a stare's length of the onset overlaps data.
+        reach = min(max(t.shapes.shape[1] for t in bank.templates), self.n_grid)
+        self._size = int(scipy.fft.next_fast_len(self.n_grid + reach, real=True))
+
+    @cached_property
+    def grid(self) -> list[Row]:
+        """Rows of all half-widths and phases, with everything that does not depend on data."""
+        return [row for template in self.bank.templates for row in self._rows_of(template)]
+
+    @property
+    def n_filters(self) -> int:
+        """Number of searched templates: half-widths, phases, onsets and temperatures."""
+        return len(self.bank.directions) * int(sum(np.count_nonzero(row.per_amplitude) for row in self.grid))
+
+    def largest(self, sums: NDArray[Any]) -> LargestValue:
+        """Return the largest value of each stare and its template.
+
+        Parameters
+        ----------
+        sums : ndarray, shape (n_stare, n_frame, n_sum)
+            Sums with unit covariance in each frame without a flare.
+        """
+        sums = self._checked(sums)
+        parts = [self._largest(sums[batch]) for batch in self._batches(len(sums))]
+        return LargestValue(
+            *(np.concatenate([getattr(p, name) for p in parts]) for name in LargestValue.__annotations__)
+        )
+
+    def values(self, sums: NDArray[Any]) -> Iterator[tuple[Row, NDArray[Any]]]:
+        """Yield each row with rho, shape (n_stare, n_temperature, n_onset); minus infinity if not searched.
+
+        Values have the precision of the sums. All stares are processed at once, which suits small numbers of stares.
+        """
+        yield from self._values(self._checked(sums))
+
+    def correlations(self, sums: NDArray[Any]) -> Iterator[tuple[Row, NDArray[Any]]]:
+        """Yield each row with the values of all sums, shape (n_stare, n_sum, n_onset); zero if not searched.
+
+        The bank's directions times these values are the values of rho. There may be any number of sums.
+        """
+        spectra = self._spectra(sums)
+        real = _precision(sums)
+        window, level = (0, 0), []
+        for template in self.bank.templates:
+            onsets = self._onsets(template)
+            # Templates with the same window share the correlations of the baseline.
+            if window != (template.first, template.time.size):
+                window = template.first, template.time.size
+                level = [
+                    self._correlated(spectra[series], template.time**power, template.first)
+                    for power, series in self._terms
+                ]
+            for row in self.grid:
+                if row.template is not template:
+                    continue
+                correlated = self._correlated(spectra[0], template.shapes[row.phase], template.first)[..., onsets]
+                for projected, term in zip(row.project.astype(real), level, strict=True):
+                    correlated -= projected * term[..., onsets]
+                scale = np.divide(
+                    1.0, row.per_amplitude, out=np.zeros_like(row.per_amplitude), where=row.per_amplitude > 0
+                )
+                correlated *= scale.astype(real)
+                yield row, correlated
+
+    def template(self, row: Row, onset: int, direction: int) -> Float:
+        """Return the weights of each sum in rho of a template, shape (n_frame, n_sum): rho = sum(weights * sums)."""
+        return np.asarray(self.in_time(row, np.array([onset]))[0][:, None] * self.bank.directions[direction])
+
+    def in_time(self, row: Row, onsets: NDArray[np.int64]) -> Float:
+        """Return the weights of frames in templates of a row, without their direction, shape (n_onset, n_frame)."""
+        size, first = row.template.time.size, row.peaks[onsets] + row.template.first
+        templates = np.zeros((onsets.size, self.stare.n_frames))
+        if not onsets.size:
+            return templates
+        reached = slice(*np.searchsorted(self._at, [first.min(), first.max() + size]))
+        grid = self._at[reached]
+        at = grid - first[:, None]
+        inside = (at >= 0) & (at < size)
+        at = np.where(inside, at, 0)
+        shape = row.template.shapes[row.phase][at]
+        for (power, series), amplitude in zip(self._terms, row.project[:, onsets], strict=True):
+            shape -= amplitude[:, None] * (row.template.time**power)[at] * self._series[series][grid]
+        shape *= self._weight[grid]
+        shape /= row.per_amplitude[onsets][:, None]
+        templates[:, reached] = np.where(inside, shape, 0.0)
+        return templates
+
+    @property
+    def variance(self) -> Float:
+        """Variance of each frame's sums, shape (n_frame,)."""
+        return np.asarray(1.0 / self._weight[self._at])
+
+    def _checked(self, sums: NDArray[Any]) -> NDArray[Any]:
+        expected = (self.stare.n_frames, self.bank.directions.shape[1])
+        if sums.ndim != 3 or sums.shape[1:] != expected:
+            raise InputError(
+                f"sums have the shape {sums.shape}",
+                f"(n_stare, {expected[0]}, {expected[1]})",
+                key="sums",
+                value=sums.shape,
+            )
+        return sums
+
+    def _batches(self, count: int) -> list[slice]:
+        size = max(1, BATCH // (self._size * self.bank.directions.shape[1]))
+        return [slice(i, i + size) for i in range(0, count, size)]
+
+    def _largest(self, sums: NDArray[Any]) -> LargestValue:
+        n = len(sums)
+        every = np.arange(n)
+        best = np.full(n, -np.inf)
+        peak, width, amplitude = (np.zeros(n) for _ in range(3))
+        temperature = np.zeros(n, np.int64)
+        for row, rho in self._values(sums):
+            which = rho.reshape(n, -1).argmax(axis=1)
+            value = rho.reshape(n, -1)[every, which]
+            better = value > best
+            direction, onset = np.divmod(which[better], rho.shape[2])
+            best[better] = value[better]
+            peak[better] = (self._first + row.peaks[onset] + row.template.phases[row.phase]) * self.bank.frame_s
+            width[better] = row.template.half_width_s
+            temperature[better] = direction
+            amplitude[better] = value[better] / row.per_amplitude[onset]
+        return LargestValue(best, peak, width, temperature, amplitude)
+
+    def _values(self, sums: NDArray[Any]) -> Iterator[tuple[Row, NDArray[Any]]]:
+        directions = self.bank.directions.astype(_precision(sums))
+        for row, correlated in self.correlations(sums):
+            tried = row.per_amplitude > 0
+            rho = np.einsum("tk,skn->stn", directions, correlated, optimize=True)
+            if not tried.all():
+                rho[:, :, ~tried] = -np.inf
+            yield row, rho
+
+    def _spectra(self, sums: NDArray[Any]) -> list[NDArray[Any]]:
+        """Return transforms of the weighted sums times each series, zero in gaps, (n_stare, n_sum, n_frequency)."""
+        real = _precision(sums)
+        held = np.zeros((len(sums), sums.shape[2], self.n_grid), real)
+        held[:, :, self._at] = self._levelled(sums) * self._weight[self._at]
+        used = {series for _, series in self._terms} | {0}
+        return [
+            scipy.fft.rfft(held * self._series[k].astype(real), self._size) if k in used else held[:0]
+            for k in range(len(self._series))
+        ]
+
+    def _levelled(self, sums: NDArray[Any]) -> NDArray[Any]:
+        """Subtract the baseline fitted to the whole stare, which does not change rho but improves its precision."""
+        y = np.moveaxis(sums, 2, 1)
+        return np.asarray(y - (y @ self._level_span) @ self._level_span.T) if self._terms else y
+
+    @cached_property
+    def _level_span(self) -> Float:
+        """Orthonormal columns that span all baselines of the stare, (n_frame, n)."""
+        time = (self._at - self._at.mean()) / max(self.n_grid, 1)
+        columns = np.array([time**power * self._series[series][self._at] for power, series in self._terms])
+        span, size, _ = np.linalg.svd(columns.T, full_matrices=False)
+        return np.asarray(span[:, size > 1e-12 * size[0]])
+
+    def _correlated(self, spectrum: NDArray[Any], kernel: Float, first: int) -> NDArray[Any]:
+        """Return sum_t data(t) kernel(t - first - onset) at every frame, in the precision of the spectrum."""
+        real = np.float32 if spectrum.dtype == np.complex64 else np.float64
+        held = np.zeros(self._size, real)
+        met = slice(max(0, 1 - self.n_grid - first), max(0, self.n_grid - first))
+        held[: kernel[met].size] = kernel[met]
+        other = np.conj(scipy.fft.rfft(np.roll(held, first + met.start)))
+        values: NDArray[Any] = scipy.fft.irfft(spectrum * other, self._size)
+        return values[..., : self.n_grid]
+
+    def _onsets(self, template: Template) -> slice:
+        """Return the frames at which a template is tried."""
+        return slice(self._start(template), self.n_grid, template.stride)
+
+    def _start(self, template: Template) -> int:
+        return -self._first % template.stride
+
+    def _rows_of(self, template: Template) -> Iterator[Row]:
+        n = len(self._terms)
+        # Onsets are multiples of the stride from the start of the whole stare, even if only a part is searched.
+        peaks = np.arange(self._start(template), self.n_grid, template.stride)
+        time = template.time
+        spectra: dict[tuple[int, int], Any] = {}
+
+        def over(a: int, b: int, kernel: Float) -> Float:
+            """Correlate the weighted product of two series with a kernel."""
+            if (a, b) not in spectra:
+                spectra[a, b] = scipy.fft.rfft(self._weight * self._series[a] * self._series[b], self._size)
+            return np.asarray(self._correlated(spectra[a, b], kernel, template.first)[self._onsets(template)])
+
+        gram = np.zeros((peaks.size, n, n))
+        for i, (p, a) in enumerate(self._terms):
+            for j, (q, b) in enumerate(self._terms[: i + 1]):
+                gram[:, i, j] = gram[:, j, i] = over(a, b, time ** (p + q))
+        size = np.sqrt(np.maximum(np.einsum("nii->ni", gram), 1e-9))
+        scaled = gram / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(n)
+        scaled += np.where(np.einsum("nii->ni", gram) > 1e-9, 0.0, 1.0)[:, :, None] * np.eye(n)
+        for phase, shape in enumerate(template.shapes):
+            power = over(0, 0, shape**2)
+            project = np.zeros((n, peaks.size))
+            left = power
+            if n:
+                shared = np.stack([over(0, a, shape * time**p) for p, a in self._terms], axis=1)
+                solved = np.linalg.solve(scaled, (shared / size)[:, :, None])[:, :, 0] / size
+                project = solved.T
+                left = power - 2 * np.sum(solved * shared, 1) + np.einsum("ni,nij,nj->n", solved, gram, solved)
+            tried = left >= LEAST_SHARE * self._without_gaps(template, phase)
+            yield Row(template, phase, peaks, np.sqrt(np.where(tried, left, 0.0)), project)
+
+    def _without_gaps(self, template: Template, phase: int) -> float:
+        """Return a template's power without gaps, marginalised over powers of time only."""
+        shape = template.shapes[phase]
+        columns = np.array([template.time**power for power in self.bank.baseline.powers])
+        if columns.size:
+            level, *_ = np.linalg.lstsq(columns.T, shape, rcond=None)
+            shape = shape - level @ columns
+        return float(shape @ shape) * float(np.median(self._weight[self._at]))
+
+
+def _precision(sums: NDArray[Any]) -> type[np.floating[Any]]:
+    """Return the type of computations: double precision for sums in double precision, else single."""
+    return np.float64 if sums.dtype == np.float64 else np.float32
+
+
+#: Averaging time of the fit, s; the curvature within it is neglected.
+BLOCK_S = 30.0
+#: Residual in standard deviations above which a mean has less weight.
+HUBER = 3.0
+#: Number of Gauss-Newton steps.
+STEPS = 6
+#: Standard deviations of an unknown at which its effect is evaluated, and smallest significant S/N of the effect.
+REACH, LEAST = 4.0, 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Trend:
+    """Effect of a stare's unknowns on the sums of its frames."""
+
+    frames: NDArray[np.int64]  # frame numbers including gaps, shape (n_frame,)
+    frame_s: float
+    variance: Float  # of each frame's sums, shape (n_frame,)
+    of: tuple[Changing, ...]  # quantity that each unknown changes
+    curves: Float  # change per standard deviation of each unknown, shape (n_unknown, n_frame)
+    star: Float  # known mean, shape (n_frame, n_sum)
+    sky: Float  # known mean, shape (n_frame, n_sum)
+    neighbours: Float  # known mean, shape (n_frame, n_sum)
+    dark: Float  # known mean, shape (n_frame, n_sum)
+    slope_per_c: float  # relative change of the dark current per deg C
+
+    @classmethod
+    def of_unknowns(
+        cls,
+        unknowns: Sequence[StareUnknown],
+        directions: Mapping[Changing, Float],
+        variance: Float,
+        frames: NDArray[np.int64],
+        frame_s: float,
+        slope_per_c: float,
+    ) -> Trend | None:
+        """Return the trend of a stare's unknowns, or None without unknowns; for `directions`, see `Survey`."""
+        if not unknowns:
+            return None
+        star, sky = directions["star"], directions["sky"]
+        neighbours = directions["light"] - star - sky
+        dark = directions["temperature"] / slope_per_c if slope_per_c else np.zeros_like(sky)
+        curves = np.array([one.sd * one.curve for one in unknowns])
+        of = tuple(one.of for one in unknowns)
+        return cls(frames, frame_s, variance, of, curves, star, sky, neighbours, dark, slope_per_c)
+
+    @cached_property
+    def extremes(self) -> Float:
+        """Amplitudes of `REACH` standard deviations, together and each alone, with both signs, (n, n_unknown)."""
+        rows = np.vstack([np.eye(len(self.of)), np.ones(len(self.of))])
+        return np.asarray(REACH * np.vstack([rows, -rows]))
+
+    @cached_property
+    def is_nonlinear(self) -> bool:
+        """True if the effect of unknowns beyond first order is significant."""
+        nonlinear = self.nonlinear_effect(self.extremes)
+        return bool((np.sum(nonlinear**2 / self.variance[:, None], axis=(1, 2)) > LEAST**2).any())
+
+    def effect(self, amplitudes: Float) -> Float:
+        """Return the effect of unknowns on the sums, (n_stare, n_frame, n_sum).
+
+        Parameters
+        ----------
+        amplitudes : ndarray, shape (n_stare, n_unknown)
+            In standard deviations.
+        """
+        return self._moved(self._changes(amplitudes))
+
+    def part(self, part: slice) -> Trend:
+        """Return the trend of some frames."""
+        names = ("frames", "variance", "star", "sky", "neighbours", "dark")
+        return replace(self, curves=self.curves[:, part], **{name: getattr(self, name)[part] for name in names})
+
+    def subtracted(self, sums: NDArray[Any]) -> NDArray[np.float64]:
+        """Fit the unknowns to sums and subtract their effect beyond first order.
+
+        Parameters
+        ----------
+        sums : ndarray, shape (n_stare, n_frame, n_sum)
+            Sums less their known mean.
+        """
+        left = np.array(sums, np.float64)
+        # One stare at a time, since the rounding of matrix products may depend on the number of stares.
+        for one in left:
+            one -= self.nonlinear_effect(self.fitted(one[None]))[0]
+        return left
+
+    def nonlinear_effect(self, amplitudes: Float) -> Float:
+        """Return the effect of unknowns less its linear part, (n_stare, n_frame, n_sum).
+
+        Parameters
+        ----------
+        amplitudes : ndarray, shape (n_stare, n_unknown)
+            In standard deviations.
+        """
+        linear = np.array([self._linear[of] for of in self.of])
+        first = np.einsum("nu,ut,uk->ntk", amplitudes, self.curves, linear, optimize=True)
+        return np.asarray(self.effect(amplitudes) - first)
+
+    def fitted(self, sums: Float) -> Float:
+        """Return the most likely amplitudes, shape (n_stare, n_unknown), in standard deviations."""
+        blocks, weight, means = self._blocks
+        y = np.add.reduceat(sums / self.variance[:, None], blocks, axis=1) / weight[:, None]
+        n, n_unknown = len(y), len(self.of)
+        amplitudes = np.zeros((n, n_unknown))
+        for _ in range(STEPS):
+            changes = means._changes(amplitudes)
+            left = y - means._moved(changes)
+            size = np.sqrt(np.sum(left**2, axis=2) * weight)
+            trusted = weight * np.minimum(1.0, HUBER / np.maximum(size, 1e-300))
+            gradient = means._gradient(changes)
+            weighted = gradient * trusted[:, None, :, None]
+            information = np.einsum("nutk,nvtk->nuv", weighted, gradient, optimize=True) + np.eye(n_unknown)
+            pull = np.einsum("nutk,ntk->nu", weighted, left, optimize=True) - amplitudes
+            amplitudes = amplitudes + np.linalg.solve(information, pull[:, :, None])[:, :, 0]
+        return amplitudes
+
+    @cached_property
+    def _linear(self) -> dict[str, Float]:
+        """Mean response of the sums to each kind of change, shape (n_sum,)."""
+        star, sky, near, dark = (x.mean(axis=0) for x in (self.star, self.sky, self.neighbours, self.dark))
+        return {"star": star, "light": star + sky + near, "sky": sky, "temperature": self.slope_per_c * dark}
+
+    @cached_property
+    def _blocks(self) -> tuple[NDArray[np.int64], Float, Trend]:
+        """The first frame of each block, its weight, and the trend of the blocks' means."""
+        number = self.frames // max(1, round(BLOCK_S / self.frame_s))
+        first = np.flatnonzero(np.diff(number, prepend=-1))
+        weight = np.add.reduceat(1.0 / self.variance, first)
+
+        def mean(values: Float, axis: int = 0) -> Float:
+            over = self.variance if axis else self.variance[:, None]
+            return np.asarray(np.add.reduceat(values / over, first, axis=axis) / (weight if axis else weight[:, None]))
+
+        means = replace(
+            self,
+            frames=number[first],
+            variance=1.0 / weight,
+            curves=mean(self.curves, 1),
+            star=mean(self.star),
+            sky=mean(self.sky),
+            neighbours=mean(self.neighbours),
+            dark=mean(self.dark),
+        )
+        return first, weight, means
+
+    def _changes(self, amplitudes: Float) -> dict[str, Float]:
+        """Return the relative changes of star, light and sky, and that of the temperature, (n_stare, n_frame)."""
+        changes: dict[str, Float] = {}
+        for of in ("star", "light", "sky", "temperature"):
+            these = [k for k, name in enumerate(self.of) if name == of]
+            changes[of] = amplitudes[:, these] @ self.curves[these]
+        return changes
+
+    def _moved(self, changes: Mapping[str, Float]) -> Float:
+        """Return the effect of changes on the sums, (n_stare, n_frame, n_sum)."""
+        light = changes["light"] + 1
+        star, sky = light * (1 + changes["star"]) - 1, light * (1 + changes["sky"]) - 1
+        warm = np.expm1(self.slope_per_c * changes["temperature"])
+        lit = star[..., None] * self.star + sky[..., None] * self.sky + changes["light"][..., None] * self.neighbours
+        return np.asarray(lit + warm[..., None] * self.dark)
+
+    def _gradient(self, changes: Mapping[str, Float]) -> Float:
+        """Return the derivatives of `_moved` by the amplitudes, (n_stare, n_unknown, n_frame, n_sum)."""
+        light, star, sky = (1 + changes[of][..., None] for of in ("light", "star", "sky"))
+        warm = np.exp(self.slope_per_c * changes["temperature"])[..., None]
+        each = {
+            "star": light * self.star,
+            "light": star * self.star + sky * self.sky + self.neighbours,
+            "sky": light * self.sky,
+            "temperature": self.slope_per_c * warm * self.dark,
+        }
+        return np.stack([each[of] * curve[:, None] for of, curve in zip(self.of, self.curves, strict=True)], axis=1)
+
+
+#: Relative norm of a curve's residual below which it is a linear combination of others.
+MIN_CURVE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """Stare at a star and its search."""
+
+    components: Components  # with the weights of `Templates`
+    stare: Stare
+    bank: Bank
+
+    @cached_property
+    def coefficients(self) -> Float:
+        """Known coefficients of each frame's components without a flare, shape (n_frame, 4 + n_flare)."""
+        return self.components.coefficients(self.stare)
+
+    @cached_property
+    def known(self) -> Float:
+        """Known mean of each frame's sums without a flare, which the observer subtracts, shape (n_frame, n_sum)."""
+        return self.components.means(self.coefficients)
+
+    @cached_property
+    def directions(self) -> dict[Changing, Float]:
+        """Derivatives of the mean sums by star, light, sky and temperature, shape (n_frame, n_sum) each."""
+        directions: dict[Any, Float] = self.components.directions(self.coefficients)
+        return directions
+
+    def covariance(self) -> Float:
+        """Return the covariance of each frame's sums without a flare, shape (n_frame, n_sum, n_sum)."""
+        covariance = self.components.covariance(self.coefficients)
+        for of, sd in self.stare.jitters.items():
+            moved = sd * self.directions[of]
+            covariance = covariance + moved[:, :, None] * moved[:, None, :]
+        return covariance
+
+    @cached_property
+    def variance(self) -> Float:
+        """Variance of each frame's sums that the search assumes, averaged over sums, shape (n_frame,)."""
+        covariance = self.covariance()
+        return np.asarray(np.einsum("tkk->t", covariance) / covariance.shape[1])
+
+    @cached_property
+    def curves(self) -> Float | None:
+        """Curves of the stare's unknowns that are not straight lines, shape (n_curve, n_frame)."""
+        if not self.bank.baseline.cycle:
+            return None
+        every = [unknown.curve for unknown in self.stare.unknowns]
+        # Residual of each curve after a fit of a straight line and the previous curves.
+        basis = np.linalg.qr(np.vander(self.stare.start_s / max(self.stare.duration_s, 1.0), 2))[0]
+        curves: list[Float] = []
+        for curve in every:
+            left = curve - basis @ (basis.T @ curve)
+            size = float(np.linalg.norm(left))
+            if size > MIN_CURVE * float(np.linalg.norm(curve)):
+                curves.append(left)
+                basis = np.column_stack([basis, left / size])
+        return np.array(curves).reshape(len(curves), self.stare.n_frames)
+
+    @cached_property
+    def search(self) -> Search:
+        """Search of the stare's frames."""
+        return Search(self.bank, self.stare, self.curves, self.variance)
+
+    @cached_property
+    def unknowns(self) -> Trend | None:
+        """Effect of the stare's unknowns, or None without unknowns."""
+        slope = self.components.quiet.conditions["dark_slope_per_c"]
+        return Trend.of_unknowns(
+            self.stare.unknowns, self.directions, self.variance, self.stare.numbers, self.stare.frame_s, slope
+        )
+
+    @property
+    def trend(self) -> Trend | None:
+        """Effect of the stare's unknowns if it is significant beyond first order, else None."""
+        return self.unknowns if self.unknowns is not None and self.unknowns.is_nonlinear else None
+
+    def unsubtracted(self, amplitudes: Float) -> Float:
+        """Return the effect of unknowns on the sums that is not subtracted before the search.
+
+        The shape is (n_stare, n_frame, n_sum).
+
+        Parameters
+        ----------
+        amplitudes : ndarray, shape (n_stare, n_unknown)
+            In standard deviations.
+        """
+        if self.unknowns is None:
+            return np.zeros((len(amplitudes), self.stare.n_frames, self.components.n_statistics))
+        moved = self.unknowns.effect(amplitudes)
+        return moved if self.trend is None else self.trend.subtracted(moved)
+
+    def net(self, sums: NDArray[Any]) -> NDArray[np.float32]:
+        """Subtract from simulated sums their known mean and the fitted trend, shape (n_stare, n_frame, n_sum)."""
+        return subtract_known(sums, self.known, self.trend)
+
+    def largest_value_request(self, count: int, seed: int, processes: Processes = NONE) -> StaresRequest:
+        """Return the request for the largest values of stares without a flare."""
+        largest = Largest(self.bank, self.stare, self.curves, self.variance, self.known, self.trend)
+        method = method_for(self.components, self.stare, processes)
+        return StaresRequest(
+            self.components, self.stare, count, seed, method=method, processes=processes, reduction=largest
+        )
+
+    def of_days(self, days: float) -> Survey:
+        """Return the survey of at most the first `days` star-days of the stare."""
+        n = int(days * DAY_S / self.stare.frame_s)
+        return self if self.stare.n_frames <= n else replace(self, stare=select_frames(self.stare, slice(0, n)))
+
+
+@dataclass(frozen=True, eq=False)
+class Largest:
+    """Reduction of simulated stares to their largest values."""
+
+    adds: ClassVar[bool] = False
+
+    bank: Bank
+    stare: Stare
+    curves: Float | None
+    variance: Float
+    known: Float
+    trend: Trend | None = None
+
+    @cached_property
+    def search(self) -> Search:
+        """Search of the stare's frames."""
+        return Search(self.bank, self.stare, self.curves, self.variance)
+
+    def __call__(self, values: NDArray[np.float32], first: int) -> dict[str, NDArray[Any]]:
+        """Return the largest values as ``maximum``, shape (n_stare,)."""
+        return {"maximum": self.search.largest(subtract_known(values, self.known, self.trend)).maximum}
+
+
+def subtract_known(sums: NDArray[Any], known: NDArray[Any], trend: Trend | None) -> NDArray[np.float32]:
+    """Subtract from simulated sums, (n_stare, n_frame, n_sum), their known mean and, if given, the fitted trend."""
+    left = sums - known
+    return np.asarray(left if trend is None else trend.subtracted(left), np.float32)
+
+
+def select_frames(stare: Stare, part: slice | NDArray[np.bool_]) -> Stare:
+    """Return a stare with some of the frames."""
+    names = ("start_s", "star", "light", "sky", "temperature_c")
+    unknowns = tuple(replace(unknown, curve=unknown.curve[part]) for unknown in stare.unknowns)
+    return replace(stare, unknowns=unknowns, **{name: getattr(stare, name)[part] for name in names})

@@ -1,0 +1,354 @@
+"""Templates of a search for flares: their bank, weights in wavelength, and study sections.
+
+Spectral weights that reduce a frame to a few sums for flares of any temperature.
+
+The optimal weights for a flare with spectrum d are C^-1 d, where C is the covariance of a frame including nuisance
+parameters (METHODS section 7). Spectra of flares of 6000-30 000 K are similar, so that two or three singular vectors of
+the whitened spectra suffice as a basis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.detection.nuisances import Nuisances, join_names
+from mauvecl.fits.flare_model import MeanSums
+from mauvecl.flares.defaults import RANK, WINDOW_S
+from mauvecl.schema.errors import InputError
+
+if TYPE_CHECKING:
+    from mauvecl.flares.shapes import Shape
+    from mauvecl.flares.stare import Stare
+    from mauvecl.host.exposure.expectation import Expectation
+
+Float = NDArray[np.float64]
+
+#: Shortest window before and after a peak, in half-widths of the template.
+LEAD, TAIL = 5.0, 10.0
+#: Smallest number of onsets per half-width.
+ONSETS = 10
+#: Half-width in frames below which two onsets per frame are searched.
+SUB_FRAME = 6.0
+#: Smallest share of a template's power outside gaps for which it is searched.
+LEAST_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """Baseline under a flare: the terms that are marginalised over in each window.
+
+    Attributes
+    ----------
+    offset, slope : bool
+    cycle : bool
+        Curves of unknown amplitude, such as the orbital thermal cycle.
+    window_s : float
+        Smallest window. Windows also include at least 5 half-widths before the peak and 10 after it.
+    """
+
+    offset: bool = True
+    slope: bool = True
+    cycle: bool = False
+    window_s: float = WINDOW_S
+
+    def __post_init__(self) -> None:
+        if self.slope and not self.offset:
+            raise InputError.of("slope", self.slope, "no slope without an offset")
+        if not (np.isfinite(self.window_s) and self.window_s >= 0):
+            raise InputError.of("window_s", self.window_s, "a time of at least 0", unit="s")
+
+    @property
+    def powers(self) -> tuple[int, ...]:
+        """Powers of time in the baseline."""
+        return (*((0,) if self.offset else ()), *((1,) if self.slope else ()))
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """Flare shapes of one half-width on a grid of frames."""
+
+    half_width_s: float
+    first: int  # first frame of the window relative to the frame of the peak
+    phases: tuple[float, ...]  # positions of the peak within its frame, in frames
+    shapes: Float  # mean flux per frame for a peak of 1, shape (n_phase, n)
+    stride: int  # frames between onsets
+
+    @cached_property
+    def time(self) -> Float:
+        """Time of each frame of the window, from -1 to 1 about its middle, shape (n,)."""
+        n = self.shapes.shape[1]
+        return np.asarray((np.arange(n) - (n - 1) / 2) / max((n - 1) / 2, 1.0))
+
+    @cached_property
+    def power(self) -> Float:
+        """Sum of squares without gaps and with a known baseline, shape (n_phase,)."""
+        return np.asarray(np.sum(self.shapes**2, axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Bank:
+    """Template bank of a search.
+
+    Attributes
+    ----------
+    half_widths_s : tuple of float
+        Ascending.
+    directions : ndarray, shape (n_temperature, n_sum)
+        Unit vectors of the change of a frame's sums for each temperature: rows of `Templates.directions`, or one row of
+        ones for a single light curve.
+    shape : Shape
+    frame_s : float
+    baseline : Baseline
+    """
+
+    half_widths_s: tuple[float, ...]
+    directions: Float
+    shape: Shape
+    frame_s: float
+    baseline: Baseline = Baseline()
+
+    def __post_init__(self) -> None:
+        widths = self.half_widths_s
+        if not widths or any(not (np.isfinite(w) and w > 0) for w in widths) or sorted(set(widths)) != list(widths):
+            raise InputError.of("half_widths_s", list(widths), "ascending times above 0")
+        if not (np.isfinite(self.frame_s) and self.frame_s > 0):
+            raise InputError.of("frame_s", self.frame_s, "a time above 0")
+        kept = np.atleast_2d(np.array(self.directions, np.float64))
+        length = np.linalg.norm(kept, axis=1, keepdims=True)
+        if not (length > 0).all():
+            raise InputError("a direction of the bank is zero", "flares that change a sum of a frame", key="directions")
+        kept = kept / length
+        kept.setflags(write=False)
+        object.__setattr__(self, "directions", kept)
+
+    @cached_property
+    def templates(self) -> tuple[Template, ...]:
+        """Templates of all half-widths."""
+        return tuple(self.template(w) for w in self.half_widths_s)
+
+    def template(self, half_width_s: float, phases: Sequence[float] | None = None) -> Template:
+        """Compute the template of a half-width.
+
+        Parameters
+        ----------
+        phases : sequence of float, optional
+            Positions of peaks within their frames; by default one or two, depending on the half-width.
+        """
+        frames = half_width_s / self.frame_s
+        if phases is None:
+            phases = (0.25, 0.75) if frames < SUB_FRAME else (0.5,)
+        lead, tail = self.window(half_width_s)
+        edges = np.arange(-lead, tail + 2) * self.frame_s
+        shapes = np.array([self.shape.mean_over(edges, p * self.frame_s, half_width_s) for p in phases])
+        return Template(half_width_s, -lead, tuple(phases), shapes, max(1, int(frames / ONSETS)))
+
+    def window(self, half_width_s: float) -> tuple[int, int]:
+        """Return the number of frames of the window before and after the peak."""
+        half = self.baseline.window_s / 2
+        lead, tail = (max(reach * half_width_s, half) / self.frame_s for reach in (LEAD, TAIL))
+        return int(np.ceil(lead)), int(np.ceil(tail))
+
+
+@lru_cache(maxsize=8)
+def white_bank(half_widths_s: tuple[float, ...], shape: Shape, frame_s: float, baseline: Baseline = Baseline()) -> Bank:
+    """Return the bank of a single light curve with white noise; the same one for the same arguments."""
+    return Bank(half_widths_s, np.ones((1, 1)), shape, frame_s, baseline)
+
+
+#: Default temperatures of templates, K, in steps of a factor of 1.034.
+TEMPERATURES_K = tuple(float(t) for t in np.geomspace(6_000.0, 30_000.0, 49).round(-1))
+#: Angle between neighbouring directions of a bank in the space of whitened sums. A flare halfway between them loses
+#: 1 - cos(ANGLE / 2) = 0.3 % of its S/N.
+ANGLE = 0.15
+#: Smallest singular value relative to the largest; smaller ones are rounding errors.
+MIN_SINGULAR = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Templates:
+    """Weights of a frame's sums, and the effect of flares on these sums.
+
+    Attributes
+    ----------
+    temperatures_k : tuple of float
+        Flare temperatures, ascending.
+    weights : ndarray, shape (n_sum, n_pixel)
+        Weights per DN, for which sums of a quiescent frame have unit covariance, including nuisance parameters.
+    directions : ndarray, shape (n_temperature, n_sum)
+        Mean sums for a flare of unit amplitude.
+    best : ndarray, shape (n_temperature,)
+        S/N of that flare in one frame with its optimal weights: the norm of `directions` without loss.
+    noise : ndarray, shape (n_temperature, n_sum, n_sum)
+        Covariance that the photon noise of a flare of unit amplitude adds to the sums.
+    """
+
+    temperatures_k: tuple[float, ...]
+    weights: Float
+    directions: Float
+    best: Float
+    noise: Float
+
+    @classmethod
+    def of(
+        cls,
+        quiet: Expectation,
+        flares_dn: Float,
+        temperatures_k: Sequence[float],
+        *,
+        nuisances: Nuisances | None = None,
+        rank: int = RANK,
+    ) -> Self:
+        """Compute weights from one frame of the quiescent star and flare spectra.
+
+        Parameters
+        ----------
+        quiet : Expectation
+            One frame.
+        flares_dn : ndarray, shape (n_temperature, n_pixel)
+            Mean DN per frame of flares of unit amplitude.
+        temperatures_k : sequence of float
+            Temperatures of these flares, ascending, in steps small enough for `chosen`.
+        nuisances : Nuisances, optional
+            Nuisance parameters that are independent in each frame, such as jitter.
+        rank : int
+            Largest number of sums.
+        """
+        used = ~quiet.saturated
+        if not used.any():
+            raise InputError.of("quiet", quiet.name, "a star that does not saturate every pixel")
+        variance = np.where(used, quiet.variance_dn2, 0.0)
+        return cls.of_spectra(
+            variance, flares_dn * used, quiet.gain_dn_per_electron, temperatures_k, nuisances=nuisances, rank=rank
+        )
+
+    @classmethod
+    def of_spectra(
+        cls,
+        variance: Float,
+        flares: Float,
+        photon_variance: Float,
+        temperatures_k: Sequence[float],
+        *,
+        nuisances: Nuisances | None = None,
+        rank: int = RANK,
+    ) -> Self:
+        """Compute weights from the noise of a quiescent frame and flare spectra, all in one unit.
+
+        Parameters
+        ----------
+        variance : ndarray, shape (n_pixel,)
+            Variance of a quiescent frame; zero in pixels that are not used.
+        flares : ndarray, shape (n_temperature, n_pixel)
+            Flares of unit amplitude; zero in pixels that are not used.
+        photon_variance : ndarray, shape (n_pixel,)
+            Rise of the variance with the flux.
+        temperatures_k, nuisances, rank
+            As for `of`.
+        """
+        used = variance > 0
+        plain = np.divide(flares, variance, out=np.zeros_like(flares), where=used)
+        optimal = plain
+        if nuisances:
+            rows = nuisances.rows(variance, nuisances.spectra * used)
+            optimal = plain - (flares @ rows.T) @ rows
+        gram = optimal @ flares.T
+        power = np.diag(gram)
+        if not (power > 1e-10 * np.einsum("tp,tp->t", plain, flares)).all():
+            names = join_names(nuisances.names) if nuisances else "nothing"
+            raise InputError(
+                f"a flare cannot be distinguished from {names} in one frame",
+                "fewer nuisance parameters",
+                key="nuisances",
+                value=names,
+            )
+        length = np.sqrt(power)
+        values, vectors = np.linalg.eigh(gram / np.outer(length, length))
+        kept = [k for k in range(len(values))[::-1][:rank] if values[k] > MIN_SINGULAR**2 * values[-1]]
+        weights = (vectors[:, kept] / length[:, None] / np.sqrt(values[kept])).T @ optimal
+        # Signs are arbitrary; choose them so that the hottest flare increases each sum.
+        weights *= np.where(weights @ flares[-1] < 0, -1.0, 1.0)[:, None]
+        photons = flares * photon_variance
+        noise = np.einsum("kp,lp,tp->tkl", weights, weights, photons, optimize=True)
+        return cls(tuple(temperatures_k), weights, flares @ weights.T, length, noise)
+
+    def mixed(self, matrix: Float) -> Self:
+        """Return the templates of linear combinations of the sums, with `matrix` of shape (n_sum, n_sum)."""
+        return replace(
+            self,
+            weights=matrix @ self.weights,
+            directions=self.directions @ matrix.T,
+            noise=np.einsum("kl,tlm,nm->tkn", matrix, self.noise, matrix),
+        )
+
+    @cached_property
+    def chosen(self) -> tuple[int, ...]:
+        """Rows of `directions` for a bank, spaced by at most about `ANGLE`."""
+        unit = self.directions / np.linalg.norm(self.directions, axis=1, keepdims=True)
+        steps = np.arccos(np.clip(np.sum(unit[1:] * unit[:-1], axis=1), -1.0, 1.0))
+        along = np.concatenate([[0.0], np.cumsum(steps)])
+        # The outermost directions may be half a step from the ends.
+        n = max(1, int(np.ceil(along[-1] / ANGLE)))
+        wanted = (np.arange(n) + 0.5) / n * along[-1]
+        return tuple(dict.fromkeys(int(np.argmin(np.abs(along - w))) for w in wanted))
+
+    @property
+    def coloured(self) -> bool:
+        """True if the sums of a flare depend on its temperature by more than a factor."""
+        return len(self.temperatures_k) > 1 and self.directions.shape[1] > 1
+
+    @cached_property
+    def mean_sums(self) -> MeanSums:
+        """Mean sums of a flare of unit amplitude over log temperature."""
+        log_k, values = np.log(self.temperatures_k), self.directions
+        if log_k.size == 1:
+            # The same at any temperature.
+            log_k, values = log_k + np.array([-1.0, 1.0]), np.tile(values, (2, 1))
+        return MeanSums(values, np.zeros((0, values.shape[1])), log_k)
+
+    @property
+    def loss(self) -> Float:
+        """Share of the S/N that is lost by reducing frames to sums, shape (n_temperature,)."""
+        return np.asarray(1.0 - np.linalg.norm(self.directions, axis=1) / self.best)
+
+    def noise_of(self, kelvin: float) -> Float:
+        """Return the covariance added by the photon noise of a flare of the nearest temperature, (n_sum, n_sum)."""
+        return np.asarray(self.noise[int(np.argmin(np.abs(np.log(np.array(self.temperatures_k) / kelvin))))])
+
+    def of_flares(self, flares_dn: Float) -> Float:
+        """Return the mean sums, (n, n_sum), for flare spectra in DN, (n, n_pixel)."""
+        return np.asarray(flares_dn @ self.weights.T)
+
+
+def frame_nuisances(
+    quiet: Expectation, stare: Stare, more: Mapping[str, float] | Nuisances | None = None
+) -> Nuisances | None:
+    """Return the nuisance parameters of each frame: the stare's jitters, and additional ones.
+
+    Parameters
+    ----------
+    quiet : Expectation
+        One frame.
+    more : mapping of str to float, or Nuisances, optional
+        Standard deviations by name, which replace jitters of the same kind; an infinite one is projected out.
+    """
+    names = {"light": "light", "sky": "sky", "temperature": "dark"}
+    jitters = {names[of]: sd for of, sd in stare.jitters.items() if sd > 0}
+    # Drifts and re-acquisitions change all light alike, by any amount and at any time.
+    drifting = {} if stare.pointing is None else {"light": np.inf}
+    jitters |= drifting
+    if isinstance(more, Nuisances):
+        mine = Nuisances.of(quiet, {name: sd for name, sd in jitters.items() if name not in more.names})
+        return replace(
+            more,
+            names=(*more.names, *mine.names),
+            spectra=np.vstack([more.spectra, mine.spectra]),
+            sd=np.concatenate([more.sd, mine.sd]),
+        )
+    spreads = jitters | dict(more or {}) | drifting
+    return Nuisances.of(quiet, spreads) if spreads else None

@@ -1,1 +1,0 @@
-"""Detection statistics and their distributions for Gaussian noise."""
