@@ -274,7 +274,23 @@ def _further(window: Window, shape: Profile, flares: list[FittedFlare]) -> list[
         if fall < FURTHER_GAIN:
             break
         flares = sorted(refined, key=lambda one: -one.equivalent_duration_s)
-    return flares
+    return _necessary(window, shape, flares) if len(flares) > 2 else flares
+
+
+def _necessary(window: Window, shape: Profile, flares: list[FittedFlare]) -> list[FittedFlare]:
+    """Leave out flares that would not be added to the others: they stood for flares that were not found yet."""
+    while len(flares) > 1:
+        light, left = light_of(window, shape, flares), []
+        for without in flares:
+            fewer = [one for one in flares if one is not without]
+            fewer = _refined(Likelihood.of(window, fewer, shape, FURTHER_EPSILON), shape, fewer)
+            likelihood = Likelihood.of(window, fewer, shape, FURTHER_EPSILON)
+            left.append((float(likelihood.chi2(light_of(window, shape, fewer)) - likelihood.chi2(light)), fewer))
+        fall, fewer = min(left, key=lambda pair: pair[0])
+        if fall >= FURTHER_GAIN:
+            break
+        flares = fewer
+    return sorted(flares, key=lambda one: -one.equivalent_duration_s)
 
 
 def light_of(window: Window, shape: Profile, flares: Sequence[FittedFlare]) -> Float:
@@ -321,7 +337,8 @@ def _refined(likelihood: Likelihood, shape: Profile, flares: Sequence[FittedFlar
     low[0::3], high[0::3] = start[0::3] - 8.0, start[0::3] + 8.0
     reach = max(f.half_width_s for f in flares)
     low[1::3], high[1::3] = span[0, 0] - 4 * reach, span[-1, 1]
-    low[2::3], high[2::3] = start[2::3] - 3.0, start[2::3] + 3.0
+    # A flare that is much longer than its event is no more than a level.
+    low[2::3], high[2::3] = start[2::3] - 3.0, np.minimum(start[2::3] + 3.0, max(_ranges(window)[1, 1], np.log(reach)))
 
     def residual(x: Float) -> Float:
         return np.asarray(root @ (window.values - _lights(window, shape, x).sum(axis=0)))
