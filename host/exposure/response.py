@@ -1,7 +1,5 @@
 """Response matrix of an instrument, from the flux of a spectrum to electrons per second and pixel, and its noise.
 
-Response matrix of an instrument, from the flux at the nodes of a spectrum to electrons per second and pixel.
-
 The flux is piecewise linear between its nodes. With P_p(l) the fraction of light of wavelength l that falls on pixel p
 (the line spread function integrated over the pixel, in closed form), a pixel's rate is the integral of flux * P_p times
 efficiency and area. The integral runs over panels in which every P_p is smooth. In a panel, P_p is its interpolating

@@ -1,9 +1,7 @@
 """Stars by name: the embedded library, the user's own stars, formulas, spectral types and well-known stars.
 
-The user's own stars, which supplement the embedded library.
-
-Each star is an ECSV file in the user's data folder, with its origin and the digest of its spectrum, which is verified
-at every reading.
+The user's own stars supplement the embedded library. Each is an ECSV file in the user's data folder, with its origin
+and the digest of its spectrum, which is verified at every reading.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Exact histograms and moments of statistics, independent of order and tiling.
 
-Sparse histogram of values outside the fine bins, with bins of equal relative width over all of float32.
-
-A bin is a range of the float's ordered integer representation (sign, exponent, leading bits of the mantissa), so no
-value lies beyond the last bin. Sums are exact integers, independent of order and tiling.
+Values outside the fine bins are counted in a sparse histogram with bins of equal relative width over all of float32. A
+bin is a range of the float's ordered integer representation (sign, exponent, leading bits of the mantissa), so no value
+lies beyond the last bin. Sums are exact integers, independent of order and tiling.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
 """Distributions of detection statistics for Gaussian noise, tail probabilities, and confidence intervals.
 
-Tail probabilities of weighted sums of squared normals to full precision, by a contour integral.
-
-The probability is the Bromwich integral of exp(K(s) - s x) / s with the cumulant generating function K. The contour
-passes through the saddle point, where the integrand is largest (Daniels 1954, doi 10.1214/aoms/1177728652), and bends
-around the branch cut in the direction of steepest descent, so that exp(-s x) decays even for a few terms (as in Talbot
-1979, doi 10.1093/imamat/23.1.97). The trapezoidal rule on this contour converges exponentially.
+Tail probabilities of weighted sums of squared normals are contour integrals, to full precision. The probability is the
+Bromwich integral of exp(K(s) - s x) / s with the cumulant generating function K. The contour passes through the saddle
+point, where the integrand is largest (Daniels 1954, doi 10.1214/aoms/1177728652), and bends around the branch cut in
+the direction of steepest descent, so that exp(-s x) decays even for a few terms (as in Talbot 1979, doi
+10.1093/imamat/23.1.97). The trapezoidal rule on this contour converges exponentially.
 """
 
 from __future__ import annotations

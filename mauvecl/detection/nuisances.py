@@ -1,7 +1,5 @@
 """Nuisance parameters: unknown amplitudes of known spectra, which statistics marginalise over.
 
-Nuisance parameters: unknown amplitudes of known spectra, which statistics marginalise over (METHODS section 7).
-
 The covariance of an exposure is C = V + U^T S U with the diagonal V of the noise, the nuisance spectra U and the
 variances S of their amplitudes. An amplitude of infinite variance is projected out.
 """

@@ -1,9 +1,8 @@
 """Requests to an engine as plain data: statistics by name, hypotheses, channels and shards.
 
-Requests to an engine as plain data, from which every worker computes the same result.
-
-A shard is a range of realisations of one part of a request. Its counts are integers, and its extreme values carry their
-realisations, so shards can be counted in any order, on any device, and more than once; `sums` adds them up.
+Every worker computes the same result from a request. A shard is a range of realisations of one part of a request. Its
+counts are integers, and its extreme values carry their realisations, so shards can be counted in any order, on any
+device, and more than once; `sums` adds them up.
 """
 
 from __future__ import annotations

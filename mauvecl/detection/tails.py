@@ -1,11 +1,10 @@
 """Rare false alarms: thresholds by importance sampling, and probabilities of campaigns of many tests.
 
-Thresholds of false-alarm probabilities too small to count, by importance sampling of the engine's noise model.
-
-The normals behind each pixel are drawn from a distribution under which an alarm is common, and each realisation counts
-with the ratio of the two densities (exponential tilting; Siegmund 1976, doi 10.1214/aos/1176343541). Everything after
-the normals (skew of the dark, rounding, clipping, the statistic itself) is the engine's. Drawn unknowns
-follow their priors in one half of the realisations, and their distribution in alarms in the other half.
+Probabilities too small to count follow from importance sampling of the engine's noise model. The normals behind each
+pixel are drawn from a distribution under which an alarm is common, and each realisation counts with the ratio of the
+two densities (exponential tilting; Siegmund 1976, doi 10.1214/aos/1176343541). Everything after the normals (skew of
+the dark, rounding, clipping, the statistic itself) is the engine's. Drawn unknowns follow their priors in one half of
+the realisations, and their distribution in alarms in the other half.
 """
 
 from __future__ import annotations

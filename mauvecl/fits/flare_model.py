@@ -1,21 +1,16 @@
 """Model of the light that a flare adds to a frame, and the weighted sums that are sufficient for its fits.
 
-Model of the light that a flare adds to a frame: its temperature, and amplitudes in which it is linear.
-
 A model is a blackbody, whose spectrum depends on one temperature, and components of fixed shape next to it: a Balmer
 continuum, and emission lines. Everything but the temperature is linear, so that a fit searches in one dimension.
 
-Unknown factor on all light of an exposure, which dims a flare as it dims the star.
+An unknown factor on all light of an exposure dims a flare as it dims the star. A fit of weighted sums finds the flare
+as it is recorded. Quantities of the flare itself are those of the recorded one over the factor, so that their profile
+intervals at a given temperature are those of a ratio of two normal estimates (Fieller 1954, doi
+10.1111/j.2517-6161.1954.tb00159.x).
 
-A fit of weighted sums finds the flare as it is recorded. Quantities of the flare itself are those of the recorded one
-over the factor, so that their profile intervals at a given temperature are those of a ratio of two normal estimates
-(Fieller 1954, doi 10.1111/j.2517-6161.1954.tb00159.x).
-
-Reduction of frames to a few weighted sums that are sufficient for fits of flares.
-
-The whitened spectra of flares of all temperatures span about seven directions to one part in 10^9. A fit needs only the
-sums along these directions, and chi-squared of the residual. The weights marginalise over unknown amplitudes of known
-spectra (generalised least squares).
+Fits need a few weighted sums of a frame only. The whitened spectra of flares of all temperatures span about seven
+directions to one part in 10^9. A fit needs only the sums along these directions, and chi-squared of the residual. The
+weights marginalise over unknown amplitudes of known spectra (generalised least squares).
 """
 
 from __future__ import annotations

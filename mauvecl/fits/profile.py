@@ -1,19 +1,16 @@
 """Fits of weighted sums by profile likelihoods, with amplitudes of any sign or of at least zero.
 
-Fits of weighted sums: the best temperature and amplitudes, and intervals by profile likelihood.
-
 At a given temperature everything else is linear, so that the minimum of chi-squared over the amplitudes is a closed
 form, and a function of one variable remains. It gives the profile likelihood of a quantity that is linear in the
 amplitudes: if chi-squared may rise by c, of which the temperature alone takes delta, the quantity may lie within
 sqrt(c - delta) standard deviations of its best value at that temperature. The interval is the hull over temperatures.
-With an unknown factor on all light, the quantity is a ratio at that temperature; see `light_factor`.
+With an unknown factor on all light, the quantity is a ratio at that temperature; see `flare_model`.
 
-Fits with amplitudes of at least zero, for flares near that boundary.
-
-The light of a blackbody, a Balmer continuum or a line is never negative. At a given temperature, the best fit with
-non-negative amplitudes is the unbounded fit of a face of the orthant, a subset of the components. The same holds for
-the ends of a profile interval, because the likelihood is convex. All faces are tried, and those with a negative
-amplitude are rejected. Only the blackbody depends on the temperature, so each face has constant matrices.
+Near the boundary of flares without light, amplitudes are at least zero. The light of a blackbody, a Balmer continuum or
+a line is never negative. At a given temperature, the best fit with non-negative amplitudes is the unbounded fit of a
+face of the orthant, a subset of the components. The same holds for the ends of a profile interval, because the
+likelihood is convex. All faces are tried, and those with a negative amplitude are rejected. Only the blackbody depends
+on the temperature, so each face has constant matrices.
 """
 
 from __future__ import annotations

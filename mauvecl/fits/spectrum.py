@@ -1,9 +1,8 @@
 """Fits of flares with one or two temperatures to observed frames, and forecasts of their errors.
 
-Fits of flares with two free temperatures.
-
-At each second temperature, one of the model's, the flare is one blackbody with another component of fixed shape, so
-that the rest is a fit of `results.measurements.nonnegative`. The second temperature is the higher one.
+Two temperatures may be free. At each second temperature, one of the model's, the flare is one blackbody with another
+component of fixed shape, so that the rest is a fit with amplitudes of at least zero. The second temperature is the
+higher one.
 """
 
 from __future__ import annotations

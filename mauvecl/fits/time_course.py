@@ -1,11 +1,10 @@
 """Fits of flares along a stare: in bins of frames, and with a temperature that falls.
 
-Joint fit of a flare's shape and spectrum along a stare, with a temperature that falls.
-
-Frames are reduced to weighted sums that are sufficient for spectra of all temperatures (`results.measurements`). The
-model of their means is one `Event` with `Cooling`. Their covariances depend on the fitted flare, so that each fit is
-repeated with the covariances of the previous one. Unknown levels that are constant over the stare, and the unknown
-changes and jitters of the stare, are marginalised over. Those of all light change that of the flare as well.
+A joint fit finds a flare's shape and spectrum, with a temperature that falls. Frames are reduced to weighted sums that
+are sufficient for spectra of all temperatures (`flare_model`). The model of their means is one `Event` with `Cooling`.
+Their covariances depend on the fitted flare, so that each fit is repeated with the covariances of the previous one.
+Unknown levels that are constant over the stare, and the unknown changes and jitters of the stare, are marginalised
+over. Those of all light change that of the flare as well.
 """
 
 from __future__ import annotations

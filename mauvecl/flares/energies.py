@@ -1,7 +1,5 @@
 """Energies of flares: their relation to amplitudes and durations, cooling flares, and rates of stars.
 
-Conversions between the energy, equivalent duration, amplitude and half-width of flares.
-
 Amplitude and equivalent duration count photons, as a detector does; energies weight them with their energy. Both
 describe the same light, the flare's excess over the quiescent star:
 
@@ -15,10 +13,8 @@ describe the same light, the flare's excess over the quiescent star:
 `EnergyScale.shibayama2013` gives those of a flat patch seen face-on, and many catalogues call `quiescent_luminosity`
 times the equivalent duration the energy in a band.
 
-Flare rates of stars: cumulative distributions of energy, published or given by the user.
-
-The convention is that of AltaiPony: dN/dE = beta E^-alpha, so that beta / (alpha - 1) E^(1 - alpha) flares per day have
-at least the energy E.
+Rates of stars are cumulative distributions of energy, published or given by the user. The convention is that of
+AltaiPony: dN/dE = beta E^-alpha, so that beta / (alpha - 1) E^(1 - alpha) flares per day have at least the energy E.
 """
 
 from __future__ import annotations

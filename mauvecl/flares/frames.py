@@ -1,11 +1,9 @@
 """Frames of a stare as sums of components, their light curves and spectra.
 
-Components of the frames of a stare: a few spectra, so that no frame needs its own expectation.
-
-Counts are sums of independent components: the star, the sky, the dark current, neighbours of the star, and flares of
-several temperatures. The spectrum of a component is the same in all frames, and only its strength, its coefficient,
-changes. The mean and all higher cumulants of a pixel, and of a weighted sum of pixels, are therefore linear in the
-coefficients of a frame.
+No frame needs its own expectation. Counts are sums of independent components: the star, the sky, the dark current,
+neighbours of the star, and flares of several temperatures. The spectrum of a component is the same in all frames, and
+only its strength, its coefficient, changes. The mean and all higher cumulants of a pixel, and of a weighted sum of
+pixels, are therefore linear in the coefficients of a frame.
 """
 
 from __future__ import annotations

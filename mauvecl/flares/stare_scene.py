@@ -1,10 +1,9 @@
 """Stares as arrays that kernels read, requests for them, and the cumulants of their sums.
 
-Joint cumulants of weighted sums of a frame, from which the sums are drawn without drawing pixels.
-
-The cumulants of independent counts add up, so those of the sums are exact. A frame is drawn as the Cholesky factor of
-the sums times normals. A quadratic function of all normals is added to each, which reproduces the third cumulants, and
-if needed a cubic function (Cornish & Fisher 1938, doi 10.2307/1400905, in several dimensions).
+Weighted sums of a frame are drawn from their joint cumulants, without drawing pixels. The cumulants of independent
+counts add up, so those of the sums are exact. A frame is drawn as the Cholesky factor of the sums times normals. A
+quadratic function of all normals is added to each, which reproduces the third cumulants, and if needed a cubic function
+(Cornish & Fisher 1938, doi 10.2307/1400905, in several dimensions).
 """
 
 from __future__ import annotations

@@ -1,7 +1,5 @@
 """Disturbances of frames: priors of unknown values, cosmic rays, drifts out of the fibre, and additive charge.
 
-Prior distributions of unknown values.
-
 Studies contain priors, so this module imports NumPy only when a quantile is computed, to keep start-up fast.
 """
 

@@ -1,10 +1,9 @@
 """Drawing of realisations: the user's options, cumulants of the noise, and tables of drawn factors.
 
-Cumulants of the noise of one draw, and its expansion as a polynomial of one normal deviate.
-
-Gaussian and Poisson noise of a pixel reach the ADC as a sum, whose cumulants are the sums of theirs. The Cornish-Fisher
-expansion (1938, doi 10.2307/1400905; Abramowitz & Stegun 26.2.49) turns a normal deviate into a draw with these
-cumulants. If Gaussian noise smooths the Poisson steps, no realistic number of draws reveals the difference.
+The noise of one draw is a polynomial of one normal deviate. Gaussian and Poisson noise of a pixel reach the ADC as a
+sum, whose cumulants are the sums of theirs. The Cornish-Fisher expansion (1938, doi 10.2307/1400905; Abramowitz &
+Stegun 26.2.49) turns a normal deviate into a draw with these cumulants. If Gaussian noise smooths the Poisson steps, no
+realistic number of draws reveals the difference.
 """
 
 from __future__ import annotations

@@ -1,7 +1,5 @@
 """Structs, stream numbers, polynomials, tables and histogram grids shared by Python and OpenCL.
 
-Structs, stream numbers, polynomials and histogram grids shared by Python and OpenCL.
-
 They are rendered into the kernels as C; a test compares every offset on the device.
 """
 

@@ -1,7 +1,5 @@
 """Slow NumPy reference of the kernels' draws, and the components of a draw.
 
-Slow NumPy reference implementation of the kernels' draws.
-
 Counters, arithmetic and the order of sums are those of the kernels. Integers equal the device's, and so do floats on
 devices with strict arithmetic, because each fused multiply-add is rounded once. Tests and the self-test use it.
 """

@@ -172,7 +172,7 @@ def _by_name(*rows: Row) -> dict[str, Row]:
 #: Additive processes: fields of `processes.Processes`, keys of studies' ``processes``.
 ADDITIVE: dict[str, type[AdditiveProcess]] = {"cosmic_rays": CosmicRays}
 #: Processes of all light during a stare, which are drawn and marginalised: keys of studies' ``stare``, fields of
-#: `lightcurve.stares.stare.Stare`.
+#: `mauvecl.flares.stare.Stare`.
 STARE_PROCESSES: dict[str, type[PointingDrifts]] = {"pointing": PointingDrifts}
 
 #: Processes in the order of their tables in kernels: fields of `processes.Processes`, keys of studies' ``processes``.

@@ -1,16 +1,12 @@
 """Rates of false alarms of a search: counted, in closed form, and by importance sampling.
 
-Rate of false alarms, counted in simulated stares, and the conventional rule of consecutive points.
+*Counted rates.* Rates are false alarms per star-day, 86 400 s of frames (gaps do not count). Alarms occur in clusters,
+of which a search reports the largest value, so that the probability of no alarm in t star-days is exp(-rate t).
+Importance sampling covers rates that are too small to count.
 
-Rates are false alarms per star-day, 86 400 s of frames (gaps do not count). Alarms occur in clusters, of which a search
-reports the largest value, so that the probability of no alarm in t star-days is exp(-rate t). `importance_sampling`
-covers rates that are too small to count.
-
-Closed-form false-alarm rate of a template bank in white noise.
-
-The templates of a bank form a grid over onset, half-width and temperature. An alarm is a local maximum of the statistic
-on that grid, so the rate of local maxima above a threshold bounds the rate of alarms from above and approaches it for
-high thresholds (Taylor, Worsley & Gosselin 2007, doi 10.1093/biomet/asm004):
+*Closed form in white noise.* The templates of a bank form a grid over onset, half-width and temperature. An alarm is a
+local maximum of the statistic on that grid, so the rate of local maxima above a threshold bounds the rate of alarms
+from above and approaches it for high thresholds (Taylor, Worsley & Gosselin 2007, doi 10.1093/biomet/asm004):
 
     rate(u) = sum over templates of  integral_u^inf phi(z) * prod over axes of P(both neighbours < z | z) dz
 
@@ -19,11 +15,9 @@ follows from Owen's T function (Owen 1956, doi 10.1214/aoms/1177728074). Neighbo
 onset of maximum correlation, which makes them independent of neighbours in onset to first order; neighbours in
 temperature are independent of both.
 
-Importance sampling of the false-alarm rate in normal noise, for alarms too rare to count.
-
-The method gives an unbiased estimate of P(max > u) for M correlated normal values rho_j at any u. One of them, i, is
-chosen with a probability proportional to w_i, and the noise is drawn except for rho_i, so that every value is
-r_j + c_ij z with z = rho_i. Then, for any function G that is not zero above u,
+*Importance sampling in normal noise.* The method gives an unbiased estimate of P(max > u) for M correlated normal
+values rho_j at any u. One of them, i, is chosen with a probability proportional to w_i, and the noise is drawn except
+for rho_i, so that every value is r_j + c_ij z with z = rho_i. Then, for any function G that is not zero above u,
 
     P = sum(w) E[integral phi(z) G(z) 1(max_j rho_j > u) / sum_j w_j G(rho_j) dz].
 
@@ -33,16 +27,13 @@ u vary in size. Here G(z) = exp(u z) from slightly below u: the sum over a clust
 integral over z is computed by quadrature, so that the estimate hardly depends on how far the maximum exceeds u. The
 weights w are the probabilities that a template is a local maximum, so that all clusters contribute equally.
 
-Effect of unknown light, sky and temperature on the false alarms of a search.
+*Unknown light, sky and temperature.* If the star is brighter or the detector warmer than assumed, the scatter of a
+template's value increases by a factor r, and it exceeds u as often as u / r is exceeded otherwise. If the baseline has
+trends that the search neither subtracts nor marginalises over, values are shifted, and exceed u as often as u less the
+shift is exceeded otherwise.
 
-If the star is brighter or the detector warmer than assumed, the scatter of a template's value increases by a factor r,
-and it exceeds u as often as u / r is exceeded otherwise. If the baseline has trends that the search neither subtracts
-nor marginalises over, values are shifted, and exceed u as often as u less the shift is exceeded otherwise.
-
-False-alarm rate of a survey by importance sampling, with the unknowns of its stare.
-
-A search weights frames by their known variance and marginalises over known curves. The unknowns of a stare are drawn
-from a widened distribution and weighted accordingly.
+*Rate of a survey.* A search weights frames by their known variance and marginalises over known curves. The unknowns of
+a stare are drawn from a widened distribution and weighted accordingly.
 """
 
 from __future__ import annotations

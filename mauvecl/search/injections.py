@@ -1,12 +1,8 @@
 """Injection of flares into simulated frames, their sites, and the accuracy of fits to them.
 
-Accuracy of fits to detected injections.
-
-Each injected flare is fitted alone (`flare_fit`), with standard errors from the curvature. Flares that `stare` detects
+Each injected flare is fitted alone, with standard errors from the curvature. Flares that `stare` detects
 are fitted together and have intervals from the profile likelihood (`alarms`), which have better coverage near the
 threshold.
-
-Injection of flares into simulated frames, and the smallest detected amplitude of each.
 
 The statistic of a template is a + A b + sqrt(A) c for a flare of amplitude A: a follows from simulated frames without
 the flare, b from its mean, and c from its photon noise. The flare is detected for all A above the root, so that one

@@ -1,7 +1,5 @@
 """Search of stares for flares with matched filters, exact over gaps, and the survey of a star.
 
-Search of stares for flares with a bank of matched filters, exact over gaps.
-
 For sums y of a frame with unit covariance, a template s in time and c in the sums, and a baseline G a with unknown
 amplitudes a in the window, the statistic is that of generalised least squares,
 
@@ -11,14 +9,12 @@ with m the inverse variance of a frame, zero in gaps. Without a flare it is norm
 mean is the S/N. All sums over time are correlations, computed by FFT. (Matched filters: Turin 1960, doi
 10.1109/TIT.1960.1057571.)
 
-Non-linear trends in the sums of a stare, fitted to the sums and subtracted.
-
-A search marginalises over the baseline of a window to first order: offset, slope and cycles. But dark current is
-exponential in temperature, so that a temperature drift is curved, and drifts of light and star multiply. This part
-follows from the amplitudes of the unknowns, which are well measured if they matter: over a whole stare, each changes
-the sums by many standard deviations. The amplitudes are fitted, and their effect beyond first order is subtracted. An
-error of one standard deviation in the baseline then leaves a few per cent of it, the relative change of the dark
-current.
+Non-linear trends are fitted to the sums of a stare and subtracted. A search marginalises over the baseline of a window
+to first order: offset, slope and cycles. But dark current is exponential in temperature, so that a temperature drift is
+curved, and drifts of light and star multiply. This part follows from the amplitudes of the unknowns, which are well
+measured if they matter: over a whole stare, each changes the sums by many standard deviations. The amplitudes are
+fitted, and their effect beyond first order is subtracted. An error of one standard deviation in the baseline then
+leaves a few per cent of it, the relative change of the dark current.
 
 The fit uses the Gauss-Newton method on means over half a minute, with the distribution of the unknowns as prior. Means
 with flares have less weight (Huber 1964, doi 10.1214/aoms/1177703732), so that flares hardly affect the fit.

@@ -1,10 +1,8 @@
 """Templates of a search for flares: their bank, weights in wavelength, and study sections.
 
-Spectral weights that reduce a frame to a few sums for flares of any temperature.
-
-The optimal weights for a flare with spectrum d are C^-1 d, where C is the covariance of a frame including nuisance
-parameters (METHODS section 7). Spectra of flares of 6000-30 000 K are similar, so that two or three singular vectors of
-the whitened spectra suffice as a basis.
+Weights reduce a frame to a few sums for flares of any temperature. The optimal weights for a flare with spectrum d are
+C^-1 d, where C is the covariance of a frame including nuisance parameters (METHODS section 7). Spectra of flares of
+6000-30 000 K are similar, so that two or three singular vectors of the whitened spectra suffice as a basis.
 """
 
 from __future__ import annotations
