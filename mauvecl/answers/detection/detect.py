@@ -16,10 +16,10 @@ from mauvecl.answers.detection.chance_with_unknowns import chance_with_unknowns
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
 from mauvecl.answers.neighbour_list import share_columns
 from mauvecl.answers.progress import reported
-from mauvecl.detection import detection as departures
 from mauvecl.detection.detection import (
     AREA_COLUMNS,
     COLUMNS,
+    DEPARTURE_COLUMNS,
     PAPER_G2V,
     ROC_COLUMNS,
     ROC_ROWS,
@@ -131,7 +131,7 @@ class DetectAnswer(Answer):
             "Where the simulation differs from the closed form: false-alarm probability at the threshold that should "
             f"give {run.fap:g}"
         )
-        return [found, View(title, (*place_columns(self.study.sweep, "amplitude"), *departures.COLUMNS), differing)]
+        return [found, View(title, (*place_columns(self.study.sweep, "amplitude"), *DEPARTURE_COLUMNS), differing)]
 
     @property
     def roc(self) -> QTable:
