@@ -100,7 +100,7 @@ class DetectAnswer(Answer):
 
     @cached_property
     def departures(self) -> QTable:
-        """One row per star, cell and statistic, and per flare for shaped statistics; see `departures.Departure`.
+        """One row per star, cell and statistic, and per flare for shaped statistics; see `Departure`.
 
         The table is empty if thresholds are not counted.
         """
