@@ -69,7 +69,7 @@ from mauvecl import (
 from mauvecl.device.selftest import digests
 from mauvecl.flares.frames import Components
 from mauvecl.host.exposure.star import Neighbour, Neighbours
-from mauvecl.host.stars.library import names
+from mauvecl.host.stars.library import library_names
 from mauvecl.observations.changes.periods import recover_periods
 from mauvecl.observations.line_index import MG_II_CONTINUUM_NM, MG_II_NM, line_index
 
@@ -168,7 +168,7 @@ def sources(folder: Path) -> Answer:
 @golden()
 def library(folder: Path) -> Answer:
     """Return mean fluxes of every fifth star of the library."""
-    return {name: Source.from_library(name).binned(50.0).flux_flam for name in names()[::5]}
+    return {name: Source.from_library(name).binned(50.0).flux_flam for name in library_names()[::5]}
 
 
 @golden()

@@ -30,8 +30,7 @@ from mauvecl.host.orbit.geometry import (
     unit,
     utc_text,
 )
-from mauvecl.host.stars import library as well_known
-from mauvecl.host.stars.library import by_key, name_key, near_names
+from mauvecl.host.stars.library import by_key, name_key, near_names, well_known_text
 from mauvecl.host.tables.coordinates import EXPECTED
 from mauvecl.host.tables.ecsv import parse_ecsv
 from mauvecl.host.tables.missing import is_missing_position
@@ -435,7 +434,7 @@ class Target:
 
 @cache
 def _list() -> Table:
-    return parse_ecsv(well_known.text(), "the embedded list of stars")
+    return parse_ecsv(well_known_text(), "the embedded list of stars")
 
 
 def target_table() -> Table:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.exposure.sky import HelioEcliptic, zodiacal_brightness
-from mauvecl.host.orbit import geometry as constraints
+from mauvecl.host.orbit import geometry
 from mauvecl.host.orbit.geometry import Bodies, Flags, TimeGrid, Vectors, unit
 from mauvecl.host.orbit.observing_limits import Limits
 from mauvecl.host.orbit.orbit import Orbit, Track
@@ -283,32 +283,31 @@ class Visibility:
 
 def in_shadow(track: Track) -> Flags:
     """Return whether more than half of the Sun's disk is hidden, shape (n,)."""
-    return np.asarray(constraints.sunlight(track.position_km, track.bodies.sun, track.bodies.sun_km) < 0.5)
+    return np.asarray(geometry.sunlight(track.position_km, track.bodies.sun, track.bodies.sun_km) < 0.5)
 
 
 def _rules(track: Track, target: Vectors, limits: Limits) -> dict[str, Rule]:
     """Return the limits in force by name."""
     at, bodies, rules = track.position_km, track.bodies, dict[str, Rule]()
     if (earth := limits.earth_limb_deg) is not None:
-        rules["earth_limb"] = lambda part: constraints.clear_of_earth(at[part], target, earth)
+        rules["earth_limb"] = lambda part: geometry.clear_of_earth(at[part], target, earth)
     if (sun := limits.sun_deg) is not None:
-        rules["sun"] = lambda part: constraints.clear_of_sun(bodies.sun[part], target, sun)
+        rules["sun"] = lambda part: geometry.clear_of_sun(bodies.sun[part], target, sun)
     if (moon := limits.moon_deg) is not None:
-        rules["moon"] = lambda part: constraints.clear_of_moon(bodies.moon_km[part], at[part], target, moon)
+        rules["moon"] = lambda part: geometry.clear_of_moon(bodies.moon_km[part], at[part], target, moon)
     if (regard := limits.declination_deg) is not None:
-        inside = constraints.in_declinations(target, *regard)
+        inside = geometry.in_declinations(target, *regard)
         rules["declination"] = lambda part: inside[None, :]
     if (cone := limits.normal_cone_deg) is not None:
         rules["normal_cone"] = lambda part: (
-            constraints.in_cone(track.normal[part], target, cone)
-            | constraints.in_cone(-track.normal[part], target, cone)
+            geometry.in_cone(track.normal[part], target, cone) | geometry.in_cone(-track.normal[part], target, cone)
         )
     if limits.eclipse != "any":
         allowed = in_shadow(track) == (limits.eclipse == "only")
         rules["eclipse"] = lambda part: allowed[part, None]
     if limits.anomaly or limits.proton_flux is not None:
         if limits.anomaly:
-            outside = ~constraints.in_polygon(*track.subsatellite_deg, np.array(limits.anomaly))
+            outside = ~geometry.in_polygon(*track.subsatellite_deg, np.array(limits.anomaly))
         else:
             outside = proton_map().at(*track.subsatellite_deg) <= (limits.proton_flux or 0.0)
         rules["anomaly"] = lambda part: outside[part, None]

@@ -21,8 +21,7 @@ from mauvecl.host.files.parsing import parsing
 from mauvecl.host.files.size_limits import limit_bytes, read_bytes
 from mauvecl.host.spectra.coverage import check_covers
 from mauvecl.host.spectra.formats import without_columns
-from mauvecl.host.stars import library as catalogue
-from mauvecl.host.stars.library import OwnStar, find, folder, kept, spectrum_digest
+from mauvecl.host.stars.library import OwnStar, embedded, find, folder, kept, spectrum_digest
 from mauvecl.host.stars.source import Source
 from mauvecl.host.version import VERSION
 from mauvecl.schema.errors import InputError
@@ -69,7 +68,7 @@ def add(
     name = (name or source.name).strip()
     if not re.fullmatch(r"[\w][\w .+\-*'()]{0,63}", name):
         raise InputError.of("name", name, "up to 64 letters, digits, spaces and . + - * ' ( )")
-    if catalogue.embedded(name) is not None:
+    if embedded(name) is not None:
         raise InputError(
             f"star name {name!r} is one of the embedded library's",
             "another: give one with `name`",

@@ -209,15 +209,15 @@ class WellKnown:
         return f"{self.spectral_type}, {self.distance_pc:g} pc, V = {self.magnitude:g}; {self.source.partition(',')[0]}"
 
 
-def text() -> str:
+def well_known_text() -> str:
     """Return the list as ECSV."""
     return resources.files(__package__).joinpath("library", "well_known.ecsv").read_text(encoding="utf-8")
 
 
 @cache
-def stars() -> tuple[WellKnown, ...]:
+def well_known_stars() -> tuple[WellKnown, ...]:
     """Return the stars of the list."""
-    lines = [line for line in text().splitlines() if not line.startswith("#")]
+    lines = [line for line in well_known_text().splitlines() if not line.startswith("#")]
     return tuple(
         WellKnown(
             row["name"], tuple(name.strip() for name in row["other_names"].split(",")), float(row["ra"]),
@@ -230,7 +230,7 @@ def stars() -> tuple[WellKnown, ...]:
 @cache
 def by_key() -> Mapping[str, WellKnown]:
     """Return every star by each of its normalised names."""
-    return {name_key(name): star for star in stars() for name in (star.name, *star.others)}
+    return {name_key(name): star for star in well_known_stars() for name in (star.name, *star.others)}
 
 
 def name_key(name: str) -> str:
@@ -270,7 +270,7 @@ def entries() -> list[dict[str, str]]:
     return list(_index().values())
 
 
-def names() -> list[str]:
+def library_names() -> list[str]:
     """Return the distinct names of all embedded spectra: types, aliases and stars."""
     each = [entry[column] for entry in entries() for column in ("name", "alias", "star")]
     # A collection's name in front of a type says nothing that the type does not.
@@ -466,7 +466,7 @@ def spectrum_name(text: str, key: str = "star", *, own: bool = True) -> str:
 
 def all_names() -> list[str]:
     """Return the names of all embedded spectra and well-known stars, without designations, and of two formulas."""
-    return list(dict.fromkeys([*names(), *EXAMPLES, *(star.name for star in stars())]))
+    return list(dict.fromkeys([*library_names(), *EXAMPLES, *(star.name for star in well_known_stars())]))
 
 
 def near_names(text: str, *, stars_only: bool = False) -> list[str]:
@@ -479,7 +479,7 @@ def near_names(text: str, *, stars_only: bool = False) -> list[str]:
     """
     known = {key: star.name for key, star in by_key().items()}
     if not stars_only:
-        known |= {name_key(name): name for name in names()}
+        known |= {name_key(name): name for name in library_names()}
         known |= {name_key(star.name): star.name for star in kept()}
     near = difflib.get_close_matches(name_key(text), known, n=4, cutoff=0.5)
     return list(dict.fromkeys(known[one] for one in near)) or ["eps Eri", "AU Mic"] + ["G2V"] * (not stars_only)

@@ -27,11 +27,9 @@ from mauvecl.host.spectra.coverage import (
 from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.spectra.wavelength_range import SPAN_NM
 from mauvecl.host.stars import bands
-from mauvecl.host.stars import library as catalogue
-from mauvecl.host.stars import library as own_stars
 from mauvecl.host.stars.flare import Geometry, with_flare
 from mauvecl.host.stars.flare_spectra import Blackbody, FlareSpectrum
-from mauvecl.host.stars.library import ModelStar
+from mauvecl.host.stars.library import ModelStar, embedded, find, spectrum, spectrum_table
 from mauvecl.schema.calls import validated
 from mauvecl.schema.drawable import Drawable
 from mauvecl.schema.errors import InputError
@@ -122,7 +120,7 @@ class Source(Drawable, ContentEquality):
         """Return an embedded spectrum, one of the user's own stars, a blackbody or a power law, by name in any case.
 
         "blackbody 9000 K" is a blackbody, and "power law -2" a flux proportional to a power of the wavelength.
-        `catalogue.library_table` lists the names. For an unknown name the error suggests the nearest ones, and for a
+        `library_table` lists the names. For an unknown name the error suggests the nearest ones, and for a
         well-known star without a spectrum that of its type.
         """
         from mauvecl.host.stars.library import spectrum_name
@@ -134,16 +132,16 @@ class Source(Drawable, ContentEquality):
                 *model.spectrum(), model.name, model.origin,
                 unscaled="a formula has no absolute level", temperature_k=model.temperature_k,
             )  # fmt: skip
-        mine = own_stars.find(name) if catalogue.embedded(name) is None else None
+        mine = find(name) if embedded(name) is None else None
         if mine is not None:
-            wavelength, flux = own_stars.spectrum(mine)
+            wavelength, flux = spectrum(mine)
             return cls(
                 wavelength, flux, mine.name, mine.origin, mine.notes,
                 messages=mine.messages, measured_nm=mine.measured_nm, unscaled=mine.unscaled,
             )  # fmt: skip
-        entry = catalogue.embedded(name)
+        entry = embedded(name)
         assert entry is not None
-        table = catalogue.spectrum_table(entry["file"])
+        table = spectrum_table(entry["file"])
         noisy = entry["noisy_below_nm"]
         return cls(
             table["wavelength"],

@@ -344,7 +344,7 @@ class Roc(Drawable):
         return table_of(ROC_COLUMNS, [self.points(rows)], realisations=self.realisations, **area)
 
     def points(self, rows: int = ROC_ROWS) -> dict[str, Float]:
-        """Return at most `rows` points of the curve with their intervals, by the names of `COLUMNS`."""
+        """Return at most `rows` points of the curve with their intervals, by the names of `ROC_COLUMNS`."""
         n = self.realisations
         wanted = np.append(np.geomspace(1.0, 1.0 / n, max(rows - 1, 1)), 0.0)
         chosen = np.unique(np.minimum(np.searchsorted(-self.fap, -wanted), self.fap.size - 1))

@@ -349,7 +349,7 @@ class QuadraticForm:
         1973, doi 10.1093/biomet/60.2.415), whose terms are computed once for all values. Its aliasing error is the
         probability of a distance above 2 pi / spacing. The spacing makes this distance 40 standard deviations, for an
         error below 1e-15 with ten terms or more, and the sum ends when its terms are below 1e-15. Otherwise the
-        integral of `inversion` is used, which is accurate far in the tail.
+        contour integral is used, which is accurate far in the tail.
         """
         if value <= 0.0:
             return 1.0

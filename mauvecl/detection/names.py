@@ -1,4 +1,4 @@
-"""Names of statistics; `registry`, which defines them, takes longer to import."""
+"""Names of statistics; `requests`, which defines them, takes longer to import."""
 
 from __future__ import annotations
 

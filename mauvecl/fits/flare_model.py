@@ -237,7 +237,7 @@ class FlareModel:
 
     @cached_property
     def multiples(self) -> tuple[tuple[int, float], ...]:
-        """For each derived quantity, the first one that it is a constant multiple of, maybe itself, and the multiple.
+        """Number of the first derived quantity of which each is a constant multiple, and the multiple.
 
         A luminosity is a multiple of a flux, so that their intervals are computed once.
         """

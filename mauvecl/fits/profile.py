@@ -754,7 +754,7 @@ class BoundedProfile(Profile):
         return self.solution(self._climbed(x, np.flatnonzero(moving)))
 
     def _climbed(self, x: Float, moving: NDArray[np.intp]) -> Float:
-        """Return temperatures of which some, where gain rises beside them, are moved to the highest gain nearby."""
+        """Return temperatures, moved to the highest gain nearby if it is higher beside them."""
         if not moving.size:
             return x
         low, high = self.nodes[0], self.nodes[-1]

@@ -19,7 +19,7 @@ from mauvecl.schema.physical import Amplitude, Duration, Energy, Moment, Tempera
 
 Float = NDArray[np.float64]
 
-#: Largest number of flare spectra of a stare (`frame_components.MOST_FLARES`), and the smallest for flares that cool.
+#: Largest number of flare spectra of a stare (`frames.MOST_FLARES`), and the smallest for flares that cool.
 MOST_TEMPERATURES, LEAST_STEPS = 8, 3
 #: For a flare that cools: smallest number of steps per frame, half-width and cooling time, and largest per frame.
 PARTS, MOST_PARTS = 16, 512

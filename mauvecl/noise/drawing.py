@@ -341,7 +341,7 @@ def table_of(prior: Prior, change: Callable[[Float], Float]) -> tuple[NDArray[np
 class Factors:
     """Factors of priors on light, dark and sky; factors on light include the sky's light."""
 
-    #: Shape (n_modulation, 2 * layout.PRIOR_NODES); quantile tables; see `prior_tables.table_of`.
+    #: Shape (n_modulation, 2 * layout.PRIOR_NODES); quantile tables; see `table_of`.
     tables: NDArray[np.float32]
     #: Factors at the priors' medians, to which the tables are relative.
     light: float

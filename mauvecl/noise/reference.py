@@ -50,7 +50,7 @@ def words_at(
 
 
 def alias_draw(word: NDArray[np.uint32], table: NDArray[np.uint32], bits: int) -> NDArray[np.uint32]:
-    """Return the alias table's column for each word; see `poisson.AliasTable`."""
+    """Return the alias table's column for each word; see `layout.AliasTable`."""
     shift = np.uint32(layout.WORD_BITS - bits)
     column = word >> shift
     entry = table[column]

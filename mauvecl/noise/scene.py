@@ -69,7 +69,7 @@ class FactorDistribution:
 
     @property
     def normal(self) -> bool:
-        """Whether the factor is a linear function of a normal score."""
+        """True if the factor is a linear function of a normal score."""
         if self.values.size == 1:
             return True
         off = self.values - self.mean - self.sd * SCORE

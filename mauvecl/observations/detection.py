@@ -109,13 +109,13 @@ def fit_quiet_light(
     other, others = alternate(survey, others, None, steps)
     if float((others ^ taken).mean()) <= SETTLED:
         return fitted, taken
-    first = criterion(fitted, taken)
-    second = criterion(other, others, further=_light_of_events(fitted, taken))
+    light = light_of_events(fitted, taken)
+    first, second = criterion(fitted, light, taken), criterion(other, light_of_events(other, others), others, light)
     return (other, others) if second < first else (fitted, taken)
 
 
 @dataclass(frozen=True, eq=False)
-class _EventLight:
+class EventLight:
     """Light of the flares that fit an event."""
 
     event: Detection
@@ -125,7 +125,7 @@ class _EventLight:
     n_flares: int
 
 
-def _light_of_events(survey: SeriesSurvey, taken: Bool) -> list[_EventLight]:
+def light_of_events(survey: SeriesSurvey, taken: Bool) -> list[EventLight]:
     """Return the light of the events above `PROVISIONAL`."""
     fits = []
     for event in detect_events(survey, PROVISIONAL)[0]:
@@ -135,85 +135,102 @@ def _light_of_events(survey: SeriesSurvey, taken: Bool) -> list[_EventLight]:
         total = np.zeros(stop - first)
         for rows, flux in lights:
             total[rows.start - first : rows.stop - first] += flux
-        fits.append(_EventLight(event, slice(first, stop), scale * total, photon * total, len(flares)))
+        fits.append(EventLight(event, slice(first, stop), scale * total, photon * total, len(flares)))
     return fits
 
 
-def criterion(survey: SeriesSurvey, taken: Bool, shapeless: bool = False, further: Sequence[_EventLight] = ()) -> float:
-    """Return the Bayesian information criterion of a process and the flares of the events above `PROVISIONAL`.
+def criterion(
+    survey: SeriesSurvey,
+    fits: Sequence[EventLight],
+    taken: Bool,
+    further: Sequence[EventLight] = (),
+    *,
+    shapeless: bool = False,
+) -> float:
+    """Return the Bayesian information criterion of a process and of flares.
 
     A process of minutes that is hardly seen to repeat costs `SEEN_ONCE`: stars and instruments repeat what they do.
-    In independent noise, or if `shapeless`, the light of an event may have any smooth shape, or depart from that of its
-    flares, or of `further` ones, by a process.
+
+    Parameters
+    ----------
+    survey : SeriesSurvey
+        With processes.
+    fits : sequence of EventLight
+        Of `light_of_events`.
+    taken : ndarray of bool, shape (n_frame,)
+        Frames of events.
+    further : sequence of EventLight, optional
+        Other flares, from which the light of an event may depart.
+    shapeless : bool
+        If True, or in independent noise, the light of an event may have any smooth shape, or depart from that of its
+        flares by a process.
     """
-    start, frame_s, size = survey.stare.start_s, survey.stare.frame_s, float(np.log(survey.stare.n_frames))
-    fits = _light_of_events(survey, taken)
-
-    def cost(epsilon: float, fits: list[_EventLight], kept: Bool) -> float:
-        """Return the criterion of some frames, with flares that depart by a share from their shape."""
-        light, extra = np.zeros_like(survey.sums), np.zeros(start.size)
-        for fit in fits:
-            light[fit.rows] += fit.light[:, None] * survey.bank.directions[fit.event.direction]
-            extra[fit.rows] += fit.photon + (epsilon * fit.light) ** 2
-        total = PARAMETERS * size * sum(fit.n_flares for fit in fits)
-        for process, column in zip(survey.processes, (survey.sums - light).T, strict=True):
-            noise = (survey.variance * process.excess**2 + extra)[kept]
-            if fits and not process.terms:
-                # Frames without events in the tail of a flare have more scatter than noise.
-                noise = (survey.variance + extra)[kept]
-                process = fit_process(Binned(start[kept], column[kept], noise, frame_s), process)
-                noise = noise * process.excess**2
-            covariance = process.covariance(start[kept], noise)
-            total += process.n_parameters * size - 2 * level_fit(covariance, column[kept]).log_likelihood
-        return total
-
-    every = np.ones(start.size, np.bool_)
-    total = min(cost(epsilon, fits, every) for epsilon in DEPARTURES)
+    size = float(np.log(survey.stare.n_frames))
+    every = np.ones(survey.stare.n_frames, np.bool_)
+    total = min(_criterion_of(survey, fits, every, epsilon) for epsilon in DEPARTURES)
     shapeless = shapeless or not any(process.terms for process in survey.processes)
     if fits and shapeless and survey.sums.shape[1] == 1:
         alone = sum(_criterion_alone(survey, fit.event, size, fits, further) for fit in fits)
-        total = min(total, cost(0.0, [], ~taken) + alone)
+        total = min(total, _criterion_of(survey, [], ~taken, 0.0) + alone)
     return total + (SEEN_ONCE if _seen_once(survey) else 0.0)
 
 
-def _criterion_alone(
-    survey: SeriesSurvey, event: Detection, size: float, *alternatives: Sequence[_EventLight]
-) -> float:
-    """Return the criterion of the frames of an event, whose light has a process of its own, for light curves.
+def _added(survey: SeriesSurvey, fits: Sequence[EventLight], epsilon: float) -> tuple[Float, Float]:
+    """Return the light of flares in the sums, (n_frame, n_sum), and the variance of flares that depart by a share."""
+    light, variance = np.zeros_like(survey.sums), np.zeros(survey.stare.n_frames)
+    for fit in fits:
+        light[fit.rows] += fit.light[:, None] * survey.bank.directions[fit.event.direction]
+        variance[fit.rows] += fit.photon + (epsilon * fit.light) ** 2
+    return light, variance
+
+
+def _criterion_of(survey: SeriesSurvey, fits: Sequence[EventLight], kept: Bool, epsilon: float) -> float:
+    """Return the criterion of some frames, with flares that depart by a share from their shape."""
+    start, size = survey.stare.start_s[kept], float(np.log(survey.stare.n_frames))
+    light, extra = _added(survey, fits, epsilon)
+    total = PARAMETERS * size * sum(fit.n_flares for fit in fits)
+    for process, column in zip(survey.processes, (survey.sums - light)[kept].T, strict=True):
+        noise = (survey.variance * process.excess**2 + extra)[kept]
+        if fits and not process.terms:
+            # Frames without events in the tail of a flare have more scatter than noise.
+            noise = (survey.variance + extra)[kept]
+            process = fit_process(Binned(start, column, noise, survey.stare.frame_s), process)
+            noise = noise * process.excess**2
+        total += _criterion_of_process(process, Binned(start, column, noise, survey.stare.frame_s), size)
+    return total
+
+
+def _criterion_alone(survey: SeriesSurvey, event: Detection, size: float, *alternatives: Sequence[EventLight]) -> float:
+    """Return the criterion of the frames of an event in a light curve, whose light has a process of its own.
 
     Parameters
     ----------
     survey, event
     size : float
-        Cost of half a parameter.
+        Cost of a parameter.
     *alternatives
-        Flares to which the process is added; the first ones are those of the events. The smallest criterion counts,
-        which may be that without flares.
+        Flares to which the process is added. The smallest criterion counts, which may be that without flares.
     """
     rows = slice(event.first, event.last + 1)
-    nothing = np.zeros(event.last + 1 - event.first)
-    values = [(0, nothing, nothing)]
+    added = [(1, *_added(survey, [], 0.0))]
     for fits in alternatives:
-        light, photon = np.zeros((2, survey.stare.n_frames))
-        for fit in fits:
-            light[fit.rows] += fit.light * survey.bank.directions[fit.event.direction, 0]
-            photon[fit.rows] += fit.photon
         inside = sum(fit.n_flares for fit in fits if event.first <= fit.event.last and fit.event.first <= event.last)
         if inside:
-            values += [(inside - 1, light[rows], photon[rows] + (epsilon * light[rows]) ** 2) for epsilon in DEPARTURES]
+            added += [(inside, *_added(survey, fits, epsilon)) for epsilon in DEPARTURES]
     costs = []
-    for more, light, extra in values:
-        data = Binned(
-            survey.stare.start_s[rows],
-            survey.sums[rows, 0] - light,
-            survey.variance[rows] + extra,
-            survey.stare.frame_s,
-        )
+    for n_flares, light, extra in added:
+        values, variance = survey.sums[rows, 0] - light[rows, 0], survey.variance[rows] + extra[rows]
+        data = Binned(survey.stare.start_s[rows], values, variance, survey.stare.frame_s)
         process = fit_process(data) if event.last - event.first >= MIN_QUIET else Process((), 1.0)
-        covariance = process.covariance(data.time_s, data.variance * process.excess**2)
-        n_parameters = PARAMETERS * (1 + more) + process.n_parameters
-        costs.append(n_parameters * size - 2 * level_fit(covariance, data.values).log_likelihood)
+        noise = replace(data, variance=variance * process.excess**2)
+        costs.append(PARAMETERS * n_flares * size + _criterion_of_process(process, noise, size))
     return min(costs)
+
+
+def _criterion_of_process(process: Process, data: Binned, size: float) -> float:
+    """Return the criterion of a process for values with the variance of their noise."""
+    covariance = process.covariance(data.time_s, data.variance)
+    return process.n_parameters * size - 2 * level_fit(covariance, data.values).log_likelihood
 
 
 def _seen_once(survey: SeriesSurvey) -> bool:

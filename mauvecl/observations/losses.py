@@ -10,7 +10,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from mauvecl.flares.shapes import Shape
-from mauvecl.observations.detection import END_FRAMES, PROVISIONAL, alternate, criterion, detect_events, fit_quiet_light
+from mauvecl.observations.detection import (
+    END_FRAMES,
+    PROVISIONAL,
+    alternate,
+    criterion,
+    detect_events,
+    fit_quiet_light,
+    light_of_events,
+)
 from mauvecl.observations.level import guess_flares
 from mauvecl.observations.process import Binned, fit_process, level_fit
 from mauvecl.observations.search import bank_of
@@ -108,12 +116,16 @@ def sudden_losses(survey: SeriesSurvey, fitted: SeriesSurvey, taken: Bool, steps
     # Losses in independent noise are the first guess: a process that is fitted to losses would hide them.
     guessed = detect_events(down, PROVISIONAL, steps)[1]
     # Those of a star that varies are most of its frames; eclipses repeat.
-    if active and guessed.mean() >= MOST_LOST and (lost := _eclipses(survey, criterion(fitted, taken))).any():
-        none[dark] = lost
-        return none
+    if active and guessed.mean() >= MOST_LOST:
+        lost = _eclipses(survey, criterion(fitted, light_of_events(fitted, taken), taken))
+        if lost.any():
+            none[dark] = lost
+            return none
     other, losses = alternate(down, guessed, None, steps)
-    if 0 < losses.mean() < MOST_LOST and criterion(other, losses, shapeless=True) < criterion(fitted, taken):
-        none[dark] = losses
+    if 0 < losses.mean() < MOST_LOST:
+        light = light_of_events(other, losses)
+        if criterion(other, light, losses, shapeless=True) < criterion(fitted, light_of_events(fitted, taken), taken):
+            none[dark] = losses
     return none
 
 
@@ -139,7 +151,7 @@ def _eclipses(survey: SeriesSurvey, usual: float) -> Bool:
     process = fit_process(data)
     light = level_fit(process.covariance(data.time_s, data.variance * process.excess**2), data.values)
     cost = (EPHEMERIS + process.n_parameters) * float(np.log(guessed.size)) - 2 * light.log_likelihood
-    if criterion(fitted, taken) + cost >= usual:
+    if criterion(fitted, light_of_events(fitted, taken), taken) + cost >= usual:
         return none
     quiet = ~guessed
     quiet[quiet] = ~taken

@@ -2,8 +2,8 @@
 
 Each pass searches the residuals of the fits. A template raises an alarm if its value exceeds the threshold by more than
 the share of the fitted flux that a wrong shape may leave in the residuals. Flares that overlap are fitted together
-(`blends`) from several starting points, and each must improve chi-squared by the square of the threshold. The passes
-end when there are no more alarms.
+(`flare_fits`) from several starting points, and each must improve chi-squared by the square of the threshold. The
+passes end when there are no more alarms.
 """
 
 from __future__ import annotations

@@ -82,7 +82,7 @@ class Interval:
 
 
 class SearchedStare(Protocol):
-    """Interface of a stare and its search for fits; the stare is simulated (`survey.Survey`) or observed."""
+    """Interface of a stare and its search for fits; the stare is simulated (`search.Survey`) or observed."""
 
     @property
     def stare(self) -> Stare:

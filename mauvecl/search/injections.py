@@ -141,7 +141,7 @@ WHOLE = 20_000
 
 @dataclass(frozen=True, eq=False)
 class InjectionSite:
-    """Half-width and time of a flare in a stare, and the templates that can detect it."""
+    """Site of an injected flare, which is a half-width and a time, with the templates that can detect it."""
 
     half_width_s: float
     peak_s: float

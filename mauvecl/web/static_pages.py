@@ -75,9 +75,7 @@ def front() -> bytes:
     from mako.lookup import TemplateLookup
 
     from mauvecl.host.exposure.star import KNOWN
-    from mauvecl.host.stars import library as catalogue
-    from mauvecl.host.stars import library as well_known
-    from mauvecl.host.stars.library import all_names
+    from mauvecl.host.stars.library import all_names, library_names, well_known_stars
     from mauvecl.web import fields
     from mauvecl.web.figures import DASHES, INKS
     from mauvecl.web.headline import TITLES
@@ -125,8 +123,8 @@ def front() -> bytes:
     lookup = TemplateLookup([str(_FOLDER)], default_filters=["h"], strict_undefined=True)
     template = lookup.get_template("page.html.mako")
     text = template.render(
-        fields=fields, uploads=UPLOADS, names=[star.name for star in well_known.stars()],
-        library=catalogue.names(), tabs=TABS, version=VERSION,
+        fields=fields, uploads=UPLOADS, names=[star.name for star in well_known_stars()],
+        library=library_names(), tabs=TABS, version=VERSION,
         bibtex=BIBTEX.format(version=VERSION), titles=TITLES, digest=_digest(),
         words=json.dumps(words).replace("<", "\\u003c"),
     )  # fmt: skip

@@ -20,7 +20,7 @@ from commands import ended, run
 from refusals import refused
 
 from mauvecl import Expectation, Source, Study, simulate
-from mauvecl.host.stars import additions as hst_collections
+from mauvecl.host.stars import additions
 
 
 @pytest.fixture(autouse=True)
@@ -255,8 +255,8 @@ def test_dereddened_star_is_marked_and_can_be_reddened(archive: str, tmp_path: P
 
 
 def test_any_collection_is_searched(archive: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    here = tuple(replace(c, base=f"{archive}/{c.name}/") for c in hst_collections.COLLECTIONS)
-    monkeypatch.setattr(hst_collections, "COLLECTIONS", here)
+    here = tuple(replace(c, base=f"{archive}/{c.name}/") for c in additions.COLLECTIONS)
+    monkeypatch.setattr(additions, "COLLECTIONS", here)
     fetch(tmp_path, "HD 37202")
     assert "Spectral Library" in Source.from_library("HD 37202").origin
     reported = not_done(tmp_path, "fetch", "HD 99999")
@@ -282,9 +282,9 @@ def test_failed_downloads_raise(
     archive: str, tmp_path: Path, name: str, below: str, facts: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MAUVECL_LARGEST_FILE_MIB", "1")
-    monkeypatch.setattr(hst_collections, "MAX_LISTING_BYTES", 1 << 20)
-    monkeypatch.setattr(hst_collections, "MAX_DOWNLOAD_S", 0.3 if below == "slow" else 60.0)
-    monkeypatch.setattr(hst_collections, "TIMEOUT_S", 0.5)
+    monkeypatch.setattr(additions, "MAX_LISTING_BYTES", 1 << 20)
+    monkeypatch.setattr(additions, "MAX_DOWNLOAD_S", 0.3 if below == "slow" else 60.0)
+    monkeypatch.setattr(additions, "TIMEOUT_S", 0.5)
     reported = not_done(tmp_path, "fetch", name, "--from", f"{archive}/{below}")
     assert all(fact in reported for fact in facts), reported
     assert kept(tmp_path) == []
@@ -298,6 +298,6 @@ def test_download_without_a_network_raises(tmp_path: Path) -> None:
 def test_documentation_and_help_list_all_collections(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs/my-star.md").read_text(encoding="utf-8")
     named = {*re.findall(r'fetch "(\w+):', page), *re.findall(r"\b(\w+):\.\.\.", page)}
-    assert named == {one.name for one in hst_collections.COLLECTIONS}
+    assert named == {one.name for one in additions.COLLECTIONS}
     reported = library(tmp_path, "fetch", "--help")
     assert all(name in reported for name in named)

@@ -90,7 +90,7 @@ ODD_SHAPES = {
     ("shape", "snr"), [("bell", 50.0), ("slow-rise", 50.0), ("slow-rise", 500.0), ("fast-tail", 3000.0)]
 )
 def test_flare_of_another_shape_in_a_short_window_is_no_process(shape: str, snr: float) -> None:
-    """Its light is found as one flare whose energy is that in the frames within a fifth, on white noise."""
+    """Find its light as one flare, with the energy in the frames to a fifth: the wrong shape, not noise, limits it."""
     rng, frame_s, half_width_s = np.random.default_rng([507, *shape.encode()]), 5.0, 150.0
     time = (np.arange(360) + 0.5) * frame_s
     tau = (time[:, None] + (np.arange(60) - 29.5) / 60 * frame_s - 600.0) / half_width_s

@@ -135,7 +135,7 @@ class DetectAnswer(Answer):
 
     @property
     def roc(self) -> QTable:
-        """All receiver operating characteristics with their areas; see `roc.Roc`.
+        """All receiver operating characteristics with their areas; see `Roc`.
 
         Many flares share `MOST_ROWS` rows, so that each curve has fewer than its 200.
         """
